@@ -1,0 +1,9 @@
+"""The one error that is meant for a person: bad input, said in one paragraph with its cure."""
+
+
+class InputError(Exception):
+    """Report something that the user can mend.
+
+    The command line prints the message as one paragraph and exits with code 2; no traceback. The message names
+    what is wrong, where (file, key, value), and what to do about it.
+    """

@@ -1,0 +1,28 @@
+"""Camera poses: checks and constructions. Poses are camera-to-world with columns right, up, back, centre."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
+    """Tell which poses are a rotation (orthonormal, determinant +1) and a finite centre."""
+    rotation = c2w[..., :3]
+    identity = torch.eye(3, dtype=c2w.dtype, device=c2w.device)
+    off = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))
+    finite = torch.isfinite(c2w).all(dim=-1).all(dim=-1)
+    return finite & (off < tolerance) & (torch.linalg.det(torch.nan_to_num(rotation)) > 0)
+
+
+def look_at(
+    eye: Float[Tensor, "*views 3"], target: Float[Tensor, "*views 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "*views 3 4"]:
+    """Return cameras at `eye` that look at `target` with the picture's top towards `up`.
+
+    >>> eye, target, up = torch.tensor([0.0, -4, 0]), torch.zeros(3), torch.tensor([0.0, 0, 1])
+    >>> look_at(eye, target, up)[:, 2].tolist()  # the back axis points from the target to the eye
+    [0.0, -1.0, 0.0]
+    """
+    back = torch.nn.functional.normalize(eye - target, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(up.expand_as(back), back), dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=-1)

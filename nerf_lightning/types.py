@@ -1,0 +1,199 @@
+"""The nouns of the program: frozen structs of tensors with named axes.
+
+Units: world axes as the user gave them (or a recorded similarity of them); a camera looks along -z of its own axes
+(x right, y up, z back); pixel centres lie at +0.5, row 0 is on top; colours are sRGB-encoded in [0, 1].
+`*rays` is any leading shape. Letters: `t` is the distance along a ray of unit direction.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Self
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+Background = Literal["white", "black", "random", "none"]
+"""What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
+
+
+class TensorStruct:
+    """Mixin of the frozen dataclasses below: move or index every tensor at once, nested structs included."""
+
+    def map(self, fn: Callable[[Tensor], Tensor]) -> Self:
+        """Return a copy with `fn` applied to each tensor."""
+        changed: dict[str, Any] = {}
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                changed[field.name] = fn(value)
+            elif isinstance(value, TensorStruct):
+                changed[field.name] = value.map(fn)
+        return replace(self, **changed)  # type: ignore[type-var]
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+        """Return a copy on `device`."""
+        return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def __getitem__(self, index: Any) -> Self:
+        """Index the leading axes of every tensor."""
+        return self.map(lambda tensor: tensor[index])
+
+
+@dataclass(frozen=True)
+class Cameras(TensorStruct):
+    """Pinhole cameras, one per view."""
+
+    c2w: Float[Tensor, "*views 3 4"]
+    """Camera-to-world; the columns are right, up, back and the camera's centre."""
+    focal: Float[Tensor, "*views 2"]
+    """Focal lengths in pixels along x and y."""
+    center: Float[Tensor, "*views 2"]
+    """Principal point in pixels from the upper left corner of the image (x, y)."""
+    width: Int[Tensor, "*views"]
+    """Image width in pixels."""
+    height: Int[Tensor, "*views"]
+    """Image height in pixels."""
+
+
+@dataclass(frozen=True)
+class PixelStore:
+    """Every pixel of every view in one flat array; views may differ in size. Row by row, row 0 on top."""
+
+    rgba: UInt8[Tensor, "pixels 4"]
+    """Straight (not premultiplied) alpha; 255 where the format has none."""
+    offset: Int[Tensor, "views"]
+    """Index of each view's first pixel."""
+    width: Int[Tensor, "views"]
+    height: Int[Tensor, "views"]
+
+    def view(self, index: int) -> UInt8[Tensor, "height width 4"]:
+        """Return one view as a picture (no copy)."""
+        start, width, height = (int(x[index]) for x in (self.offset, self.width, self.height))
+        return self.rgba[start : start + width * height].view(height, width, 4)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The exact geometry of each pixel, where a scene knows it. Flat like the pixel store."""
+
+    depth: Float[Tensor, "pixels"]
+    """Distance along the unit ray through the pixel's centre to the first surface; inf where there is none."""
+    normals: Float[Tensor, "pixels 3"]
+    """Unit surface normal in world axes, facing the camera; zero where there is no surface."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a reader returns: pictures with cameras, and where to look for content."""
+
+    name: str
+    cameras: Cameras
+    pixels: PixelStore
+    near: Float[Tensor, "views"]
+    """Distance along the ray at which content may begin, per view, in scene units."""
+    far: Float[Tensor, "views"]
+    """Distance at which content ends."""
+    aabb: Float[Tensor, "2 3"]
+    """Lower and upper corner of a world box that contains the content."""
+    splits: dict[str, tuple[int, ...]]
+    """Views of `train`, `val` and `test`."""
+    view_names: tuple[str, ...]
+    background: Background
+    to_user: Float[Tensor, "4 4"]
+    """Similarity that takes scene coordinates to the user's own frame."""
+    protocol: dict[str, str]
+    """How the pixels were made (downscale filter and the like), stamped on every number measured on them."""
+    truth: Truth | None
+    """Exact depth and normals, for scenes that know them."""
+
+
+@dataclass(frozen=True)
+class RayBundle(TensorStruct):
+    """Rays r(t) = origin + t * direction, for t between near and far."""
+
+    origins: Float[Tensor, "*rays 3"]
+    directions: Float[Tensor, "*rays 3"]
+    """Unit length, so `t` is a distance."""
+    near: Float[Tensor, "*rays"]
+    far: Float[Tensor, "*rays"]
+    camera_index: Int[Tensor, "*rays"]
+
+
+@dataclass(frozen=True)
+class RaySamples(TensorStruct):
+    """Adjacent intervals along each ray, kept as their fenceposts."""
+
+    edges: Float[Tensor, "*rays edges"]
+    """Increasing distances; one more than there are samples."""
+
+    @property
+    def starts(self) -> Float[Tensor, "*rays samples"]:
+        """Where each interval begins."""
+        return self.edges[..., :-1]
+
+    @property
+    def ends(self) -> Float[Tensor, "*rays samples"]:
+        """Where each interval ends."""
+        return self.edges[..., 1:]
+
+    @property
+    def midpoints(self) -> Float[Tensor, "*rays samples"]:
+        """Where the field is asked."""
+        return 0.5 * (self.starts + self.ends)
+
+    @property
+    def deltas(self) -> Float[Tensor, "*rays samples"]:
+        """Length of each interval."""
+        return self.ends - self.starts
+
+
+@dataclass(frozen=True)
+class FieldOutput(TensorStruct):
+    """What a field says of points in space."""
+
+    density: Float[Tensor, "*points"]
+    """Per unit length, >= 0."""
+    rgb: Float[Tensor, "*points 3"]
+    """In [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Rendering(TensorStruct):
+    """What one level saw along each ray."""
+
+    rgb: Float[Tensor, "*rays 3"]
+    """Composited over the background, exactly once."""
+    foreground: Float[Tensor, "*rays 3"]
+    """The scene's own light, before the background: sum of weights times colour."""
+    opacity: Float[Tensor, "*rays"]
+    """Sum of weights."""
+    depth: Float[Tensor, "*rays"]
+    """Expected distance along the ray; light that escapes ends at far."""
+    weights: Float[Tensor, "*rays samples"]
+    samples: RaySamples
+
+
+@dataclass(frozen=True)
+class Batch(TensorStruct):
+    """Rays, all that a model may see, and what the photographs say of them."""
+
+    rays: RayBundle
+    rgba: Float[Tensor, "*rays 4"]
+    """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
+
+
+@dataclass(frozen=True)
+class PixelIndex(TensorStruct):
+    """Which pixel of which view."""
+
+    view: Int[Tensor, "*rays"]
+    x: Int[Tensor, "*rays"]
+    """Column, from 0 on the left."""
+    y: Int[Tensor, "*rays"]
+    """Row, from 0 on top."""
+
+
+def opaque(alpha: Float[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+    """Tell the pixels that are wholly covered by the scene, where geometry can be scored."""
+    return alpha >= 1.0
