@@ -33,9 +33,7 @@ def pinhole_cameras(c2w: Float[Tensor, "views 3 4"], focal: float, width: int, h
     )
 
 
-def resized(
-    cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, "*views"]
-) -> Cameras:
+def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, "*views"]) -> Cameras:
     """Return the same cameras for images of another size: focal length and principal point follow the pixels."""
     scale = torch.stack([width / cameras.width, height / cameras.height], dim=-1).to(cameras.focal)
     return Cameras(

@@ -1,0 +1,5 @@
+"""`python -m nerf_lightning` is `nerf`."""
+
+from nerf_lightning.cli import main
+
+main()

@@ -1,0 +1,88 @@
+"""The collapse guard: a run that renders a constant picture is noticed early and begun anew."""
+
+import logging
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+log = logging.getLogger(__name__)
+
+
+class CollapseGuard(Callback):
+    """Restart a run whose renders stay constant while the photographs do not.
+
+    With ReLU densities and a white background a run may fall into "all is empty", where no gradient leads out. The sign
+    is the spread (standard deviation over rays) of the scene's own light, before the background: below
+    `ratio` times the spread of the targets at `patience` looks in a row. The restart draws new weights, a new order
+    of rays, and goes through the centre crop again; steps already taken are not given back.
+
+    Args:
+        every_steps: steps between two looks.
+        until_step: the attempt's step after which the guard trusts the run.
+        patience: looks in a row that must fail.
+        ratio: smallest share of the targets' spread that counts as alive.
+        max_restarts: how often it restarts at most.
+    """
+
+    def __init__(
+        self,
+        every_steps: int = 25,
+        until_step: int = 500,
+        patience: int = 6,
+        ratio: float = 0.02,
+        max_restarts: int = 3,
+    ):
+        self.every_steps, self.until_step, self.patience = every_steps, until_step, patience
+        self.ratio, self.max_restarts = ratio, max_restarts
+        self.failed = 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Look now and then."""
+        step = pl_module.progress.step
+        if step % self.every_steps or step > self.until_step:
+            return
+        self.failed = self.failed + 1 if is_constant(pl_module.last_step, self.ratio) else 0
+        if self.failed >= self.patience:
+            self.failed = 0
+            self._restart(trainer, pl_module)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Remember the looks across a resume."""
+        return {"failed": self.failed}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the count up again."""
+        self.failed = state_dict["failed"]
+
+    def _restart(self, trainer: Trainer, system: Any) -> None:
+        step, attempt = trainer.global_step, system.progress.attempt
+        if attempt >= self.max_restarts:
+            log.warning(
+                "Step %d: the renders are constant again, after %d restarts; training goes on as it is. Check the "
+                "poses, near and far, or try field.density_activation=softplus, scene.background=random or a smaller "
+                "optimizer.lr.",
+                step,
+                attempt,
+            )
+            return
+        system.restart()
+        message = (
+            f"Step {step}: the renders are constant while the photographs are not (a collapsed run). "
+            f"Restarted with new weights: attempt {attempt + 2} of at most {self.max_restarts + 1}."
+        )
+        log.warning(message)
+        for logger in trainer.loggers:
+            logger.log_metrics({"train/attempt": system.progress.attempt}, step)
+            if hasattr(logger.experiment, "add_text"):
+                logger.experiment.add_text("collapse_guard", message, step)
+
+
+def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:
+    """Tell whether the light that the field itself sends is the same for all rays, unlike the photographs."""
+    target_spread = last_step["target"].std(dim=0).amax()
+    render_spread = last_step["foreground"].std(dim=0).amax()
+    return bool((target_spread > 1e-3) & (render_spread < ratio * target_spread))

@@ -1,0 +1,56 @@
+"""Scalars for TensorBoard: losses, PSNR of each level, learning rate, speed, memory."""
+
+import time
+from typing import Any
+
+import psutil
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+GIGABYTE = 1e9
+
+
+class Monitor(Callback):
+    """Log every few steps, straight to the loggers: `LightningModule.log` would cost more than a small step.
+
+    Args:
+        every_steps: steps between two rows.
+    """
+
+    def __init__(self, every_steps: int = 50):
+        self.every_steps = every_steps
+        self.since = (0.0, 0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self.since = (time.perf_counter(), trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Log a row when it is time."""
+        if trainer.global_step % self.every_steps:
+            return
+        now, step = time.perf_counter(), trainer.global_step
+        steps, seconds = step - self.since[1], now - self.since[0]
+        self.since = (now, step)
+        values = level_scalars(pl_module.model.level_names, pl_module.last_step["losses"])
+        values["train/learning_rate"] = pl_module.optimizers().param_groups[0]["lr"]
+        if steps > 0 and seconds > 0:
+            values["speed/rays_per_second"] = steps * batch.rays.near.numel() / seconds
+        values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
+        if pl_module.device.type == "cuda":
+            values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE
+        for logger in trainer.loggers:
+            logger.log_metrics(values, step)
+
+
+def level_scalars(names: tuple[str, ...], losses: Tensor) -> dict[str, float]:
+    """Return loss and PSNR of each level, and the sum that is minimised."""
+    values = {"train/loss": float(losses.sum())}
+    for name, loss in zip(names, losses, strict=True):
+        values[f"train/loss_{name}"] = float(loss)
+        values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
+    return values

@@ -1,0 +1,83 @@
+"""One line that says how far the training is: step, loss, PSNR, rays per second, time left."""
+
+import logging
+import time
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+log = logging.getLogger(__name__)
+
+
+class TrainingProgress(ProgressBar):
+    """A bar on a terminal; elsewhere a line in the log now and then.
+
+    Args:
+        refresh_seconds: time between two updates of the bar; the loss is read from the device only then.
+        line_seconds: time between two lines where stderr is not a terminal.
+    """
+
+    def __init__(self, refresh_seconds: float = 0.5, line_seconds: float = 30.0):
+        super().__init__()
+        self.refresh_seconds, self.line_seconds = refresh_seconds, line_seconds
+        self.bar: Progress | None = None
+        self.task = TaskID(0)
+        self.started, self.first_step, self.shown = 0.0, 0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Show the bar."""
+        self.started = self.shown = time.perf_counter()
+        self.first_step = trainer.global_step
+        console = Console(stderr=True)
+        if not console.is_terminal:
+            return
+        self.bar = Progress(
+            TextColumn("step {task.completed:,.0f}/{task.total:,.0f}"),
+            BarColumn(bar_width=None),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            expand=True,
+        )
+        self.task = self.bar.add_task("", total=trainer.max_steps, completed=trainer.global_step)
+        self.bar.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Update what is shown."""
+        now, step = time.perf_counter(), trainer.global_step
+        if now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
+            return
+        self.shown = now
+        per_second = (step - self.first_step) / (now - self.started)
+        loss = pl_module.last_step["losses"]
+        text = (
+            f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "
+            f"{per_second * batch.rays.near.numel():,.0f} rays/s"
+        )
+        if self.bar is not None:
+            self.bar.update(self.task, completed=step, description=text)
+        else:
+            left = (trainer.max_steps - step) / per_second
+            log.info("step %d/%d  %s  about %.0f s left", step, trainer.max_steps, text, left)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the finished bar on the screen."""
+        self._stop(trainer.global_step)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Give the terminal back."""
+        self._stop(trainer.global_step)
+
+    def _stop(self, step: int) -> None:
+        if self.bar is not None:
+            self.bar.update(self.task, completed=step)
+            self.bar.stop()
+            self.bar = None

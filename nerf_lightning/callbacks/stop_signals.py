@@ -1,0 +1,53 @@
+"""Ctrl-C and SIGTERM: finish the step, save, stop; the run can go on to the last bit."""
+
+import signal
+from types import FrameType
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
+
+
+class StopSignals(Callback):
+    """Set a flag in the handler, and stop at a step's end.
+
+    The checkpoint itself is written when the training ends (`Checkpoints`). A handler that saved by itself would save
+    half a step. A second Ctrl-C stops at once.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self.former: dict[int, Any] = {}
+
+    def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen."""
+        self._listen()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen; Lightning puts handlers of its own in place shortly before."""
+        self._listen()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stop where the step is whole."""
+        if self.received is not None:
+            trainer.should_stop = True
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give the handlers back."""
+        for number, handler in self.former.items():
+            signal.signal(number, handler)
+        self.former.clear()
+
+    def _listen(self) -> None:
+        for number in SIGNALS:
+            before = signal.signal(number, self._handle)
+            self.former.setdefault(number, before)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.received = number

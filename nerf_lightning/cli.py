@@ -1,0 +1,122 @@
+"""The console command: `nerf COMMAND ...` hands its arguments to one Hydra application per command.
+
+Nothing heavy is imported here, so that `nerf --help` answers at once.
+"""
+
+import ast
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+PACKAGE = Path(__file__).parent
+USAGE_ERROR = 2
+
+
+def main() -> None:
+    """Run the command line."""
+    arguments = sys.argv[1:]
+    commands = find_commands()
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_help(commands))
+        return
+    if arguments[0] in ("-V", "--version"):
+        from nerf_lightning import __version__
+
+        print(__version__)
+        return
+    if arguments[0] not in commands:
+        _complain(f"There is no command '{arguments[0]}'.{_near(arguments[0], list(commands))} See nerf --help.")
+    _run(arguments[0], arguments[1:])
+
+
+def conf_folder() -> Path:
+    """Return where the yaml files are: inside the package when installed as a wheel, beside it in a checkout."""
+    inside = PACKAGE / "conf"
+    return inside if inside.is_dir() else PACKAGE.parent / "conf"
+
+
+def find_commands() -> dict[str, str]:
+    """Return each command with its one-line description: a file in commands/ that has a yaml of its name in conf/."""
+    files = sorted((PACKAGE / "commands").glob("*.py"))
+    return {file.stem: _summary(file) for file in files if (conf_folder() / f"{file.stem}.yaml").is_file()}
+
+
+def _summary(file: Path) -> str:
+    # Read, not imported: an import would cost seconds.
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    return docstring.partition("\n")[0]
+
+
+def _help(commands: dict[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in commands.items()]
+    return "\n".join(
+        [
+            "nerf: learn a radiance field from photographs with known cameras, and render new views.",
+            "",
+            "usage: nerf COMMAND [-m] [key=value ...]",
+            "",
+            *lines,
+            "",
+            "nerf COMMAND --help lists the groups, the settings and examples of a command.",
+            "python -m nerf_lightning is the same.",
+        ]
+    )
+
+
+def _run(command: str, arguments: list[str]) -> None:
+    """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    # Hydra would print its own short traceback and exit with 1; we want the exceptions.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    import hydra
+
+    module = importlib.import_module(f"nerf_lightning.commands.{command}")
+
+    def task(config: "DictConfig") -> Any:
+        # Caught inside the job as well: Hydra would print the overrides first, and run the next job of a sweep.
+        with _explained(command):
+            return module.run(config)
+
+    with _explained(command):
+        prepare = getattr(module, "prepare", list)
+        sys.argv = [f"nerf {command}", *prepare(arguments)]
+        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)()
+
+
+@contextmanager
+def _explained(command: str) -> Iterator[None]:
+    """Turn bad input into one paragraph and exit code 2."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from nerf_lightning.errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        _complain(str(error))
+    except (HydraException, OmegaConfBaseException) as error:
+        from nerf_lightning.commands.suggestions import explain
+
+        _complain(explain(error, command, conf_folder()))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _near(word: str, known: list[str]) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(word, known, n=3)
+    return f" Did you mean {' or '.join(close)}?" if close else ""
+
+
+def _complain(message: str) -> None:
+    print(f"nerf: {message}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)

@@ -1,0 +1,100 @@
+"""Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
+
+import importlib
+from typing import Any
+
+import torch
+import yaml
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
+from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.errors import InputError
+from nerf_lightning.fields.base import Field
+from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.samplers.base import Sampler
+
+CONTRACTS = (Encoder, Field, Sampler, Level, RadianceModel)
+ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
+
+
+def build(node: DictConfig) -> Any:
+    """Build one node of the user's own config."""
+    return instantiate(node, _convert_="all")
+
+
+def load_model(checkpoint: Checkpoint) -> RadianceModel:
+    """Build the model that a checkpoint describes, with its weights, in evaluation mode.
+
+    The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
+    defined in our own rooms and follow one of our contracts are built.
+
+    Raises:
+        InputError: the config names anything else, or the weights do not fit.
+    """
+    try:
+        config = yaml.safe_load(checkpoint.config)["model"]
+    except (yaml.YAMLError, KeyError, TypeError) as error:
+        raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part ({error}).") from error
+    _require_our_own(config, str(checkpoint.path))
+    model = instantiate(config, _convert_="all")
+    if not isinstance(model, RadianceModel):
+        raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
+    load_weights(model, checkpoint)
+    return model.eval()
+
+
+def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
+    """Put a checkpoint's weights into a model.
+
+    Raises:
+        InputError: the model has another shape than the checkpoint's.
+    """
+    try:
+        model.load_state_dict(checkpoint.weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:400]
+        raise InputError(
+            f"The weights of {checkpoint.path} do not fit this model: {reason}. Give the model, field and encoder "
+            "settings that they were trained with (.hydra/overrides.yaml of that run)."
+        ) from error
+
+
+def model_from(path: str, device: str) -> tuple[RadianceModel, Checkpoint]:
+    """Read a checkpoint and its model."""
+    checkpoint = read_checkpoint(path)
+    return load_model(checkpoint).to(torch.device(device)), checkpoint
+
+
+def _require_our_own(node: Any, source: str) -> None:
+    if isinstance(node, list):
+        for child in node:
+            _require_our_own(child, source)
+    elif isinstance(node, str):
+        if "${" in node:
+            raise InputError(f"{source}: its model part holds an interpolation ({node}), which is not read from files.")
+    elif isinstance(node, dict):
+        for key, child in node.items():
+            if key == "_target_":
+                _require_contract(child, source)
+            elif str(key).startswith("_"):
+                raise InputError(f"{source}: its model part holds the key {key}, which is not read from files.")
+            else:
+                _require_our_own(child, source)
+
+
+def _require_contract(target: Any, source: str) -> None:
+    module_name, _, class_name = str(target).rpartition(".")
+    found = None
+    if module_name.startswith(ROOMS):
+        try:
+            found = getattr(importlib.import_module(module_name), class_name, None)
+        except ImportError:
+            found = None
+    ours = isinstance(found, type) and issubclass(found, CONTRACTS) and found.__module__ == module_name
+    if not ours:
+        raise InputError(
+            f"{source} asks for {target}, which is not a model part of this program, so it is not built. Use a "
+            "checkpoint from a source that you trust, or install the version that has this class."
+        )

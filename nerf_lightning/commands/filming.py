@@ -1,0 +1,77 @@
+"""Render a model along a camera path: colour and depth, as videos or as frames."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import UInt8
+from rich.progress import track
+from torch import Tensor
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.commands.console import stderr_console
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.pictures import depth_picture, to_bytes
+from nerf_lightning.export.video import write_frames, write_video
+from nerf_lightning.geometry.paths.base import CameraPath, frame_of
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.pictures import Picture, render_picture
+from nerf_lightning.types import Background
+
+FORMATS = ("video", "frames")
+
+
+def film(
+    model: RadianceModel,
+    scene: SceneRecord,
+    path: CameraPath,
+    background: Background,
+    tile_points: int,
+    folder: Path,
+    form: Literal["video", "frames"] = "video",
+) -> list[Path]:
+    """Write `video.mp4` and `depth.mp4` (or folders of frames of these names) and return where they are.
+
+    Depth is in scene units along the ray, coloured between the nearest near and the farthest far of the photographs,
+    with its scale beside it.
+    """
+    if form not in FORMATS:
+        raise InputError(f"format={form}: choose video (mp4) or frames (PNG files).")
+    # Rendered once, kept as bytes and half floats: two videos come of it.
+    pictures = [picture for picture in render_path(model, scene, path, background, tile_points)]
+    seen = torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
+    near, far = float(scene.near.min()), float(scene.far.max())
+    if seen.numel():
+        near, far = (float(value) for value in torch.quantile(_thinned(seen), torch.tensor([0.01, 0.99])))
+    color = [to_bytes(picture.rgb) for picture in pictures]
+    depth = [depth_picture(picture.depth, near, far, picture.opacity) for picture in pictures]
+    return [
+        _write(folder, "video", color, path.fps, form),
+        _write(folder, "depth", depth, path.fps, form),
+    ]
+
+
+def render_path(
+    model: RadianceModel, scene: SceneRecord, path: CameraPath, background: Background, tile_points: int
+) -> Iterator[Picture]:
+    """Render one picture per camera of the path; near and far are the widest of the photographs."""
+    cameras = path.cameras(frame_of(scene.cameras, scene.aabb))
+    count = cameras.c2w.shape[0]
+    near = scene.near.min().expand(count)
+    far = scene.far.max().expand(count)
+    for view in track(range(count), description="filming", transient=True, console=stderr_console()):
+        yield render_picture(model, cameras, view, near, far, background, tile_points)
+
+
+def _write(folder: Path, name: str, frames: list[UInt8[Tensor, "h w 3"]], fps: int, form: str) -> Path:
+    if form == "frames":
+        write_frames(folder / name, frames)
+        return folder / name
+    write_video(folder / f"{name}.mp4", frames, fps, len(frames))
+    return folder / f"{name}.mp4"
+
+
+def _thinned(values: Tensor, most: int = 1_000_000) -> Tensor:
+    # torch.quantile takes at most 16 million values.
+    return values[:: max(1, values.numel() // most)]

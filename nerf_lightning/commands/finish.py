@@ -1,0 +1,82 @@
+"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the person."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Trainer
+from omegaconf import DictConfig
+from PIL import Image
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.commands.build import build
+from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.tensorboard import FINAL_METRICS
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.export.video import write_video
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.types import Scene
+
+PROGRESS_FPS = 4
+
+
+def finish(
+    config: DictConfig,
+    settings: TrainerSettings,
+    scene: Scene,
+    model: RadianceModel,
+    trainer: Trainer,
+    folder: Path,
+) -> float | None:
+    """Evaluate and film as the config says, print a summary, and return the test PSNR (else the validation's)."""
+    model.to(settings.device).eval()
+    lines, result = [], trainer.callback_metrics.get("val/psnr")
+    tile_points = settings.inference_tile_points
+    with settings.inference():
+        if config.final.evaluate:
+            metrics = build(config.evaluation).score(model, scene, scene.background, tile_points, folder)
+            result = metrics["psnr"]
+            _log_metrics(trainer, metrics)
+            lines += metric_lines(metrics, folder)
+        if config.final.video:
+            path = build(config.path)
+            video, depth = film(model, scene_record(scene), path, scene.background, tile_points, folder)
+            lines += [f"video        {video}", f"depth        {depth}"]
+    if progress := _film_progress(folder):
+        lines.append(f"progress     {progress}")
+    lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
+    lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
+    print("\n".join(lines))
+    return None if result is None else float(result)
+
+
+def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
+    """Return the lines that a person reads at the end."""
+    protocol = metrics["protocol"]
+    ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
+    lines = [
+        f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
+        f"({metrics['num_images']} views, {protocol['background']} background)"
+    ]
+    if metrics["depth_error"] is not None:
+        normal = metrics["normal_error"]
+        angle = "" if normal is None else f"   normal error {normal:.1f} degrees"
+        lines.append(f"depth error  {metrics['depth_error']:.4f} scene units{angle}")
+    return [*lines, f"metrics      {folder / 'metrics.json'}"]
+
+
+def _log_metrics(trainer: Trainer, metrics: dict[str, Any]) -> None:
+    values = {name: metrics[name.partition("/")[2]] for name in FINAL_METRICS}
+    for logger in trainer.loggers:
+        logger.log_metrics({name: v for name, v in values.items() if v is not None}, trainer.global_step)
+
+
+def _film_progress(folder: Path) -> Path | None:
+    """Join the pictures that were taken of one view during training."""
+    files = sorted((folder / "images" / "progress").glob("step_*.png"))
+    if len(files) < 2:
+        return None
+    frames = [torch.from_numpy(np.array(Image.open(file).convert("RGB"))) for file in files]
+    write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
+    return folder / "progress.mp4"

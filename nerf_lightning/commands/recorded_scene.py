@@ -1,0 +1,43 @@
+"""The scene that a checkpoint was trained on, as overrides for our own conf/."""
+
+from typing import Any
+
+import yaml
+
+from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.cli import conf_folder
+from nerf_lightning.errors import InputError
+
+
+def scene_overrides(path: str) -> list[str]:
+    """Return `scene=NAME` and the recorded plain values that our yaml of this name knows.
+
+    Raises:
+        InputError: the checkpoint cannot be read, or was trained on a scene that our conf/ lacks.
+    """
+    checkpoint = read_checkpoint(path.strip("'\""))
+    name = checkpoint.choices.get("scene", "")
+    known = {file.stem: file for file in (conf_folder() / "scene").glob("*.yaml")}
+    if name not in known:
+        raise InputError(
+            f"{path} was trained on the scene '{name}', which conf/scene/ lacks. Name the scene: "
+            f"nerf eval ckpt={path} scene=... ({', '.join(sorted(known))})."
+        )
+    recorded = yaml.safe_load(checkpoint.config).get("scene", {})
+    ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
+    plain = {key: value for key, value in recorded.items() if key in ours and _is_plain(key, value)}
+    return [f"scene={name}", *(f"scene.{key}={_quoted(value)}" for key, value in plain.items())]
+
+
+def _is_plain(key: str, value: Any) -> bool:
+    return not key.startswith("_") and (value is None or isinstance(value, (bool, int, float, str)))
+
+
+def _quoted(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, str):
+        # Single quotes: Hydra takes what stands in them as it is, but for quotes, backslashes and interpolations.
+        text = value.replace("\\", "\\\\").replace("'", "\\'").replace("${", "\\${")
+        return f"'{text}'"
+    return str(value).lower() if isinstance(value, bool) else str(value)

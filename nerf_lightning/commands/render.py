@@ -1,0 +1,10 @@
+"""Make a video of a checkpoint along a camera path."""
+
+from omegaconf import DictConfig
+
+
+def run(config: DictConfig) -> None:
+    """Render colour and depth."""
+    from nerf_lightning.commands.rendering import render
+
+    render(config)

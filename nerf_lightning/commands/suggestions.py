@@ -1,0 +1,79 @@
+"""Hydra's and OmegaConf's errors as one paragraph, with near matches for a mistyped key."""
+
+import difflib
+import re
+from pathlib import Path
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import InstantiationException
+from hydra.initialize import initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
+
+from nerf_lightning.errors import InputError
+
+
+def explain(error: BaseException, command: str, conf_folder: Path) -> str:
+    """Return what to tell the user about a bad override, an unknown name or a missing value."""
+    chain = list(_chain(error))
+    for link in chain:
+        if isinstance(link, InputError):
+            return str(link)
+        if isinstance(link, MissingMandatoryValue):
+            key = getattr(link, "full_key", None) or str(link)
+            return f"{key} has no value. Give one on the command line: {key}=VALUE."
+    if isinstance(error, InstantiationException):
+        where = re.search(r"full_key: (\S+)", str(error))
+        reason = str(chain[-1]).splitlines()[0]
+        return f"{where.group(1) if where else 'The config'} cannot be built: {reason}. See nerf {command} --help."
+    message = " ".join(str(error).split())
+    key = _mistyped_key([str(link) for link in chain])
+    close = difflib.get_close_matches(key, _known_keys(command, conf_folder), n=3, cutoff=0.6) if key else []
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
+    return f"{message}{hint} nerf {command} --help lists the groups, --cfg job the settings."
+
+
+def _chain(error: BaseException | None) -> list[BaseException]:
+    links: list[BaseException] = []
+    while error is not None:
+        links.append(error)
+        error = error.__cause__ or error.__context__
+    return links
+
+
+def _mistyped_key(messages: list[str]) -> str | None:
+    for pattern in (r"full_key: (\S+)", r"Could not override '([^']+)'", r"Could not find '([^']+)'"):
+        for message in messages:
+            if found := re.search(pattern, message):
+                return found.group(1)
+    return None
+
+
+def _known_keys(command: str, conf_folder: Path) -> list[str]:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(conf_folder), version_base="1.3"):
+        config = compose(command)
+    return list(flatten(config)) + [
+        f"{group.name}/{option.stem}" for group in conf_folder.iterdir() for option in group.glob("*.yaml")
+    ]
+
+
+def flatten(config: DictConfig) -> dict[str, object]:
+    """Return the leaves of a config by their dotted keys; interpolations stay text.
+
+    >>> flatten(OmegaConf.create({"a": {"b": 1}, "c": [2]}))
+    {'a.b': 1, 'c': [2]}
+    """
+    plain = OmegaConf.to_container(config, resolve=False)
+    leaves: dict[str, object] = {}
+
+    def visit(node: object, path: str) -> None:
+        if isinstance(node, dict) and node:
+            for key, value in node.items():
+                visit(value, f"{path}.{key}" if path else str(key))
+        else:
+            leaves[path] = node
+
+    visit(plain, "")
+    return leaves

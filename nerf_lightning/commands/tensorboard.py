@@ -1,0 +1,37 @@
+"""What TensorBoard shows of a run besides its curves: the config as text, and a row in the hyper-parameter table."""
+
+from typing import Any
+
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.commands.suggestions import flatten
+
+COMPARED = ("seed", "optimizer", "scheduler", "data", "field", "encoder", "model", "trainer", "scene")
+FINAL_METRICS = ("test/psnr", "test/ssim")
+
+
+def describe_run(loggers: list[Logger], config: DictConfig) -> None:
+    """Write the config and the hyper-parameters; their metrics are filled in by the scalars of the same names."""
+    from torch.utils.tensorboard.summary import hparams
+
+    values = hyper_parameters(config)
+    for logger in loggers:
+        if not hasattr(logger.experiment, "add_text"):
+            continue
+        text = OmegaConf.to_yaml(config, resolve=True)
+        logger.experiment.add_text("config", "\n".join(f"    {line}" for line in text.splitlines()), 0)
+        for summary in hparams(values, dict.fromkeys(FINAL_METRICS, 0.0)):
+            logger.experiment._get_file_writer().add_summary(summary)
+
+
+def hyper_parameters(config: DictConfig) -> dict[str, Any]:
+    """Return the settings by which runs differ, flat, as TensorBoard takes them."""
+    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    assert isinstance(resolved, DictConfig)
+    leaves = {key: value for key, value in flatten(resolved).items() if key.startswith(COMPARED)}
+    return {
+        key: value if isinstance(value, (bool, int, float, str)) else str(value)
+        for key, value in leaves.items()
+        if not key.rpartition(".")[2].startswith("_")
+    }

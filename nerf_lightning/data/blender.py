@@ -1,0 +1,169 @@
+"""The Blender format of the original method: `transforms_{train,val,test}.json` beside RGBA pictures."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+
+from nerf_lightning.data.base import Reader
+from nerf_lightning.data.blender_frames import Frame, read_frames
+from nerf_lightning.data.checks import (
+    check_bounds,
+    check_divisible,
+    check_step,
+    known_background,
+    listed,
+    one_size,
+)
+from nerf_lightning.data.images import image_size
+from nerf_lightning.data.pixel_store import read_pixels
+from nerf_lightning.data.splits import every_kth
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras
+from nerf_lightning.types import Cameras, Scene
+
+SPLITS = ("train", "val", "test")
+HOLD_EVERY = 8
+
+log = logging.getLogger(__name__)
+
+
+class BlenderReader(Reader):
+    """Read a folder of the Blender format.
+
+    A missing val split is held out from train, every 8th view. A missing test split is judged on val.
+
+    Args:
+        root: the folder with the json files.
+        near: distance along every ray at which content may begin, scene units.
+        far: distance at which content ends.
+        background: what the transparent pixels lie on: white, black, random or none.
+        downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
+        skip: per split, take every k-th frame, such as {"test": 8}; splits not named are taken whole.
+        aabb_half: half the side of the box around the origin that holds the content, scene units.
+        name: what the scene is called in reports.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        near: float = 2.0,
+        far: float = 6.0,
+        background: str = "white",
+        downscale: int = 1,
+        skip: Mapping[str, int] | None = None,
+        aabb_half: float = 1.5,
+        name: str = "blender",
+    ) -> None:
+        self.root = Path(root)
+        self.near = near
+        self.far = far
+        self.background = background
+        self.downscale = downscale
+        self.skip = dict(skip or {})
+        self.aabb_half = aabb_half
+        self.name = name
+
+    def read(self) -> Scene:
+        """Return the capture: the views of train, val and test in this order.
+
+        Raises:
+            InputError: a setting that makes no sense, or anything wrong with the files.
+        """
+        self._check_settings()
+        frames = self._frames()
+        views = [frame for split in SPLITS for frame in frames[split]]
+        sizes = {frame.image: image_size(frame.image) for frame in views}
+        width, height = one_size(sizes)
+        check_divisible(width, height, self.downscale)
+        splits = _splits({split: len(frames[split]) for split in SPLITS}, self.root)
+        label = f"Reading {self.root.name}"
+        pixels = read_pixels([frame.image for frame in views], [(width, height)] * len(views), self.downscale, label)
+        return Scene(
+            name=self.name,
+            cameras=_cameras(views, width // self.downscale, height // self.downscale),
+            pixels=pixels,
+            near=torch.full((len(views),), float(self.near)),
+            far=torch.full((len(views),), float(self.far)),
+            aabb=torch.tensor([[-self.aabb_half] * 3, [self.aabb_half] * 3]),
+            splits=splits,
+            view_names=_names(frames),
+            background=known_background(self.background),
+            to_user=torch.eye(4),
+            protocol=self._protocol(frames),
+            truth=None,
+        )
+
+    def _check_settings(self) -> None:
+        """Refuse settings that make no sense before any file is read."""
+        check_step("downscale", self.downscale)
+        for split, step in self.skip.items():
+            if split not in SPLITS:
+                raise InputError(f"scene.skip names the split {split!r}; the splits are {listed(SPLITS)}.")
+            check_step(f"skip.{split}", step)
+        check_bounds(self.near, self.far)
+        known_background(self.background)
+        if not self.aabb_half > 0:
+            raise InputError(f"scene.aabb_half is {self.aabb_half}, but half the side of a box must be above 0.")
+
+    def _frames(self) -> dict[str, list[Frame]]:
+        """Return the frames of each split; a split without a file, or without frames, is an empty list."""
+        if not self.root.is_dir():
+            raise InputError(f"The folder {self.root} does not exist. Set scene.root to the capture's folder.")
+        files = {split: self.root / f"transforms_{split}.json" for split in SPLITS}
+        if not files["train"].is_file():
+            present = listed(sorted(path.name for path in self.root.iterdir())) or "nothing"
+            raise InputError(
+                f"{files['train']} does not exist; the folder holds {present}. "
+                "Set scene.root to the folder that holds transforms_train.json."
+            )
+        frames = {
+            split: read_frames(path, self.skip.get(split, 1)) if path.is_file() else [] for split, path in files.items()
+        }
+        if not frames["train"]:
+            raise InputError(f"{files['train']} has no frames, so there is nothing to learn from. Export it again.")
+        return frames
+
+    def _protocol(self, frames: Mapping[str, list[Frame]]) -> dict[str, str]:
+        """Say how the pixels were made and which views are judged."""
+        judged = "test" if frames["test"] else "val" if frames["val"] else f"every {HOLD_EVERY}th train view"
+        return {
+            "downscale": str(self.downscale),
+            "filter": "none" if self.downscale == 1 else "area, premultiplied",
+            "test_views": judged,
+            "test_skip": str(self.skip.get(judged, 1)),
+        }
+
+
+def _cameras(views: list[Frame], width: int, height: int) -> Cameras:
+    """Return the cameras at the size of the kept pixels; each file has its own angle of view."""
+    c2w = torch.stack([frame.c2w for frame in views]).float()
+    focal = torch.tensor([focal_from_fov(width, frame.fov) for frame in views])
+    return replace(pinhole_cameras(c2w, 1.0, width, height), focal=focal[:, None].repeat(1, 2))
+
+
+def _splits(counts: Mapping[str, int], root: Path) -> dict[str, tuple[int, ...]]:
+    """Number the views split after split, and hold views out where val or test is missing."""
+    bounds = [0, counts["train"], counts["train"] + counts["val"], sum(counts.values())]
+    train, val, test = (tuple(range(*pair)) for pair in pairwise(bounds))
+    if not val:
+        train, val = every_kth(train, HOLD_EVERY)
+        log.info("%s has no val split: every %dth train view is held out for it.", root, HOLD_EVERY)
+    if not test:
+        test = val
+        log.info("%s has no test split: the %d val views serve as test.", root, len(val))
+    return {"train": train, "val": val, "test": test}
+
+
+def _names(frames: Mapping[str, list[Frame]]) -> tuple[str, ...]:
+    """Return the shortest names that tell the views apart: stem, split/stem, or the path in the json."""
+    views = [(split, frame.label) for split in SPLITS for frame in frames[split]]
+    stems = [Path(label).name for _, label in views]
+    prefixed = [f"{split}/{Path(label).name}" for split, label in views]
+    for names in (stems, prefixed):
+        if len(set(names)) == len(names):
+            return tuple(names)
+    return tuple(label for _, label in views)

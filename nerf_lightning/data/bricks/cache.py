@@ -1,0 +1,106 @@
+"""Keep what was rendered: one uncompressed .npz per setting, written whole or not at all."""
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from filelock import FileLock
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The arrays of a generated scene, all views one after the other."""
+
+    rgba: UInt8[ndarray, "pixels 4"]
+    depth: Float[ndarray, "pixels"]
+    normals: Float[ndarray, "pixels 3"]
+
+
+def default_folder() -> Path:
+    """Return $NERF_LIGHTNING_CACHE/bricks, else nerf_lightning/bricks in $XDG_CACHE_HOME or ~/.cache."""
+    chosen = os.environ.get("NERF_LIGHTNING_CACHE")
+    if chosen:
+        return Path(chosen).expanduser() / "bricks"
+    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(home).expanduser() / "nerf_lightning" / "bricks"
+
+
+def cache_file(folder: Path, settings: dict[str, int]) -> Path:
+    """Return the file that belongs to settings, the version of the renderer among them."""
+    key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+    return folder / f"{key}.npz"
+
+
+def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
+    """Return what `path` holds, or make it and keep it there.
+
+    Of several processes that ask at once, one makes and the others wait. A damaged file is made again. A folder that
+    cannot be written costs a warning and the time to make it every run, never the run.
+
+    Args:
+        path: the file.
+        pixels: how many pixels a sound file has.
+        make: renders the scene.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path.with_suffix(".lock"))
+        lock.acquire()
+    except OSError as error:
+        logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered anew.", path.parent, error)
+        return make()
+    try:
+        return _load(path, pixels) or _make_and_save(path, make)
+    finally:
+        lock.release()
+
+
+def _load(path: Path, pixels: int) -> Rendered | None:
+    """Return a sound file's content, or None."""
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            rendered = Rendered(**{field.name: stored[field.name] for field in fields(Rendered)})
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+        logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, error)
+        return None
+    sound = {
+        "rgba": ((pixels, 4), "uint8"),
+        "depth": ((pixels,), "float32"),
+        "normals": ((pixels, 3), "float32"),
+    }
+    for name, (shape, dtype) in sound.items():
+        array = getattr(rendered, name)
+        if array.shape != shape or array.dtype != dtype:
+            logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, name)
+            return None
+    return rendered
+
+
+def _make_and_save(path: Path, make: Callable[[], Rendered]) -> Rendered:
+    rendered = make()
+    try:
+        # A reader must never see half a file: write beside it, then swap names.
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                np.savez(stream, **vars(rendered))
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        logger.warning("Cannot keep the bricks scene in %s (%s).", path.parent, error)
+    return rendered

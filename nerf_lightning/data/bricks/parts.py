@@ -1,0 +1,92 @@
+"""The parts of a model: a solid, where it stands, and what it is made of. Lengths are in studs until `scaled`."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE, Solid
+
+STUD_RADIUS = 0.3
+STUD_HEIGHT = 0.22
+
+Triple = tuple[float, float, float]
+
+ALONG_X = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+"""Frame whose z axis is the world's x; the columns are the frame's axes."""
+ALONG_Y = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+ALONG_Z = np.eye(3)
+
+
+@dataclass(frozen=True)
+class Material:
+    """A surface. Colours are sRGB-encoded."""
+
+    color: Triple
+    specular: float = 0.25
+    """Strength of the highlight of the key light."""
+    sharpness: int = 5
+    """The highlight's exponent is two to this power."""
+    mirror: float = 0.03
+    """Share of the surroundings that is mirrored at normal incidence; the rest is diffuse."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One convex solid in the world."""
+
+    solid: Solid
+    size: tuple[float, ...]
+    """The solid's own numbers, see `shapes`."""
+    center: Triple
+    frame: Float[ndarray, "3 3"]
+    """Rotation from the solid's frame to the world."""
+    material: Material
+
+    def scaled(self, scale: float, shift: Triple) -> "Part":
+        """Return the part moved by `shift` (studs) and then scaled about the origin."""
+        lengths = tuple(x if self.solid is WEDGE and i in (3, 4) else scale * x for i, x in enumerate(self.size))
+        x, y, z = (scale * (a + b) for a, b in zip(self.center, shift, strict=True))
+        return replace(self, size=lengths, center=(x, y, z))
+
+
+def block(low: Triple, high: Triple, material: Material) -> Part:
+    """Return the box between two corners."""
+    size, center = _between(low, high)
+    return Part(BOX, size, center, ALONG_Z, material)
+
+
+def slope(low: Triple, high: Triple, start: tuple[float, float], end: tuple[float, float], material: Material) -> Part:
+    """Return a box cut by the plane through two points (x, z); what lies to the right of start -> end goes."""
+    size, center = _between(low, high)
+    run, rise = end[0] - start[0], end[1] - start[1]
+    length = float(np.hypot(run, rise))
+    cut_x, cut_z = rise / length, -run / length
+    offset = cut_x * (start[0] - center[0]) + cut_z * (start[1] - center[2])
+    return Part(WEDGE, (*size, cut_x, cut_z, offset), center, ALONG_Z, material)
+
+
+def rod(center: Triple, radius: float, length: float, frame: Float[ndarray, "3 3"], material: Material) -> Part:
+    """Return a cylinder whose axis is the z axis of `frame`."""
+    return Part(CYLINDER, (radius, 0.5 * length), center, frame, material)
+
+
+def ball(center: Triple, radius: float, material: Material) -> Part:
+    """Return a ball."""
+    return Part(BALL, (radius,), center, ALONG_Z, material)
+
+
+def studs(xs: list[float], ys: list[float], z: float, material: Material) -> list[Part]:
+    """Return a grid of studs that stand on the height `z`."""
+    return [rod((x, y, z + 0.5 * STUD_HEIGHT), STUD_RADIUS, STUD_HEIGHT, ALONG_Z, material) for x in xs for y in ys]
+
+
+def _between(low: Triple, high: Triple) -> tuple[Triple, Triple]:
+    a, b = np.array(low), np.array(high)
+    half, middle = 0.5 * (b - a), 0.5 * (a + b)
+    return (float(half[0]), float(half[1]), float(half[2])), (
+        float(middle[0]),
+        float(middle[1]),
+        float(middle[2]),
+    )

@@ -1,0 +1,172 @@
+"""The embedded scene: a fire engine of bricks, rendered on first use and cached. No download."""
+
+import multiprocessing
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from rich.console import Console
+from rich.progress import Progress
+
+from nerf_lightning.data.base import Reader
+from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached, default_folder
+from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
+from nerf_lightning.data.bricks.vehicle import fire_engine
+from nerf_lightning.data.bricks.views import bricks_cameras
+from nerf_lightning.errors import InputError
+from nerf_lightning.types import Background, Cameras, PixelStore, Scene, Truth
+
+RENDER_VERSION = 1
+"""Part of the cache's key: raise it whenever a pixel changes."""
+CHUNK = 3_000_000
+"""Rays that one thread takes at a time: enough to share the search for shadows, few enough for memory."""
+MOST_THREADS = 4
+"""Each takes about half a gigabyte."""
+MARGIN = 0.02
+"""Room between the model and the box handed out, in world units."""
+
+
+class BricksReader(Reader):
+    """Render the embedded scene, with exact depth and normals.
+
+    Args:
+        resolution: width and height of every picture in pixels.
+        num_train: number of training views, spread over the upper hemisphere.
+        num_val: number of validation views, in the gaps between the training views.
+        num_test: number of test views, on an orbit.
+        near: distance from a camera at which content may begin; the model lies between 2.7 and 5.4.
+        far: distance at which content ends.
+        background: what the transparent pixels are blended with.
+        cache_dir: folder of the rendered pictures; by default in the user's cache folder
+            (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
+        name: the scene's name in reports.
+    """
+
+    def __init__(
+        self,
+        resolution: int = 128,
+        num_train: int = 100,
+        num_val: int = 20,
+        num_test: int = 25,
+        near: float = 2.0,
+        far: float = 6.0,
+        background: Background = "white",
+        cache_dir: str | None = None,
+        name: str = "bricks",
+    ) -> None:
+        self.resolution = resolution
+        self.counts = {"train": num_train, "val": num_val, "test": num_test}
+        self.near = near
+        self.far = far
+        self.background = background
+        self.cache_dir = cache_dir
+        self.name = name
+
+    def read(self) -> Scene:
+        """Return all views: train, then val, then test.
+
+        Raises:
+            InputError: an argument is out of range.
+        """
+        self._check()
+        views = sum(self.counts.values())
+        cameras = bricks_cameras(**self.counts, resolution=self.resolution)
+        folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder()
+        settings = {"version": RENDER_VERSION, "resolution": self.resolution, **self.counts}
+        pixels = views * self.resolution**2
+        rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras))
+        splits, names = self._splits()
+        return Scene(
+            name=self.name,
+            cameras=cameras,
+            pixels=PixelStore(
+                rgba=torch.from_numpy(rendered.rgba),
+                offset=torch.arange(views) * self.resolution**2,
+                width=cameras.width,
+                height=cameras.height,
+            ),
+            near=torch.full((views,), float(self.near)),
+            far=torch.full((views,), float(self.far)),
+            aabb=torch.from_numpy(model_box()),
+            splits=splits,
+            view_names=names,
+            background=self.background,
+            to_user=torch.eye(4),
+            protocol={"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"},
+            truth=Truth(torch.from_numpy(rendered.depth), torch.from_numpy(rendered.normals)),
+        )
+
+    def _splits(self) -> tuple[dict[str, tuple[int, ...]], tuple[str, ...]]:
+        splits, names, first = {}, [], 0
+        for split, count in self.counts.items():
+            splits[split] = tuple(range(first, first + count))
+            names += [f"{split}_{i:03d}" for i in range(count)]
+            first += count
+        return splits, tuple(names)
+
+    def _check(self) -> None:
+        if self.resolution < 1:
+            raise InputError(
+                f"The bricks scene cannot be rendered at scene.resolution={self.resolution}: give a width in pixels, "
+                "1 or more (128 is the default)."
+            )
+        for split, least in (("train", 1), ("val", 0), ("test", 0)):
+            if self.counts[split] < least:
+                raise InputError(
+                    f"The bricks scene cannot have scene.num_{split}={self.counts[split]} views: give {least} or more."
+                )
+        if not 0 <= self.near < self.far:
+            raise InputError(
+                f"The bricks scene was given scene.near={self.near} and scene.far={self.far}: near must be 0 or more "
+                "and less than far (2 and 6 hold the model)."
+            )
+        if self.background not in get_args(Background):
+            raise InputError(
+                f"The bricks scene knows no scene.background={self.background}: choose one of "
+                f"{', '.join(get_args(Background))}."
+            )
+
+
+def model_box() -> Float[ndarray, "2 3"]:
+    """Return the lower and upper corner of a box that holds the model with a little room."""
+    corners = Tracer(fire_engine()).corners.reshape(-1, 3)
+    return np.stack([corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN]).astype(np.float32)
+
+
+def render(cameras: Cameras) -> Rendered:
+    """Render every view, on a few cores, with a progress bar on stderr."""
+    tracer = Tracer(fire_engine())
+    resolution = int(cameras.width[0])
+    views = [
+        Pinhole(c2w.double().numpy(), float(focal[0]), resolution)
+        for c2w, focal in zip(cameras.c2w, cameras.focal, strict=True)
+    ]
+    step = max(1, CHUNK // (16 * resolution**2))
+    chunks = [views[i : i + step] for i in range(0, len(views), step)]
+    parts = []
+    with _progress() as progress, ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+        task = progress.add_task("Rendering the bricks scene (once)", total=len(views))
+        for chunk, part in zip(chunks, pool.map(lambda chunk: _render_chunk(tracer, chunk), chunks), strict=True):
+            parts.append(part)
+            progress.advance(task, len(chunk))
+    return Rendered(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def _render_chunk(tracer: Tracer, views: list[Pinhole]) -> Rendered:
+    geometry = [tracer.geometry(view) for view in views]
+    return Rendered(
+        rgba=tracer.pictures(views).reshape(-1, 4),
+        depth=np.concatenate([depth for depth, _ in geometry]),
+        normals=np.concatenate([normals for _, normals in geometry]),
+    )
+
+
+def _progress() -> Progress:
+    """One bar per run: not in the workers of a loader, nor on the other ranks."""
+    main = multiprocessing.parent_process() is None and os.environ.get("LOCAL_RANK", "0") == "0"
+    return Progress(console=Console(stderr=True), transient=True, disable=not main)

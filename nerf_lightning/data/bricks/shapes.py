@@ -1,0 +1,164 @@
+"""Closed forms of convex solids centred at the origin of their own frame: ray intervals, distances and normals.
+
+A ray is inside a convex solid between two distances, so every solid here is an intersection of intervals. All
+functions broadcast: axis 0 of `origin`, `direction` and `point` is x, y, z; axis 0 of `size` is the solid's numbers.
+
+| solid    | size                                                                        |
+|----------|-----------------------------------------------------------------------------|
+| box      | half extents x, y, z                                                        |
+| wedge    | half extents x, y, z, then a cut: keep a x + c z <= w, with a, c of unit length |
+| cylinder | radius, half length along z (with caps)                                     |
+| ball     | radius                                                                      |
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+TINY = 1e-12
+"""Stands in for a zero component of a direction, so that a slab's distances are huge instead of undefined."""
+
+Vectors = Float[ndarray, "3 ..."]
+Numbers = Float[ndarray, "..."]
+Sizes = Float[ndarray, "numbers ..."]
+Interval = tuple[Numbers, Numbers]
+
+
+class Solid(NamedTuple):
+    """What the tracer asks of a kind of solid."""
+
+    interval: Callable[[Vectors, Vectors, Sizes], Interval]
+    """(origin, direction, size) -> distances of entry and exit; a miss has entry > exit."""
+    distance: Callable[[Vectors, Sizes], Numbers]
+    """(point, size) -> signed distance, negative inside; a wedge's is a lower bound."""
+    normal: Callable[[Vectors, Sizes], Vectors]
+    """(point, size) -> outward unit normal at a point on the surface."""
+    extent: Callable[[Sizes], Vectors]
+    """(size) -> half extents of the bounding box."""
+
+
+def _nonzero(values: Numbers) -> Numbers:
+    return np.where(np.abs(values) < TINY, values.dtype.type(TINY), values)
+
+
+def slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interval:
+    """Return where a line is within `half` of 0 along one axis."""
+    inverse = 1 / _nonzero(direction)
+    middle, reach = -origin * inverse, half * np.abs(inverse)
+    return middle - reach, middle + reach
+
+
+def box_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    """Return entry and exit of a box.
+
+    >>> start, along = np.array([-4.0, 0, 0]), np.array([1.0, 0, 0])
+    >>> [float(t) for t in box_interval(start, along, np.array([1.0, 2, 3]))]
+    [3.0, 5.0]
+    """
+    entry, exit = slab_interval(origin[0], direction[0], size[0])
+    for axis in (1, 2):
+        low, high = slab_interval(origin[axis], direction[axis], size[axis])
+        entry, exit = np.maximum(entry, low), np.minimum(exit, high)
+    return entry, exit
+
+
+def wedge_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    """Return entry and exit of a box cut by a plane."""
+    entry, exit = box_interval(origin, direction, size)
+    along, cut_x, cut_z = size[5], size[3], size[4]
+    slope = _nonzero(cut_x * direction[0] + cut_z * direction[2])
+    plane = (along - cut_x * origin[0] - cut_z * origin[2]) / slope
+    inwards = slope < 0
+    return np.where(inwards, np.maximum(entry, plane), entry), np.where(inwards, exit, np.minimum(exit, plane))
+
+
+def _disc_interval(origin: Vectors, direction: Vectors, radius: Numbers) -> Interval:
+    """Return where a line is within the infinite cylinder around z.
+
+    The discriminant is written as (a r^2 - (o x d)^2): b^2 - a c loses its digits for a small cylinder far away.
+    """
+    square = np.maximum(direction[0] ** 2 + direction[1] ** 2, TINY)
+    closest = -(origin[0] * direction[0] + origin[1] * direction[1]) / square
+    moment = origin[0] * direction[1] - origin[1] * direction[0]
+    under = square * radius**2 - moment**2
+    half = np.sqrt(np.maximum(under, 0)) / square
+    return np.where(under > 0, closest - half, np.inf), closest + half
+
+
+def cylinder_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    """Return entry and exit of a capped cylinder."""
+    entry, exit = _disc_interval(origin, direction, size[0])
+    low, high = slab_interval(origin[2], direction[2], size[1])
+    return np.maximum(entry, low), np.minimum(exit, high)
+
+
+def ball_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    """Return entry and exit of a ball; the direction has unit length."""
+    closest = -(origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2])
+    miss = sum((origin[i] + closest * direction[i]) ** 2 for i in range(3))
+    under = size[0] ** 2 - miss
+    half = np.sqrt(np.maximum(under, 0))
+    return np.where(under > 0, closest - half, np.inf), closest + half
+
+
+def box_distance(point: Vectors, size: Sizes) -> Numbers:
+    """Return the signed distance of a box."""
+    x, y, z = (np.abs(point[i]) - size[i] for i in range(3))
+    outside = np.sqrt(np.maximum(x, 0) ** 2 + np.maximum(y, 0) ** 2 + np.maximum(z, 0) ** 2)
+    return outside + np.minimum(np.maximum(np.maximum(x, y), z), 0)
+
+
+def wedge_distance(point: Vectors, size: Sizes) -> Numbers:
+    """Return a lower bound of the distance of a cut box, exact at its surface."""
+    return np.maximum(box_distance(point, size), size[3] * point[0] + size[4] * point[2] - size[5])
+
+
+def cylinder_distance(point: Vectors, size: Sizes) -> Numbers:
+    """Return the signed distance of a capped cylinder."""
+    around = np.sqrt(point[0] ** 2 + point[1] ** 2) - size[0]
+    along = np.abs(point[2]) - size[1]
+    outside = np.sqrt(np.maximum(around, 0) ** 2 + np.maximum(along, 0) ** 2)
+    return outside + np.minimum(np.maximum(around, along), 0)
+
+
+def ball_distance(point: Vectors, size: Sizes) -> Numbers:
+    """Return the signed distance of a ball."""
+    return np.sqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2) - size[0]
+
+
+def box_normal(point: Vectors, size: Sizes) -> Vectors:
+    """Return the normal of the nearest face."""
+    face = np.argmax(np.abs(point) - size[:3], axis=0)
+    picked = np.arange(3).reshape(3, *[1] * face.ndim) == face
+    return np.where(picked, np.copysign(1, point), 0).astype(point.dtype)
+
+
+def wedge_normal(point: Vectors, size: Sizes) -> Vectors:
+    """Return the normal of the nearest face, the cut being one."""
+    to_faces = np.max(np.abs(point) - size[:3], axis=0)
+    to_cut = size[3] * point[0] + size[4] * point[2] - size[5]
+    cut = np.stack([size[3], np.zeros_like(size[3]), size[4]])
+    return np.where(to_cut > to_faces, cut, box_normal(point, size))
+
+
+def cylinder_normal(point: Vectors, size: Sizes) -> Vectors:
+    """Return the normal of the side or of a cap, whichever is nearer."""
+    around = np.sqrt(point[0] ** 2 + point[1] ** 2)
+    zero = np.zeros_like(around)
+    side = np.stack([point[0], point[1], zero]) / np.maximum(around, TINY)
+    cap = np.stack([zero, zero, np.copysign(1, point[2])])
+    return np.where(around - size[0] > np.abs(point[2]) - size[1], side, cap)
+
+
+def ball_normal(point: Vectors, size: Sizes) -> Vectors:
+    """Return the direction from the middle."""
+    return point / np.sqrt(np.sum(point**2, axis=0))
+
+
+BOX = Solid(box_interval, box_distance, box_normal, lambda size: size[:3])
+WEDGE = Solid(wedge_interval, wedge_distance, wedge_normal, lambda size: size[:3])
+CYLINDER = Solid(cylinder_interval, cylinder_distance, cylinder_normal, lambda size: size[[0, 0, 1]])
+BALL = Solid(ball_interval, ball_distance, ball_normal, lambda size: size[[0, 0, 0]])

@@ -1,0 +1,51 @@
+"""The LightningDataModule: flattens every picture of a scene into ray batches."""
+
+from lightning.pytorch import LightningDataModule
+
+from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
+from nerf_lightning.errors import InputError
+from nerf_lightning.types import Scene
+
+
+class RayDataModule(LightningDataModule):
+    """Ray batches for training, and a fixed subset of rays for validation.
+
+    Args:
+        scene: what a reader returned.
+        progress: the run's place, shared with the system.
+        seed: the run's seed.
+        num_steps: the length of the run.
+        batch_rays: rays per training step.
+        crop_steps: steps at the start that see only the pictures' centres.
+        crop_fraction: share of each side that the crop keeps.
+        val_rays: size of the validation subset.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        progress: Progress,
+        seed: int,
+        num_steps: int,
+        batch_rays: int = 1024,
+        crop_steps: int = 0,
+        crop_fraction: float = 0.5,
+        val_rays: int = 4096,
+    ):
+        super().__init__()
+        for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
+            if value < 1:
+                raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
+        if not 0 < crop_fraction <= 1:
+            raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
+        self.scene = scene
+        self.batches = RayBatches(scene, progress, seed, batch_rays, crop_steps, crop_fraction, num_steps)
+        self.val_rays = val_rays
+
+    def train_dataloader(self) -> RayBatches:
+        """Return the training batches."""
+        return self.batches
+
+    def val_dataloader(self) -> FixedRays:
+        """Return the fixed validation rays."""
+        return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)

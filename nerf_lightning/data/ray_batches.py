@@ -1,0 +1,153 @@
+"""Training batches: a stateless, keyed order over every pixel, and one vectorised gather per batch.
+
+The order of rays is a permutation of all training pixels, new in each epoch and computed for a batch at a time; nothing
+is stored but how many rays have been seen, so a resumed run goes on exactly where it stopped.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from nerf_lightning.geometry.cameras import rays_through_pixels
+from nerf_lightning.randomness import fold, permute
+from nerf_lightning.types import Batch, PixelIndex, Scene
+
+
+@dataclass
+class Progress:
+    """How far a run is: all that its randomness and its order of rays depend on, besides the config."""
+
+    attempt: int = 0
+    """Raised by the collapse guard at each restart."""
+    step: int = 0
+    """Steps taken in this attempt."""
+    rays_seen: int = 0
+    """Rays trained on in this attempt, those of the centre crop included."""
+
+    def advance(self, num_rays: int) -> None:
+        """Count one step of `num_rays` rays."""
+        self.step += 1
+        self.rays_seen += num_rays
+
+    def restart(self) -> None:
+        """Begin a new attempt."""
+        self.attempt, self.step, self.rays_seen = self.attempt + 1, 0, 0
+
+
+class PixelDomain:
+    """The pixels of some views, or of their centres, numbered from 0; row by row, view by view.
+
+    Args:
+        scene: the views' sizes.
+        views: which views take part, in order.
+        fraction: share of each side, around the centre, that takes part; 1 for the whole picture.
+    """
+
+    def __init__(self, scene: Scene, views: Sequence[int], fraction: float = 1.0):
+        self.views = torch.tensor(views, dtype=torch.int64)
+        width, height = scene.pixels.width[self.views], scene.pixels.height[self.views]
+        self.width = (width * fraction).round().long().clamp(min=1)
+        self.height = (height * fraction).round().long().clamp(min=1)
+        self.left = (width - self.width) // 2
+        self.top = (height - self.height) // 2
+        self.ends = (self.width * self.height).cumsum(0)
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def locate(self, number: Int[Tensor, "*rays"]) -> PixelIndex:
+        """Return which pixel of which view each number stands for."""
+        slot = torch.searchsorted(self.ends, number, right=True)
+        within = number - (self.ends[slot] - self.width[slot] * self.height[slot])
+        row = torch.div(within, self.width[slot], rounding_mode="floor")
+        column = within - row * self.width[slot]
+        return PixelIndex(view=self.views[slot], x=column + self.left[slot], y=row + self.top[slot])
+
+
+def gather(scene: Scene, pixels: PixelIndex) -> Batch:
+    """Return rays and colours of pixels."""
+    flat = scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
+    return Batch(
+        rays=rays_through_pixels(scene.cameras, pixels, scene.near, scene.far),
+        rgba=scene.pixels.rgba[flat].to(torch.float32) / 255.0,
+    )
+
+
+class RayBatches:
+    """The training loader: an iterable of `Batch` that reads its place from the run's progress.
+
+    Args:
+        scene: where the pixels come from.
+        progress: shared with the system, which advances it after each step.
+        seed: the run's seed.
+        batch_rays: rays per step.
+        crop_steps: for so many steps only the pictures' centres are seen; without this, runs on white backgrounds
+            may never start learning. The crop is a domain of its own and counts no epoch.
+        crop_fraction: share of each side that the crop keeps.
+        num_steps: the length of the run, for those who ask.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        progress: Progress,
+        seed: int,
+        batch_rays: int,
+        crop_steps: int,
+        crop_fraction: float,
+        num_steps: int,
+    ):
+        self.scene, self.progress, self.seed = scene, progress, seed
+        self.batch_rays, self.num_steps = batch_rays, num_steps
+        self.crop_rays = crop_steps * batch_rays
+        self.crop = PixelDomain(scene, scene.splits["train"], crop_fraction)
+        self.whole = PixelDomain(scene, scene.splits["train"])
+
+    def __len__(self) -> int:
+        return self.num_steps
+
+    def __iter__(self) -> Iterator[Batch]:
+        while True:
+            yield self.at(self.progress.attempt, self.progress.rays_seen)
+
+    def at(self, attempt: int, rays_seen: int) -> Batch:
+        """Return the batch that follows `rays_seen` rays of an attempt."""
+        return gather(self.scene, self.pixels_at(attempt, rays_seen))
+
+    def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
+        """Return which pixels that batch holds."""
+        if rays_seen < self.crop_rays:
+            domain, purpose, position = self.crop, "crop", rays_seen
+        else:
+            domain, purpose, position = self.whole, "rays", rays_seen - self.crop_rays
+        place = position + torch.arange(self.batch_rays)
+        epochs, epoch = torch.unique(place // len(domain), return_inverse=True)
+        keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
+        return domain.locate(permute(place % len(domain), len(domain), keys[epoch]))
+
+
+class FixedRays:
+    """The validation loader: a fixed, evenly spread subset of a split's rays, the same for every run and seed.
+
+    Args:
+        scene: where the pixels come from.
+        split: which views.
+        num_rays: size of the subset; all of the split's rays where it has fewer.
+        chunk: rays per batch.
+    """
+
+    def __init__(self, scene: Scene, split: str, num_rays: int, chunk: int):
+        self.scene = scene
+        domain = PixelDomain(scene, scene.splits[split])
+        count = min(num_rays, len(domain))
+        numbers = permute(torch.arange(count), len(domain), torch.full((count,), fold("validation")))
+        self.chunks = [domain.locate(part) for part in numbers.split(chunk)]
+
+    def __len__(self) -> int:
+        return len(self.chunks)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return (gather(self.scene, pixels) for pixels in self.chunks)

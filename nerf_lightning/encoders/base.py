@@ -1,0 +1,25 @@
+"""The contract of an encoder: points in, features out, any leading shape."""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class Encoder(nn.Module, ABC):
+    """Map coordinates to features that an MLP can resolve. `in_dim` is 3: positions or unit directions."""
+
+    in_dim: int = 3
+
+    @property
+    @abstractmethod
+    def out_dim(self) -> int:
+        """Number of features."""
+
+    @abstractmethod
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
+        """Return the features, in the points' dtype."""
+
+    @abstractmethod
+    def reset_parameters(self) -> None:
+        """Draw the parameters anew from torch's generator; nothing to do where there are none."""

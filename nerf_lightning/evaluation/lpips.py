@@ -1,0 +1,147 @@
+"""LPIPS (arXiv 1801.03924, version 0.1) in plain torch, on a backbone whose weights the user brings.
+
+The usual packages need torchvision and a download at run time; this needs neither. Our layers carry the names
+of torchvision's state dict; the learnt weights of the channels lie in torchmetrics' package.
+"""
+
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.errors import InputError
+
+LPIPS_HINT = (
+    "LPIPS needs the weights of a backbone: where torchvision is installed, run "
+    "`torch.save(torchvision.models.alexnet(weights='DEFAULT').state_dict(), 'alexnet.pth')`, "
+    "copy the file here and set lpips_weights=alexnet.pth (vgg16 in place of alexnet for the net vgg)"
+)
+
+Net = Literal["alex", "vgg"]
+
+_TAPS: dict[Net, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+"""The rectified layers whose features are compared."""
+_SMALLEST: dict[Net, int] = {"alex": 31, "vgg": 16}
+"""Pixels below which pooling leaves nothing of a side."""
+_VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+_TINY = 1e-8
+"""Keeps the length of a feature of zeros from dividing by zero; the reference's value."""
+
+
+class LPIPS(nn.Module):
+    """Perceptual distance of two pictures: weighted squared differences of unit-length deep features.
+
+    Args:
+        net: which backbone. "alex" is the usual choice for reporting, "vgg" the one many NeRF papers report.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, net: Net = "alex") -> None:
+        super().__init__()
+        self.net = net
+        self.features = nn.Sequential(*(_alexnet() if net == "alex" else _vgg16()))
+        # The reference's constants: ImageNet's mean and deviation for pictures in [-1, 1].
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188])[:, None, None], persistent=False)
+        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450])[:, None, None], persistent=False)
+        for level, weight in enumerate(_channel_weights(net)):
+            self.register_buffer(f"channels{level}", weight, persistent=False)
+        self.requires_grad_(False)
+
+    def forward(
+        self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, ""]:
+        """Return the distance of two pictures with colours in [0, 1]: 0 for equal ones, seldom above 1."""
+        features = torch.stack([render, truth]).movedim(-1, 1).clamp(0, 1) * 2 - 1
+        features = (features - self.shift) / self.scale
+        distance, level = features.new_zeros(()), 0
+        for index, layer in enumerate(self.features):
+            features = layer(features)
+            if index in _TAPS[self.net]:
+                unit = features / (features.square().sum(dim=1, keepdim=True) + _TINY).sqrt()
+                weights = self.get_buffer(f"channels{level}")
+                distance = distance + ((unit[0] - unit[1]).square() * weights).sum(dim=0).mean()
+                level += 1
+        return distance
+
+    def score(self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float | None:
+        """Return the distance as a number; None for pictures too small for the backbone (31 or 16)."""
+        return None if min(render.shape[:2]) < _SMALLEST[self.net] else float(self(render, truth))
+
+
+def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
+    """Return LPIPS on the backbone in the file `weights`, a state dict as torchvision's; None for None.
+
+    Only the convolutions (`features.*`) are read. The file is read as data: nothing in it is run.
+
+    Raises:
+        InputError: there is no such file, or it does not hold this backbone.
+    """
+    if weights is None:
+        return None
+    if not Path(weights).is_file():
+        raise InputError(f"lpips_weights={weights}: there is no such file. {LPIPS_HINT}")
+    try:
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+    except Exception as error:  # a file of another kind can fail in any way
+        raise InputError(f"lpips_weights={weights}: this is not a file of weights. {LPIPS_HINT}") from error
+    model = LPIPS(net)
+    wrong = _mismatch(state, model.state_dict())
+    if wrong is not None:
+        raise InputError(f"lpips_weights={weights}: this is not the backbone {net!r}: {wrong}. {LPIPS_HINT}")
+    model.load_state_dict({name: state[name] for name in model.state_dict()})
+    return model.eval()
+
+
+def _mismatch(state: object, wanted: dict[str, Tensor]) -> str | None:
+    """Return what is wrong with a state dict in a few words, None if it fits."""
+    if not isinstance(state, dict):
+        return "it holds no table of tensors"
+    for name, tensor in wanted.items():
+        found = state.get(name)
+        if not isinstance(found, Tensor):
+            return f"{name} is missing"
+        if found.shape != tensor.shape:
+            return f"{name} has shape {tuple(found.shape)}, not {tuple(tensor.shape)}"
+    return None
+
+
+def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:
+    """Return the learnt weight of each channel of each compared layer."""
+    source = files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
+    with as_file(source) as path:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    return [state[f"lin{level}.model.1.weight"][0] for level in range(len(_TAPS[net]))]
+
+
+def _alexnet() -> list[nn.Module]:
+    return [
+        nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        nn.Conv2d(64, 192, kernel_size=5, padding=2),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        nn.Conv2d(192, 384, kernel_size=3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, kernel_size=3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, kernel_size=3, padding=1),
+        nn.ReLU(),
+    ]
+
+
+def _vgg16() -> list[nn.Module]:
+    layers: list[nn.Module] = []
+    width = 3
+    for block in _VGG_WIDTHS:
+        if layers:
+            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
+        for wider in block:
+            layers += [nn.Conv2d(width, wider, kernel_size=3, padding=1), nn.ReLU()]
+            width = wider
+    return layers

@@ -1,0 +1,57 @@
+"""How close a render is to a photograph: PSNR and SSIM of one image, and their mean over images.
+
+Papers average the PSNR of each image. Pooling the squared error over images first gives a lower number.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+SSIM_WINDOW = 11
+"""Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
+
+
+def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
+    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; inf where mse is 0.
+
+    >>> round(float(psnr(torch.tensor(0.01))), 3)
+    20.0
+    """
+    return -10.0 * torch.log10(mse)
+
+
+def image_metrics(
+    render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+) -> dict[str, float | None]:
+    """Return `psnr` (dB) and `ssim` of one image; the render is clamped to [0, 1] first.
+
+    SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
+    is None where the image is smaller than the window: with another window it would be another metric.
+    """
+    render = render.clamp(0, 1)
+    ssim = None
+    if min(render.shape[:2]) >= SSIM_WINDOW:
+        ours, true = (picture.movedim(-1, 0)[None] for picture in (render, truth))
+        similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
+        assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
+        ssim = float(similarity)
+    return {"psnr": float(psnr((render - truth).square().mean())), "ssim": ssim}
+
+
+def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
+    """Return each metric's mean over images; None where an image has none, since a mean over others misleads.
+
+    Raises:
+        ValueError: no images.
+    """
+    if not per_image:
+        raise ValueError("there is no image to average over")
+    return {name: _mean([image[name] for image in per_image]) for name in per_image[0]}
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if len(known) == len(values) else None

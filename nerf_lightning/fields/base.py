@@ -1,0 +1,33 @@
+"""The contract of a field: density and colour of points in space."""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.randomness import RayRandom
+from nerf_lightning.types import FieldOutput
+
+
+class Field(nn.Module, ABC):
+    """A radiance field. Positions are in scene units, directions have unit length."""
+
+    needs_whole_batch: bool = False
+    """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
+
+    @abstractmethod
+    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Return the density per unit length, without paying for colour."""
+
+    @abstractmethod
+    def forward(
+        self,
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
+        random: RayRandom | None,
+    ) -> FieldOutput:
+        """Return density and colour along rays; `random` is None outside training."""
+
+    @abstractmethod
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator."""

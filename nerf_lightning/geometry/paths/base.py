@@ -1,0 +1,55 @@
+"""The contract of a camera path: a frame of reference in, cameras in order of time out."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.types import Cameras
+
+
+@dataclass(frozen=True)
+class PathFrame:
+    """What a path moves around, and through what kind of camera it looks."""
+
+    center: Float[Tensor, "3"]
+    """The point to look at, in scene coordinates."""
+    up: Float[Tensor, "3"]
+    """Where the top of the picture points; any length but zero."""
+    radius: float
+    """How far the photographs were taken from the centre, in scene units."""
+    focal: float
+    """Focal length in pixels, for a picture of `width` by `height`."""
+    width: int
+    height: int
+
+
+class CameraPath(ABC):
+    """A path of virtual cameras for a video."""
+
+    fps: int
+    """Frames per second at which the path is meant to be played."""
+
+    @abstractmethod
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return one camera per frame, all of one size, in order of time."""
+
+
+def frame_of(
+    cameras: Cameras, aabb: Float[Tensor, "2 3"], up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> PathFrame:
+    """Return the frame of a capture: the middle of its box, seen from the mean distance of its cameras.
+
+    Focal length and size are those of the first camera. The default `up` is the world's z axis.
+    """
+    center = aabb.mean(dim=0).to(cameras.c2w)
+    return PathFrame(
+        center=center,
+        up=torch.tensor(up).to(cameras.c2w),
+        radius=float((cameras.c2w[:, :, 3] - center).norm(dim=-1).mean()),
+        focal=float(cameras.focal[0, 0]),
+        width=int(cameras.width[0]),
+        height=int(cameras.height[0]),
+    )

@@ -1,0 +1,26 @@
+"""The contract of a sampler: where along each ray to ask the field."""
+
+from abc import ABC, abstractmethod
+
+from torch import nn
+
+from nerf_lightning.randomness import RayRandom
+from nerf_lightning.types import RayBundle, RaySamples, Rendering
+
+
+class Sampler(nn.Module, ABC):
+    """Choose intervals along rays."""
+
+    @abstractmethod
+    def forward(self, rays: RayBundle, history: list[Rendering], random: RayRandom | None) -> RaySamples:
+        """Return the intervals.
+
+        Args:
+            rays: near and far bound the intervals.
+            history: what the earlier levels saw, coarse first; empty for the first level.
+            random: the step's numbers for these rays; None asks for the deterministic midpoints of evaluation.
+        """
+
+    @abstractmethod
+    def num_samples_after(self, before: int) -> int:
+        """Return how many intervals come out, given how many the level before had (0 for none)."""

@@ -1,0 +1,11 @@
+"""The contract of a schedule: the learning rate as a function of the step alone, so there is no state to lose."""
+
+from abc import ABC, abstractmethod
+
+
+class Schedule(ABC):
+    """A factor on the optimizer's learning rate."""
+
+    @abstractmethod
+    def __call__(self, step: int) -> float:
+        """Return the factor for the step that is about to be taken (0 is the first of an attempt)."""

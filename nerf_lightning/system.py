@@ -1,0 +1,167 @@
+"""The one LightningModule: it wires model, loss, optimizer and schedule together, and holds no mathematics."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+from torch.optim import Optimizer
+
+from nerf_lightning.data.ray_batches import Progress
+from nerf_lightning.errors import InputError
+from nerf_lightning.losses.base import Loss
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.pictures import tile_rays_for, tiles
+from nerf_lightning.randomness import batch_random, fold
+from nerf_lightning.rendering.blending import background_colors, blend
+from nerf_lightning.schedules.base import Schedule
+from nerf_lightning.types import Background, Batch, RayBundle, Rendering
+
+
+class RadianceFieldSystem(LightningModule):
+    """Train a radiance model on ray batches.
+
+    A step is cut into tiles of rays whose gradients add up: the activations stay in the cache, and the result is the
+    whole step's up to rounding. Hence the optimisation is manual.
+
+    Args:
+        model: the levels.
+        loss: one number per level; their sum is minimised.
+        optimizer: takes the parameters.
+        schedule: factor on the learning rate as a function of the attempt's step.
+        progress: the run's place, shared with the loader.
+        seed: the run's seed.
+        background: what lies behind the training rays.
+        tile_points: most points that a tile may send through a field at once; None trains the batch whole.
+        clip_norm: gradients are scaled down to this norm; None leaves them.
+        record: what a checkpoint needs to be used alone (config text, cameras, bounds).
+    """
+
+    def __init__(
+        self,
+        model: RadianceModel,
+        loss: Loss,
+        optimizer: Callable[[Iterable[Any]], Optimizer],
+        schedule: Schedule,
+        progress: Progress,
+        seed: int,
+        background: Background,
+        tile_points: int | None,
+        clip_norm: float | None,
+        record: dict[str, Any],
+    ):
+        super().__init__()
+        self.automatic_optimization = False
+        self.model, self.loss = model, loss
+        self.build_optimizer, self.schedule = optimizer, schedule
+        self.progress, self.seed = progress, seed
+        self.background = background
+        self.tile_points, self.clip_norm = tile_points, clip_norm
+        self.record = record
+        if tile_points is not None and model.needs_whole_batch:
+            raise InputError(
+                "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
+                "add trainer.tile_points=null, or leave batch_norm off."
+            )
+        self.last_step: dict[str, Tensor] = {}
+        self.squared_errors: list[Tensor] = []
+
+    def initialize(self) -> None:
+        """Draw the weights of this attempt: a function of (seed, attempt)."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(fold(self.seed, self.progress.attempt, "weights"))
+            self.model.reset_parameters()
+
+    def restart(self) -> None:
+        """Begin a new attempt with fresh weights, optimizer and order of rays."""
+        self.progress.restart()
+        self.initialize()
+        optimizer = self.optimizers().optimizer  # type: ignore[union-attr]
+        optimizer.state.clear()
+
+    def configure_optimizers(self) -> Optimizer:
+        """Complete the optimizer."""
+        return self.build_optimizer(self.model.parameters())
+
+    def training_step(self, batch: Batch, batch_index: int) -> None:
+        """Take one step: tiles forward and backward, clip, update."""
+        num_rays = batch.rays.near.numel()
+        optimizer = self.optimizers()
+        optimizer.zero_grad()  # type: ignore[union-attr]
+        key = fold(self.seed, self.progress.attempt, self.progress.step)
+        random = batch_random(key, num_rays, self.device)
+        background = background_colors(self.background, num_rays, self.device, random)
+        target = blend(batch.rgba, background)
+        parts = []
+        for tile in tiles(num_rays, self._tile_rays(num_rays)):
+            behind = None if background is None else background[tile]
+            renderings = self.model(batch.rays[tile], behind, random[tile])
+            losses = torch.stack(self.loss(renderings, target[tile])) * (target[tile].shape[0] / num_rays)
+            self.manual_backward(losses.sum())
+            parts.append((losses.detach(), renderings[-1].foreground.detach()))
+        losses, foreground = torch.stack([p[0] for p in parts]).sum(0), torch.cat([p[1] for p in parts])
+        self.last_step = {"losses": losses, "foreground": foreground, "target": target}
+        # Elsewhere than on the CPU the question costs a synchronisation, so it is asked seldom and before each save.
+        if self.device.type == "cpu" or self.progress.step % 100 == 0:
+            self.require_finite_loss()
+        self._update(optimizer)
+        self.progress.advance(num_rays)
+
+    def require_finite_loss(self) -> None:
+        """Stop the run at a loss that is not a number, before it ruins the weights or reaches a checkpoint."""
+        if self.last_step and not bool(torch.isfinite(self.last_step["losses"]).all()):
+            raise InputError(
+                f"The loss of step {self.trainer.global_step} is not a finite number; the run stops before it ruins "
+                f"the weights. The last good checkpoint, where one was saved, is "
+                f"{self.trainer.default_root_dir}/checkpoints/last.ckpt. Try a smaller optimizer.lr, gradient "
+                "clipping (trainer.clip_norm=1), trainer.precision=32-true, or check the capture's poses, near and far."
+            )
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        """Collect the squared error of fixed rays; backgrounds as at evaluation."""
+        background = background_colors(self.background, batch.rays.near.numel(), self.device, None)
+        target = blend(batch.rgba, background)
+        for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
+            rendering = self._render(batch.rays[tile], None if background is None else background[tile])
+            self.squared_errors.append((rendering.rgb - target[tile]).square().mean(dim=-1))
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the PSNR of the fixed rays and its standard error (delta method)."""
+        error = torch.cat(self.squared_errors).double()
+        self.squared_errors.clear()
+        mean = error.mean()
+        standard_error = error.std() / error.numel() ** 0.5
+        self.log("val/psnr", -10.0 * torch.log10(mean))
+        self.log("val/psnr_standard_error", 10.0 / torch.log(mean.new_tensor(10.0)) * standard_error / mean)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what makes the file self-contained, and the run's state beyond weights and optimizer."""
+        self.require_finite_loss()
+        checkpoint["nerf_lightning"] = self.record | {
+            "progress": asdict(self.progress),
+            "tile_points": self.tile_points,
+            "num_threads": torch.get_num_threads(),
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take up the state again: place, tile and thread count decide the last bits of every sum."""
+        state = checkpoint["nerf_lightning"]
+        for name, value in state["progress"].items():
+            setattr(self.progress, name, value)
+        self.tile_points = state["tile_points"]
+        torch.set_num_threads(state["num_threads"])
+
+    def _tile_rays(self, num_rays: int) -> int:
+        return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points)
+
+    def _render(self, rays: RayBundle, background: Tensor | None) -> Rendering:
+        return self.model(rays, background, random=None)[-1]
+
+    def _update(self, optimizer: Any) -> None:
+        if self.clip_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
+        for group in optimizer.param_groups:
+            group["lr"] = self.schedule(self.progress.step) * group.setdefault("base_lr", group["lr"])
+        optimizer.step()

@@ -1,0 +1,125 @@
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from captures import picture
+from PIL import Image
+
+from nerf_lightning.data.images import area_downscale, image_size, read_rgba
+from nerf_lightning.errors import InputError
+
+
+def slow_downscale(rgba, factor):
+    """Average premultiplied colour block by block, in floating point."""
+    height, width = rgba.shape[0] // factor, rgba.shape[1] // factor
+    out = np.zeros((height, width, 4), dtype=np.uint8)
+    for y in range(height):
+        for x in range(width):
+            block = rgba[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor].reshape(-1, 4)
+            colour, alpha = np.zeros(3), 0.0
+            for pixel in block.astype(np.float64):
+                colour += pixel[:3] * pixel[3] / factor**2
+                alpha += pixel[3] / factor**2
+            if np.floor(alpha + 0.5) > 0:
+                out[y, x] = np.floor(np.array([*(colour / alpha), alpha]) + 0.5 + 1e-9)
+    return out
+
+
+def png_16_bit(values):
+    """Return a 16-bit RGB png of one row, which PIL cannot write."""
+
+    def chunk(kind, content):
+        check = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    header = struct.pack(">IIBBBBB", len(values), 1, 16, 2, 0, 0, 0)
+    row = b"\0" + b"".join(struct.pack(">3H", *value) for value in values)
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(row)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 6])
+def test_area_filter_equals_the_slow_loop(factor):
+    rgba = picture(1, width=18, height=12)
+    rgba[:6, :6, 3] = 0
+    rgba[0, 0] = (250, 120, 3, 1)
+    expected = rgba if factor == 1 else slow_downscale(rgba, factor)
+    assert np.array_equal(area_downscale(rgba, factor), expected)
+
+
+def test_transparent_neighbours_do_not_darken_an_edge():
+    rgba = np.array([[[200, 100, 50, 255], [0, 0, 0, 0]]] * 2, dtype=np.uint8)
+    assert area_downscale(rgba, 2).tolist() == [[[200, 100, 50, 128]]]
+
+
+def test_colour_is_zero_where_alpha_is():
+    rgba = np.full((2, 2, 4), [90, 80, 70, 0], dtype=np.uint8)
+    rgba[0, 0, 3] = 1
+    assert area_downscale(rgba, 2).tolist() == [[[0, 0, 0, 0]]]
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
+def test_modes_with_a_plain_reading(tmp_path, mode):
+    path = tmp_path / "a.png"
+    image = Image.fromarray(picture(2)).convert("RGB" if mode == "P" else "RGBA").convert(mode)
+    image.save(path)
+    rgba = read_rgba(path)
+    assert np.array_equal(rgba, np.asarray(image.convert("RGBA")))
+    if mode not in ("LA", "RGBA"):
+        assert rgba[..., 3].min() == 255
+
+
+def test_palette_with_transparency(tmp_path):
+    image = Image.new("P", (2, 1))
+    image.putpalette([10, 20, 30, 40, 50, 60])
+    image.putpixel((1, 0), 1)
+    image.save(tmp_path / "a.png", transparency=1)
+    assert read_rgba(tmp_path / "a.png").tolist() == [[[10, 20, 30, 255], [40, 50, 60, 0]]]
+
+
+def test_sixteen_bit_colour_keeps_the_upper_byte(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_16_bit([(0, 257 * 128, 65535), (257, 513, 255)]))
+    assert read_rgba(tmp_path / "a.png").tolist() == [[[0, 128, 255, 255], [1, 2, 0, 255]]]
+
+
+def test_refuses_sixteen_bit_grey_by_name(tmp_path):
+    Image.fromarray(np.full((2, 2), 40000, dtype=np.uint16)).save(tmp_path / "a.png")
+    with pytest.raises(
+        InputError, match=r"a.png has the pixel mode 'I;16'.* Save it as an 8-bit RGB or RGBA PNG"
+    ):
+        read_rgba(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_refuses_pictures_that_are_stored_turned(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(picture(0)[..., :3]).save(path, exif=exif)
+    with pytest.raises(InputError, match=rf"a.{ending} carries the EXIF orientation 6.* Turn the pixels"):
+        read_rgba(path)
+
+
+def test_refuses_formats_that_start_other_programs(tmp_path):
+    Image.fromarray(picture(0)[..., :3]).save(tmp_path / "a.eps")
+    with pytest.raises(InputError, match=r"a.eps is not an image that can be read"):
+        image_size(tmp_path / "a.eps")
+
+
+@pytest.mark.parametrize("limit", [40, 10])
+def test_refuses_decompression_bombs(tmp_path, monkeypatch, limit):
+    Image.fromarray(picture(0)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+    with pytest.raises(InputError, match=rf"a.png has more than {limit} pixels"):
+        image_size(tmp_path / "a.png")
+
+
+def test_size_is_width_then_height(tmp_path):
+    Image.fromarray(picture(0, width=5, height=3)).save(tmp_path / "a.png")
+    assert image_size(tmp_path / "a.png") == (5, 3)
+
+
+def test_absent_file(tmp_path):
+    with pytest.raises(InputError, match=r"a.png cannot be read: .*No such file"):
+        read_rgba(tmp_path / "a.png")

@@ -1,0 +1,45 @@
+import subprocess
+import sys
+
+import pytest
+from captures import pose, write_transforms
+from PIL import Image
+
+SIDE = 512
+VIEWS = 256
+
+MEASURE = """
+import sys
+from nerf_lightning.data.blender import BlenderReader
+
+
+def peak():
+    with open("/proc/self/status") as status:
+        return 1024 * int(next(line for line in status if line.startswith("VmHWM")).split()[1])
+
+
+kept = []
+for factor, few, many in ((1, 16, 4), (2, 8, 1)):
+    # What a picture takes while it is decoded is in the peak of the first reading already.
+    kept.append(BlenderReader(sys.argv[1], downscale=factor, skip={"train": few}).read())
+    before = peak()
+    kept.append(BlenderReader(sys.argv[1], downscale=factor, skip={"train": many}).read())
+    print((peak() - before) / len(kept[-1].pixels.rgba))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+def test_reading_takes_the_store_and_no_more(tmp_path):
+    Image.radial_gradient("L").resize((SIDE, SIDE)).convert("RGBA").save(tmp_path / "r_0.png")
+    for view in range(1, VIEWS):
+        (tmp_path / f"r_{view}.png").hardlink_to(tmp_path / "r_0.png")
+    frames = [{"file_path": f"r_{view}", "transform_matrix": pose(view)} for view in range(VIEWS)]
+    write_transforms(tmp_path, "train", frames)
+    command = [sys.executable, "-c", MEASURE, str(tmp_path)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    growth = [float(line) for line in output.split()]
+    print("bytes per pixel at downscale 1 and 2:", growth)
+    assert len(growth) == 2
+    assert max(growth) <= 4.2
+    # Much less than the store itself would mean that the peak had been reached before.
+    assert min(growth) > 3.5

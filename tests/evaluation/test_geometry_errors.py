@@ -1,0 +1,104 @@
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.evaluation.geometry import depth_error, normal_error, normals_from_depth, surface_depth
+from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
+from nerf_lightning.geometry.poses import look_at
+
+FAR = 6.0
+
+
+def picture_rays(size=48, focal=60.0):
+    """The rays of one oblique camera, with the world turned so that no axis is special."""
+    eye = torch.tensor([[2.0, -3.0, 1.5]], dtype=torch.float64)
+    c2w = look_at(eye, torch.zeros_like(eye), torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64))
+    cameras = pinhole_cameras(c2w, focal, size, size)
+    near, far = torch.zeros(1, dtype=torch.float64), torch.full((1,), FAR, dtype=torch.float64)
+    return rays_through_pixels(cameras, all_pixels(cameras, 0), near, far)
+
+
+def plane(rays, normal):
+    distance = -(rays.origins @ normal) / (rays.directions @ normal)
+    return rays.origins + distance[..., None] * rays.directions
+
+
+def sphere(rays, radius=1.0):
+    middle = (rays.origins * rays.directions).sum(dim=-1)
+    inside = middle**2 - (rays.origins.square().sum(dim=-1) - radius**2)
+    distance = -middle - inside.clamp(min=0).sqrt()
+    hit = inside > 0
+    points = rays.origins + torch.where(hit, distance, FAR)[..., None] * rays.directions
+    return points, hit
+
+
+def test_the_share_of_escaping_light_is_taken_out_of_the_depth():
+    opacity = torch.tensor([1.0, 0.5, 0.01, 0.0], dtype=torch.float64)
+    depth = 2.5 * opacity + FAR * (1 - opacity)
+    found = surface_depth(depth, opacity, torch.full_like(depth, FAR))
+    torch.testing.assert_close(found, torch.tensor([2.5, 2.5, 2.5, FAR], dtype=torch.float64))
+
+
+def test_depth_is_scored_where_the_scene_covers_the_pixel():
+    truth = torch.tensor([2.0, 2.0, 2.0, math.inf])
+    opacity = torch.tensor([1.0, 0.5, 1.0, 0.0])
+    depth = torch.tensor([2.5, 0.5 * 1.9 + 0.5 * FAR, 5.0, FAR])
+    alpha = torch.tensor([1.0, 1.0, 0.99, 1.0])
+    far = torch.full((4,), FAR)
+    assert math.isclose(depth_error(depth, opacity, far, truth, alpha), (0.5 + 0.1) / 2, abs_tol=1e-6)
+    assert depth_error(depth, opacity, far, truth, torch.zeros(4)) is None
+
+
+def test_a_hole_counts_as_far():
+    one, zero = torch.ones(1), torch.zeros(1)
+    assert depth_error(FAR * one, zero, FAR * one, 2 * one, one) == pytest.approx(FAR - 2)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.6, 0.2), (-0.1, 0.9, -0.4)])
+def test_a_plane_has_its_normal_exactly(normal):
+    rays = picture_rays(16, focal=200.0)
+    normal = normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    found = normals_from_depth(plane(rays, normal))
+    facing = normal if float(rays.directions[8, 8] @ normal) < 0 else -normal
+    torch.testing.assert_close(found, facing.expand_as(found))
+    assert ((found * rays.directions).sum(dim=-1) < 0).all()
+
+
+def test_a_spheres_normals_are_near_and_face_the_camera():
+    rays = picture_rays(96, focal=130.0)
+    points, hit = sphere(rays)
+    normals = normals_from_depth(points)
+    truth = torch.where(hit[..., None], points, 0.0)
+    error = normal_error(normals, truth, hit.double())
+    assert error < 1.0
+    inner = torch.linalg.cross(rays.directions, truth).norm(dim=-1) < 0.8
+    assert ((normals * rays.directions).sum(dim=-1) < 0)[inner & hit].all()
+    finer = picture_rays(192, focal=260.0)
+    fine_points, fine_hit = sphere(finer)
+    fine_truth = torch.where(fine_hit[..., None], fine_points, 0.0)
+    assert normal_error(normals_from_depth(fine_points), fine_truth, fine_hit.double()) < 0.6 * error
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 30.0, 90.0, 180.0])
+def test_the_angle_is_in_degrees(degrees):
+    truth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 5, 3)
+    angle = math.radians(degrees)
+    tilted = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=torch.float64).expand(5, 5, 3)
+    alpha = torch.ones(5, 5, dtype=torch.float64)
+    assert normal_error(tilted, truth, alpha) == pytest.approx(degrees, rel=1e-9, abs=1e-12)
+
+
+def test_only_pixels_whose_neighbours_are_covered_count():
+    truth = torch.tensor([0.0, 0.0, 1.0]).repeat(5, 5, 1)
+    normals = torch.tensor([1.0, 0.0, 0.0]).repeat(5, 5, 1)
+    normals[2, 3] = truth[2, 3]
+    alpha = torch.ones(5, 5)
+    alpha[1, 1] = alpha[3, 1] = 0.5
+    # Rows and columns 1 to 3 are inside; on or beside the two half-covered pixels nothing counts. That leaves
+    # (1,3), (2,2), (2,3) and (3,3).
+    assert normal_error(normals, truth, alpha) == pytest.approx(90.0 * 3 / 4)
+    truth[2, 2] = 0.0
+    assert normal_error(normals, truth, alpha) == pytest.approx(90.0 * 2 / 3)
+    assert normal_error(normals, truth, torch.zeros(5, 5)) is None

@@ -1,0 +1,66 @@
+import math
+
+import pytest
+import torch
+
+from nerf_lightning.evaluation.metrics import SSIM_WINDOW, image_metrics, mean_over_images, psnr
+
+
+def pair(mse, size=16):
+    truth = torch.full((size, size, 3), 0.3)
+    return truth + math.sqrt(mse), truth
+
+
+def test_psnr_by_hand():
+    torch.testing.assert_close(psnr(torch.tensor([1.0, 0.01, 1e-4])), torch.tensor([0.0, 20.0, 40.0]))
+    assert psnr(torch.tensor(0.0)) == math.inf
+
+
+def test_an_image_has_its_psnr():
+    assert math.isclose(image_metrics(*pair(0.01))["psnr"], 20.0, abs_tol=1e-3)
+
+
+def test_the_render_is_clamped_as_a_screen_would():
+    truth = torch.ones(16, 16, 3)
+    assert image_metrics(truth * 1.5, truth)["psnr"] == math.inf
+
+
+def test_equal_images_are_alike():
+    image = torch.rand(20, 31, 3)
+    metrics = image_metrics(image, image)
+    assert metrics["psnr"] == math.inf
+    assert math.isclose(metrics["ssim"], 1.0, abs_tol=1e-6)
+
+
+def test_ssim_of_two_flat_images_by_hand():
+    # No variance, so only the luminance term is left: (2ab + c) / (a^2 + b^2 + c) with c = 0.01^2.
+    render, truth = torch.full((16, 16, 3), 0.6), torch.full((16, 16, 3), 0.2)
+    wanted = (2 * 0.6 * 0.2 + 1e-4) / (0.36 + 0.04 + 1e-4)
+    assert math.isclose(image_metrics(render, truth)["ssim"], wanted, abs_tol=1e-4)
+
+
+def test_ssim_falls_with_noise():
+    truth = torch.rand(32, 32, 3)
+    noise = torch.randn(32, 32, 3)
+    scores = [image_metrics(truth + level * noise, truth)["ssim"] for level in (0.02, 0.1, 0.3)]
+    assert 1.0 > scores[0] > scores[1] > scores[2] > 0.0
+
+
+def test_an_image_smaller_than_the_window_has_no_ssim():
+    assert image_metrics(*pair(0.01, SSIM_WINDOW - 1))["ssim"] is None
+    assert math.isfinite(image_metrics(*pair(0.01, SSIM_WINDOW))["ssim"])
+
+
+def test_psnr_is_averaged_over_images_not_pooled():
+    errors = [0.1, 0.001]
+    mean = mean_over_images([image_metrics(*pair(mse)) for mse in errors])
+    assert math.isclose(mean["psnr"], 20.0, abs_tol=1e-3)
+    pooled = float(psnr(torch.tensor(errors).mean()))
+    assert math.isclose(pooled, 12.967, abs_tol=1e-3)
+
+
+def test_a_metric_that_an_image_lacks_has_no_mean():
+    mean = mean_over_images([{"psnr": 20.0, "ssim": 0.5}, {"psnr": 30.0, "ssim": None}])
+    assert mean == {"psnr": 25.0, "ssim": None}
+    with pytest.raises(ValueError, match="no image"):
+        mean_over_images([])

@@ -1,0 +1,124 @@
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.cameras import pinhole_cameras, project
+from nerf_lightning.geometry.paths.base import PathFrame, frame_of
+from nerf_lightning.geometry.paths.orbit import Orbit
+from nerf_lightning.geometry.poses import is_rigid, look_at
+
+
+def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64):
+    return PathFrame(
+        center=torch.tensor([1.0, 2.0, 3.0], dtype=dtype),
+        up=torch.tensor(up, dtype=dtype),
+        radius=4.0,
+        focal=140.0,
+        width=100,
+        height=80,
+    )
+
+
+def test_the_first_cameras_stand_where_geometry_says():
+    cameras = Orbit(num_frames=4, elevation=30.0).cameras(frame())
+    level, up = 4 * math.cos(math.pi / 6), 2.0
+    offsets = [[level, 0, up], [0, level, up], [-level, 0, up], [0, -level, up]]
+    wanted = torch.tensor(offsets, dtype=torch.float64) + frame().center
+    torch.testing.assert_close(cameras.c2w[:, :, 3], wanted)
+
+
+def test_start_and_direction():
+    eyes = Orbit(num_frames=4, elevation=0.0, start=90.0, turns=-1.0).cameras(frame()).c2w[:, :, 3] - frame().center
+    wanted = torch.tensor([[0.0, 4, 0], [4, 0, 0], [0, -4, 0], [-4, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(eyes, wanted)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.3, 0.5, -0.4)])
+def test_every_camera_looks_at_the_center_and_keeps_up_up(up):
+    around = frame(up)
+    cameras = Orbit(num_frames=7, elevation=-20.0, turns=2.0).cameras(around)
+    assert is_rigid(cameras.c2w, tolerance=1e-9).all()
+    unit = around.up / around.up.norm()
+    offsets = cameras.c2w[:, :, 3] - around.center
+    torch.testing.assert_close(offsets.norm(dim=-1), torch.full((7,), 4.0, dtype=torch.float64))
+    height = torch.full((7,), 4 * math.sin(math.radians(-20)), dtype=torch.float64)
+    torch.testing.assert_close(offsets @ unit, height)
+    for view in range(7):
+        middle = project(cameras, view, around.center)
+        torch.testing.assert_close(middle, torch.tensor([50.0, 40.0], dtype=torch.float64))
+        assert project(cameras, view, around.center + 0.1 * unit)[1] < 40.0
+
+
+def test_frames_are_evenly_spaced_and_the_last_is_not_the_first():
+    eyes = Orbit(num_frames=12).cameras(frame()).c2w[:, :, 3]
+    gaps = (eyes - eyes.roll(-1, dims=0)).norm(dim=-1)
+    torch.testing.assert_close(gaps, gaps[:1].expand(12))
+    assert gaps[0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("asked", "size", "focal"),
+    [
+        ({}, (100, 80), 140.0),
+        ({"width": 200}, (200, 160), 280.0),
+        ({"height": 40}, (50, 40), 70.0),
+        ({"width": 400, "height": 400}, (400, 400), 560.0),
+    ],
+)
+def test_another_size_keeps_the_field_of_view(asked, size, focal):
+    cameras = Orbit(num_frames=2, **asked).cameras(frame())
+    assert (int(cameras.width[0]), int(cameras.height[0])) == size
+    assert cameras.focal.tolist() == [[focal, focal]] * 2
+    assert cameras.center[1].tolist() == [size[0] / 2, size[1] / 2]
+    assert math.isclose(float(cameras.width[0] / cameras.focal[0, 0]), 100 / 140, rel_tol=1e-6)
+
+
+def test_a_radius_of_ones_own():
+    cameras = Orbit(num_frames=3, radius=1.5).cameras(frame(dtype=torch.float32))
+    distance = (cameras.c2w[:, :, 3] - frame(dtype=torch.float32).center).norm(dim=-1)
+    torch.testing.assert_close(distance, torch.full((3,), 1.5))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"num_frames": 0}, "path.num_frames is 0, but must be at least 1"),
+        ({"elevation": 90.0}, "path.elevation is 90.0, but must be between -90 and 90"),
+        ({"elevation": math.nan}, "path.elevation is nan"),
+        ({"radius": 0.0}, "path.radius is 0.0, but must be a positive distance"),
+        ({"radius": math.inf}, "path.radius is inf"),
+        ({"turns": 0.0}, "path.turns is 0.0"),
+        ({"start": math.nan}, "path.start is nan"),
+        ({"width": 0}, "path.width is 0"),
+        ({"height": -3}, "path.height is -3"),
+        ({"fps": 0}, "path.fps is 0"),
+    ],
+)
+def test_a_bad_number_is_named(bad, words):
+    with pytest.raises(InputError, match=words):
+        Orbit(**bad)
+
+
+def test_the_frame_of_a_capture():
+    eyes = torch.tensor([[3.0, 0, 1], [0, 5, 1], [1, 0, 4]])
+    target = torch.tensor([1.0, 0, 1])
+    c2w = look_at(eyes, target.expand(3, 3), torch.tensor([0.1, 0.2, 1.0]))
+    cameras = pinhole_cameras(c2w, focal=70.0, width=64, height=48)
+    around = frame_of(cameras, torch.tensor([[0.0, -1, 0], [2, 1, 2]]))
+    assert around.center.tolist() == [1, 0, 1]
+    assert around.up.tolist() == [0, 0, 1]
+    assert math.isclose(around.radius, (2 + math.sqrt(26) + 3) / 3, rel_tol=1e-6)
+    assert (around.focal, around.width, around.height) == (70.0, 64, 48)
+    assert frame_of(cameras, torch.zeros(2, 3), up=(0.0, 1.0, 0.0)).up.tolist() == [0, 1, 0]
+
+
+def test_the_yaml_lists_the_constructors_defaults():
+    yaml = pytest.importorskip("yaml")
+    text = (Path(__file__).parents[2] / "conf" / "path" / "orbit.yaml").read_text()
+    listed = yaml.safe_load(text)
+    assert listed.pop("_target_") == f"{Orbit.__module__}.{Orbit.__qualname__}"
+    assert vars(Orbit(**listed)) == vars(Orbit())
+    assert set(listed) == set(vars(Orbit()))
