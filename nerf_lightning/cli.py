@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerf_lightning.conf_folder import conf_folder
+
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
@@ -34,12 +36,6 @@ def main() -> None:
     if arguments[0] not in commands:
         _complain(f"There is no command '{arguments[0]}'.{_near(arguments[0], list(commands))} See nerf --help.")
     _run(arguments[0], arguments[1:])
-
-
-def conf_folder() -> Path:
-    """Return where the yaml files are: inside the package when installed as a wheel, beside it in a checkout."""
-    inside = PACKAGE / "conf"
-    return inside if inside.is_dir() else PACKAGE.parent / "conf"
 
 
 def find_commands() -> dict[str, str]:

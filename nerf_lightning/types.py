@@ -7,7 +7,7 @@ Units: world axes as the user gave them (or a recorded similarity of them); a ca
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -17,10 +17,14 @@ Background = Literal["white", "black", "random", "none"]
 """What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
 
 
+# Not typing.Self, which runtime type checkers do not know.
+Struct = TypeVar("Struct", bound="TensorStruct")
+
+
 class TensorStruct:
     """Mixin of the frozen dataclasses below: move or index every tensor at once, nested structs included."""
 
-    def map(self, fn: Callable[[Tensor], Tensor]) -> Self:
+    def map(self: Struct, fn: Callable[[Tensor], Tensor]) -> Struct:
         """Return a copy with `fn` applied to each tensor."""
         changed: dict[str, Any] = {}
         for field in fields(self):  # type: ignore[arg-type]
@@ -31,11 +35,11 @@ class TensorStruct:
                 changed[field.name] = value.map(fn)
         return replace(self, **changed)  # type: ignore[type-var]
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+    def to(self: Struct, device: torch.device | str, non_blocking: bool = False) -> Struct:
         """Return a copy on `device`."""
         return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
-    def __getitem__(self, index: Any) -> Self:
+    def __getitem__(self: Struct, index: Any) -> Struct:
         """Index the leading axes of every tensor."""
         return self.map(lambda tensor: tensor[index])
 

@@ -4,8 +4,10 @@ import logging
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning.callbacks.writers import tensorboard_writers
 
 log = logging.getLogger(__name__)
 
@@ -38,9 +40,7 @@ class CollapseGuard(Callback):
         self.ratio, self.max_restarts = ratio, max_restarts
         self.failed = 0
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then."""
         step = pl_module.progress.step
         if step % self.every_steps or step > self.until_step:
@@ -77,8 +77,8 @@ class CollapseGuard(Callback):
         log.warning(message)
         for logger in trainer.loggers:
             logger.log_metrics({"train/attempt": system.progress.attempt}, step)
-            if hasattr(logger.experiment, "add_text"):
-                logger.experiment.add_text("collapse_guard", message, step)
+        for writer in tensorboard_writers(trainer.loggers):
+            writer.add_text("collapse_guard", message, step)
 
 
 def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.callbacks.validation_pictures import EVALUATION_TILE_POINTS
@@ -26,9 +26,7 @@ class EpochFigures(Callback):
         self.steps: list[int] = []
         self.losses: list[float] = []
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Collect the loss; draw when an epoch has ended."""
         if trainer.global_step % self.every_steps == 0:
             self.steps.append(trainer.global_step)

@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -28,7 +28,7 @@ class TrainingProgress(ProgressBar):
         self.task = TaskID(0)
         self.started, self.first_step, self.shown = 0.0, 0, 0.0
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Show the bar."""
         self.started = self.shown = time.perf_counter()
         self.first_step = trainer.global_step
@@ -48,9 +48,7 @@ class TrainingProgress(ProgressBar):
         self.task = self.bar.add_task("", total=trainer.max_steps, completed=trainer.global_step)
         self.bar.start()
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
         if now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
@@ -68,11 +66,11 @@ class TrainingProgress(ProgressBar):
             left = (trainer.max_steps - step) / per_second
             log.info("step %d/%d  %s  about %.0f s left", step, trainer.max_steps, text, left)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""
         self._stop(trainer.global_step)
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
         """Give the terminal back."""
         self._stop(trainer.global_step)
 

@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.rendering.blending import background_colors, blend
@@ -25,9 +26,7 @@ class ValidationPictures(Callback):
     def __init__(self, every_steps: int = 1000, view: int = 0):
         self.every_steps, self.view = every_steps, view
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render when it is time."""
         step = trainer.global_step
         if step % self.every_steps and step != trainer.max_steps:
@@ -48,6 +47,5 @@ class ValidationPictures(Callback):
         folder = Path(trainer.default_root_dir) / "images"
         save_png(folder / "validation" / f"step_{step:07d}.png", panel)
         save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))
-        for logger in trainer.loggers:
-            if hasattr(logger.experiment, "add_image"):
-                logger.experiment.add_image("validation/picture", panel.numpy(), step, dataformats="HWC")
+        for writer in tensorboard_writers(trainer.loggers):
+            writer.add_image("validation/picture", panel.numpy(), step, dataformats="HWC")

@@ -5,7 +5,7 @@ from typing import Any
 import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
-from nerf_lightning.cli import conf_folder
+from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 
 

@@ -79,7 +79,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     return RunFolder(folder, lock)
 
 
-def write_config(folder: Path, config: DictConfig, hydra_config: DictConfig) -> None:
+def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
     """Keep the config where Hydra would: `.hydra/config.yaml`, `hydra.yaml` and `overrides.yaml`."""
     OmegaConf.save(config, folder / ".hydra" / "config.yaml")
     OmegaConf.save(

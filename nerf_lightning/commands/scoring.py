@@ -68,7 +68,8 @@ class Scoring:
         """
         views = self._views(scene)
         kept = {views[i * len(views) // self.num_pictures] for i in range(self.num_pictures)} if views else set()
-        rows, started = [], time.perf_counter()
+        rows: list[dict[str, Any]] = []
+        started = time.perf_counter()
         for view in track(views, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
             picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
             truth = truth_picture(scene, view, background)

@@ -5,6 +5,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.commands.suggestions import flatten
 
 COMPARED = ("seed", "optimizer", "scheduler", "data", "field", "encoder", "model", "trainer", "scene")
@@ -16,13 +17,11 @@ def describe_run(loggers: list[Logger], config: DictConfig) -> None:
     from torch.utils.tensorboard.summary import hparams
 
     values = hyper_parameters(config)
-    for logger in loggers:
-        if not hasattr(logger.experiment, "add_text"):
-            continue
+    for writer in tensorboard_writers(loggers):
         text = OmegaConf.to_yaml(config, resolve=True)
-        logger.experiment.add_text("config", "\n".join(f"    {line}" for line in text.splitlines()), 0)
+        writer.add_text("config", "\n".join(f"    {line}" for line in text.splitlines()), 0)
         for summary in hparams(values, dict.fromkeys(FINAL_METRICS, 0.0)):
-            logger.experiment._get_file_writer().add_summary(summary)
+            writer._get_file_writer().add_summary(summary)
 
 
 def hyper_parameters(config: DictConfig) -> dict[str, Any]:

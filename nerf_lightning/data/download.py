@@ -141,7 +141,7 @@ def _check_content(part: Path, num_bytes: int, sha256: str | None) -> None:
     size = _size(part)
     if size != num_bytes:
         part.unlink()
-        raise _Failure(f"the server's file has not {num_bytes} bytes (more than that arrived)")
+        raise _Failure(f"the server's file has not {num_bytes} bytes: {size} had arrived when it was stopped")
     if sha256 is None:
         return
     with part.open("rb") as file:

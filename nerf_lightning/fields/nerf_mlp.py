@@ -13,7 +13,7 @@ from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types import FieldOutput
 
 # Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
-BATCH_NORM = {"momentum": 0.01, "eps": 1e-3}
+MOMENTUM, EPSILON = 0.01, 1e-3
 
 
 class NerfMLP(Field):
@@ -130,5 +130,5 @@ class _BatchNorm(nn.BatchNorm1d):
 
 def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:
     linear: list[nn.Module] = [nn.Linear(inputs, outputs)]
-    norm: list[nn.Module] = [_BatchNorm(outputs, **BATCH_NORM)] if batch_norm else []
+    norm: list[nn.Module] = [_BatchNorm(outputs, eps=EPSILON, momentum=MOMENTUM)] if batch_norm else []
     return nn.Sequential(*linear, *norm, nn.ReLU(inplace=True))

@@ -1,5 +1,7 @@
 """A method as named levels of (sampler, field): each level samples where the one before saw something."""
 
+from typing import cast
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -52,14 +54,14 @@ class RadianceModel(nn.Module):
     def max_samples(self) -> int:
         """The largest number of points that one ray takes in any level: what tiles are cut by."""
         counts = [0]
-        for level in self.levels.values():
+        for level in self._in_order():
             counts.append(level.sampler.num_samples_after(counts[-1]))
         return max(counts)
 
     @property
     def needs_whole_batch(self) -> bool:
         """Whether any field forbids tiles."""
-        return any(level.field.needs_whole_batch for level in self.levels.values())
+        return any(level.field.needs_whole_batch for level in self._in_order())
 
     def forward(
         self,
@@ -75,11 +77,14 @@ class RadianceModel(nn.Module):
             random: the step's numbers for these rays; None for evaluation.
         """
         history: list[Rendering] = []
-        for level in self.levels.values():
+        for level in self._in_order():
             history.append(level(rays, background, history, random))
         return history
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
-        for level in self.levels.values():
+        for level in self._in_order():
             level.field.reset_parameters()
+
+    def _in_order(self) -> list[Level]:
+        return cast(list[Level], list(self.levels.values()))

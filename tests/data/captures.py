@@ -17,9 +17,7 @@ REAL = Path(os.environ.get("NERF_LIGHTNING_DATA", Path(__file__).parents[3] / "s
 def real_capture(name: str) -> Path:
     """Return a folder of the real captures, or skip the test."""
     if not (REAL / name).is_dir():
-        pytest.skip(
-            f"{REAL / name} does not exist; NERF_LIGHTNING_DATA names the folder of the real captures"
-        )
+        pytest.skip(f"{REAL / name} does not exist; NERF_LIGHTNING_DATA names the folder of the real captures")
     return REAL / name
 
 

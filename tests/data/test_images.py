@@ -85,9 +85,7 @@ def test_sixteen_bit_colour_keeps_the_upper_byte(tmp_path):
 
 def test_refuses_sixteen_bit_grey_by_name(tmp_path):
     Image.fromarray(np.full((2, 2), 40000, dtype=np.uint16)).save(tmp_path / "a.png")
-    with pytest.raises(
-        InputError, match=r"a.png has the pixel mode 'I;16'.* Save it as an 8-bit RGB or RGBA PNG"
-    ):
+    with pytest.raises(InputError, match=r"a.png has the pixel mode 'I;16'.* Save it as an 8-bit RGB or RGBA PNG"):
         read_rgba(tmp_path / "a.png")
 
 

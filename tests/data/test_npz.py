@@ -113,7 +113,7 @@ def test_refuses_content(path, changed, message):
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut short"])
 def test_refuses_files_that_are_no_npz(tmp_path, content):
     (tmp_path / "a.npz").write_bytes(content)
-    refused(tmp_path / "a.npz", r"a.npz is not a numpy .npz archive, or is damaged: .*Remove it and copy")
+    refused(tmp_path / "a.npz", r"a.npz is not a numpy .npz archive, or is damaged: .*Remove it, and copy")
 
 
 def test_refuses_a_cut_npz(path):
