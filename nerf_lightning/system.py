@@ -49,7 +49,7 @@ class RadianceFieldSystem(LightningModule):
         seed: int,
         background: Background,
         tile_points: int | None,
-        clip_norm: float | None,
+        clip_norm: int | float | None,
         record: dict[str, Any],
     ):
         super().__init__()

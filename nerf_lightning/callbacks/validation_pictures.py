@@ -3,14 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
 from nerf_lightning.models.pictures import render_picture
-from nerf_lightning.rendering.blending import background_colors, blend
+from nerf_lightning.rendering.blending import photograph
 
 EVALUATION_TILE_POINTS = 65_536
 
@@ -41,8 +40,7 @@ class ValidationPictures(Callback):
                 pl_module.model, scene.cameras, view, scene.near, scene.far, scene.background, tile
             )
         pl_module.train()
-        behind = background_colors(scene.background, 1, torch.device("cpu"), None)
-        truth = blend(scene.pixels.view(view).float() / 255.0, behind)
+        truth = photograph(scene, view, scene.background)
         panel = mosaic(truth, picture.rgb, picture.depth, picture.opacity)
         folder = Path(trainer.default_root_dir) / "images"
         save_png(folder / "validation" / f"step_{step:07d}.png", panel)

@@ -7,8 +7,6 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
-from jaxtyping import Float
 from rich.progress import track
 from torch import Tensor
 
@@ -22,7 +20,7 @@ from nerf_lightning.export.pictures import mosaic, save_png
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
-from nerf_lightning.rendering.blending import background_colors, blend
+from nerf_lightning.rendering.blending import photograph
 from nerf_lightning.types import Background, Scene
 
 METRICS = ("psnr", "ssim", "lpips", "depth_error", "normal_error")
@@ -72,7 +70,7 @@ class Scoring:
         started = time.perf_counter()
         for view in track(views, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
             picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
-            truth = truth_picture(scene, view, background)
+            truth = photograph(scene, view, background)
             if self.quantize:
                 picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
             rows.append({"name": scene.view_names[view]} | self._measure(picture, truth, scene, view))
@@ -117,12 +115,6 @@ class Scoring:
             "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
             **scene.protocol,
         }
-
-
-def truth_picture(scene: Scene, view: int, background: Background) -> Float[Tensor, "height width 3"]:
-    """Return the photograph of a view over the background of evaluation."""
-    behind = background_colors(background, 1, torch.device("cpu"), random=None)
-    return blend(scene.pixels.view(view).float() / 255.0, behind)
 
 
 def split_hash(scene: Scene, views: list[int]) -> str:

@@ -42,11 +42,11 @@ class TrainerSettings:
     def __init__(
         self,
         max_steps: int = 200_000,
-        max_epochs: float | None = None,
+        max_epochs: int | float | None = None,
         accelerator: Literal["auto", "cpu", "gpu"] = "auto",
         precision: str = "auto",
         tile_points: int | Literal["auto"] | None = "auto",
-        clip_norm: float | None = None,
+        clip_norm: int | float | None = None,
         val_every_steps: int = 500,
         num_threads: int | None = None,
     ):

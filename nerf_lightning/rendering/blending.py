@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import Background
+from nerf_lightning.types import Background, Scene
 
 
 def background_colors(
@@ -23,7 +23,7 @@ def background_colors(
     return torch.full((num_rays, 3), 0.0 if background == "black" else 1.0, device=device)
 
 
-def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*rays 3"] | None) -> Float[Tensor, "*rays 3"]:
+def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] | None) -> Float[Tensor, "*rays 3"]:
     """Return straight-alpha colours over a background: rgb * a + background * (1 - a).
 
     Without a background the colours are taken as they are.
@@ -35,3 +35,9 @@ def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*rays 3"] |
         return rgba[..., :3]
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + background * (1.0 - alpha)
+
+
+def photograph(scene: Scene, view: int, background: Background) -> Float[Tensor, "height width 3"]:
+    """Return what a view's photograph shows over the background of evaluation."""
+    behind = background_colors(background, 1, torch.device("cpu"), random=None)
+    return blend(scene.pixels.view(view).float() / 255.0, behind)

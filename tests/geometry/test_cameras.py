@@ -53,9 +53,7 @@ def test_a_camera_looks_along_minus_z_with_x_right_and_row_0_on_top():
 
 def test_rotating_a_camera_rotates_its_rays(cameras):
     angle = torch.tensor(0.7, dtype=torch.float64)
-    turn = torch.tensor(
-        [[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]], dtype=torch.float64
-    )
+    turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]], dtype=torch.float64)
     turned = pinhole_cameras(turn @ cameras.c2w, 30.0, 24, 16)
     torch.testing.assert_close(rays_of(turned, 0).directions, rays_of(cameras, 0).directions @ turn.T)
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import some_rays
 from torch.autograd import gradcheck
 
 from nerf_lightning.rendering.quadrature import closed_weights, composite, weights_from_density
 from nerf_lightning.types import FieldOutput, RaySamples
-from scenes import some_rays
 
 
 def loop_weights(density, deltas):

@@ -1,12 +1,12 @@
 import pytest
 import torch
+from scenes import some_rays
 
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.importance import ImportanceSampler
 from nerf_lightning.samplers.stratified import StratifiedSampler
 from nerf_lightning.types import FieldOutput, RaySamples
-from scenes import some_rays
 
 
 def coarse_rendering(rays, density_at):

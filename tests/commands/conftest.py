@@ -1,0 +1,98 @@
+"""A capture that a command can read, a finished run on it, and ways to call `nerf`."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene
+
+from nerf_lightning import cli
+
+REPOSITORY = Path(__file__).parents[2]
+
+# Small enough for a test: seconds in all.
+FAST = (
+    "model=nerf_tiny",
+    "data.batch_rays=64",
+    "data.crop_steps=3",
+    "data.val_rays=64",
+    "trainer.val_every_steps=10",
+    "callbacks.validation_pictures.every_steps=10",
+    "callbacks.monitor.every_steps=5",
+    "callbacks.checkpoints.every_steps=5",
+    "evaluation.max_views=2",
+    "evaluation.num_pictures=1",
+    "path.num_frames=2",
+)
+
+
+@dataclass
+class Result:
+    """What a command left."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory):
+    """The ball as an npz file."""
+    scene = ball_scene(num_views=10, size=16, background="black")
+    pictures = torch.stack([scene.pixels.view(view) for view in range(10)]).float() / 255
+    poses = torch.eye(4).repeat(10, 1, 1)
+    poses[:, :3] = scene.cameras.c2w
+    path = tmp_path_factory.mktemp("capture") / "ball.npz"
+    np.savez(path, images=(pictures[..., :3] * pictures[..., 3:]).numpy(), poses=poses.numpy(), focal=1.6 * 16)
+    return path
+
+
+@pytest.fixture
+def nerf(monkeypatch, capfd):
+    """Call the command line in this process."""
+
+    def call(*arguments: str) -> Result:
+        monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
+        capfd.readouterr()
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        finally:
+            monkeypatch.undo()
+        return Result(code, *capfd.readouterr())
+
+    return call
+
+
+def start(*arguments: str, **options) -> subprocess.Popen:
+    """Start the command line as a process of its own."""
+    command = [sys.executable, "-m", "nerf_lightning", *map(str, arguments)]
+    return subprocess.Popen(
+        command,
+        cwd=options.pop("cwd", REPOSITORY),
+        env=os.environ | options.pop("env", {}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        **options,
+    )
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory, capture):
+    """A run of 20 steps, evaluated and filmed."""
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    process = start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=20", f"paths.output_dir={folder}"
+    )
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    (folder / "output.txt").write_text(output)
+    return folder

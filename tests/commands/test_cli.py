@@ -1,0 +1,71 @@
+import subprocess
+import sys
+
+import pytest
+
+from nerf_lightning.cli import find_commands
+
+
+def test_help_lists_every_command_with_its_line(nerf):
+    result = nerf("--help")
+    assert result.code == 0
+    for name in ("train", "eval", "render", "bench"):
+        assert f"\n  {name}" in result.out
+    assert nerf().out == result.out
+    assert all(summary for summary in find_commands().values())
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['nerf', '--help']; from nerf_lightning.cli import main; main(); "
+        "print([m for m in ('torch', 'hydra', 'numpy', 'lightning') if m in sys.modules])"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench"])
+def test_help_of_a_command_lists_groups_and_examples(nerf, command):
+    result = nerf(command, "--help")
+    assert result.code == 0
+    assert "Examples:" in result.out
+    assert f"nerf {command}" in result.out
+    assert "trainer: auto, cpu, gpu" in result.out
+
+
+def test_an_unknown_command_has_a_near_match(nerf):
+    result = nerf("trian")
+    assert result.code == 2
+    assert "Did you mean train?" in result.err
+
+
+@pytest.mark.parametrize(
+    ("override", "hint"),
+    [
+        ("trainer.max_stps=3", "trainer.max_steps"),
+        ("optimiser.lr=1", "optimizer.lr"),
+        ("model=nerf_smal", "nerf_small"),
+        ("scene=brick", "bricks"),
+    ],
+)
+def test_an_unknown_override_is_named_with_near_matches(nerf, override, hint):
+    result = nerf("train", override)
+    assert result.code == 2
+    assert override.partition("=")[0].rpartition(".")[2] in result.err
+    assert hint in result.err
+    assert "Traceback" not in result.err
+    assert len(result.err.strip().splitlines()) == 1
+
+
+def test_a_missing_value_is_named_with_the_cure(nerf):
+    result = nerf("train", "scene=blender")
+    assert result.code == 2
+    assert "scene.root has no value" in result.err
+    assert "scene.root=VALUE" in result.err
+
+
+def test_a_value_of_the_wrong_kind_is_named(nerf):
+    result = nerf("train", "field.skip=20")
+    assert result.code == 2
+    assert "skip=20 names no layer" in result.err
+    assert "Traceback" not in result.err

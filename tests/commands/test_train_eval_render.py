@@ -1,0 +1,165 @@
+"""The main job, end to end: what a run folder holds, and what eval and render make of its checkpoint."""
+
+import csv
+import json
+
+import imageio.v3 as iio
+import pytest
+import torch
+from commands.conftest import FAST
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+
+def events(folder):
+    accumulator = EventAccumulator(str(folder / "tensorboard"), size_guidance={"tensors": 0, "images": 0, "scalars": 0})
+    return accumulator.Reload()
+
+
+def test_a_run_folder_has_everything(finished_run):
+    for name in (
+        "metrics.json",
+        "metrics.csv",
+        "checkpoints/last.ckpt",
+        "checkpoints/best.ckpt",
+        ".hydra/config.yaml",
+        "video.mp4",
+        "depth.mp4",
+        "progress.mp4",
+        "train.log",
+    ):
+        assert (finished_run / name).stat().st_size > 0, name
+    assert len(list((finished_run / "images").glob("test_*.png"))) == 1
+    assert len(list((finished_run / "images" / "validation").glob("*.png"))) == 2
+
+
+def test_the_end_says_psnr_ssim_video_and_tensorboard(finished_run):
+    output = (finished_run / "output.txt").read_text()
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    assert f"test PSNR    {metrics['psnr']:.2f} dB   SSIM {metrics['ssim']:.4f}" in output
+    assert str(finished_run / "video.mp4") in output
+    assert f"tensorboard --logdir {finished_run / 'tensorboard'}" in output
+
+
+def test_metrics_carry_their_protocol(finished_run):
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    assert metrics["num_images"] == 2
+    assert metrics["lpips"] is None
+    assert "lpips_weights" in metrics["lpips_hint"]
+    assert metrics["psnr"] == pytest.approx(sum(row["psnr"] for row in metrics["per_image"]) / 2)
+    protocol = metrics["protocol"]
+    assert protocol["background"] == "black"
+    assert protocol["resolution"] == [[16, 16]]
+    assert protocol["split"] == "test"
+    assert protocol["pixels"] == "float"
+    assert len(protocol["split_hash"]) == 16
+    rows = list(csv.DictReader((finished_run / "metrics.csv").read_text().splitlines()))
+    assert [row["name"] for row in rows] == [row["name"] for row in metrics["per_image"]]
+
+
+def test_the_video_has_the_pictures_own_size(finished_run):
+    frames = iio.imread(finished_run / "video.mp4", plugin="FFMPEG")
+    assert frames.shape == (2, 16, 16, 3)
+
+
+def test_tensorboard_has_scalars_pictures_config_and_a_row_of_hyper_parameters(finished_run):
+    log = events(finished_run)
+    tags = log.Tags()
+    assert {
+        "train/loss",
+        "train/psnr_coarse",
+        "train/psnr_fine",
+        "train/learning_rate",
+        "speed/rays_per_second",
+    } <= set(tags["scalars"])
+    assert {"val/psnr", "val/psnr_standard_error", "memory/resident_gigabytes", "test/psnr"} <= set(tags["scalars"])
+    assert [event.step for event in log.Scalars("train/loss")] == [5, 10, 15, 20]
+    assert "validation/picture" in tags["images"]
+    assert "config/text_summary" in tags["tensors"]
+    assert "_hparams_/session_start_info" in log.summary_metadata
+
+
+def test_a_checkpoint_loads_with_weights_only_and_names_its_state_dict(finished_run):
+    content = torch.load(finished_run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert "model.levels.fine.field.color_head.weight" in content["state_dict"]
+    assert content["global_step"] == 20
+
+
+def test_eval_needs_the_checkpoint_alone_and_repeats_the_trained_number(finished_run, nerf, tmp_path):
+    result = nerf(
+        "eval", f"ckpt={finished_run}/checkpoints/last.ckpt", f"paths.output_dir={tmp_path}", "evaluation.max_views=2"
+    )
+    assert result.code == 0, result.err
+    ours = json.loads((tmp_path / "metrics.json").read_text())
+    theirs = json.loads((finished_run / "metrics.json").read_text())
+    assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=1e-6)
+    assert ours["protocol"]["split_hash"] == theirs["protocol"]["split_hash"]
+    assert "test PSNR" in result.out
+
+
+def test_eval_of_another_split_and_of_bytes(finished_run, nerf, tmp_path):
+    nerf(
+        "eval",
+        f"ckpt={finished_run}/checkpoints/best.ckpt",
+        f"paths.output_dir={tmp_path}",
+        "evaluation.split=train",
+        "evaluation.quantize=true",
+        "evaluation.max_views=1",
+    )
+    protocol = json.loads((tmp_path / "metrics.json").read_text())["protocol"]
+    assert (protocol["split"], protocol["pixels"]) == ("train", "8-bit")
+
+
+def test_render_needs_nothing_but_the_file(finished_run, nerf, tmp_path):
+    arguments = [f"ckpt={finished_run}/checkpoints/last.ckpt", "path=orbit", "path.num_frames=3", "path.width=21"]
+    result = nerf("render", *arguments, f"paths.output_dir={tmp_path}")
+    assert result.code == 0, result.err
+    frames = iio.imread(tmp_path / "video.mp4", plugin="FFMPEG")
+    assert frames.shape == (3, 22, 22, 3)  # 21 is odd: one pixel more, nothing rescaled
+    result = nerf("render", *arguments, f"paths.output_dir={tmp_path}", "format=frames")
+    assert result.code == 0, result.err
+    assert iio.imread(tmp_path / "video" / "frame_0002.png").shape == (21, 21, 3)
+
+
+def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7",
+        f"init_from={finished_run}/checkpoints/last.ckpt", f"paths.output_dir={tmp_path}/run", "final.video=false",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    ours = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    theirs = torch.load(finished_run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
+
+
+def test_an_epoch_is_every_training_ray_once(nerf, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_epochs=1", "data.batch_rays=100",
+        f"paths.output_dir={tmp_path}/run", "final.video=false", "final.evaluate=false", "logger=none",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    steps = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"]
+    assert steps == -(-8 * 256 // 100)
+
+
+@pytest.mark.parametrize("experiment", ["lego_article", "lego_article_100", "quickstart"])
+def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
+    scene = ["scene=npz"] if experiment == "quickstart" else []
+    article = [] if experiment == "quickstart" else ["trainer.max_epochs=null", "scene.download=null"]
+    result = nerf(
+        "train", f"experiment={experiment}", *scene, f"scene.path={capture}", *article, "trainer.max_steps=2",
+        "data.batch_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
+        f"paths.output_dir={tmp_path}/run",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
+def test_the_articles_figure_is_drawn_after_each_epoch(nerf, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "callbacks=article", "data.batch_rays=512",
+        "data.crop_steps=0", "trainer.max_steps=9", f"paths.output_dir={tmp_path}/run", "final.evaluate=false",
+        "final.video=false", "callbacks.epoch_figures.every_steps=1",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    figures = sorted(file.name for file in (tmp_path / "run/images/epochs").glob("*.png"))
+    assert figures == ["epoch_0001.png", "epoch_0002.png"]  # 4 steps an epoch, 9 steps

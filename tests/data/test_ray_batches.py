@@ -1,0 +1,97 @@
+import torch
+from scenes import ball_scene
+
+from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, Progress, RayBatches, gather
+from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+
+
+def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
+    return RayBatches(scene, Progress(), seed, batch_rays, crop_steps, crop_fraction, num_steps=100)
+
+
+def flat(scene, pixels):
+    return scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
+
+
+def test_an_epoch_is_every_training_pixel_once_and_batches_straddle_epochs():
+    scene = ball_scene()
+    total = 3 * 144
+    loader = batches(scene, batch_rays=50)
+    seen = torch.cat([flat(scene, loader.pixels_at(0, 50 * step)) for step in range(2 * total // 50 + 1)])
+    first, second = seen[:total], seen[total : 2 * total]
+    assert torch.equal(first.sort().values, torch.arange(total))
+    assert torch.equal(second.sort().values, torch.arange(total))
+    assert not torch.equal(first, second)
+
+
+def test_the_shuffle_reaches_all_rays():
+    """The fault: a shuffle buffer of a few batches; early batches would show the first view only."""
+    scene = ball_scene(num_views=20, size=16)
+    pixels = batches(scene, batch_rays=100).pixels_at(0, 0)
+    assert pixels.view.unique().numel() == 10
+    assert pixels.y.unique().numel() == 16
+
+
+def test_seeds_attempts_and_zero_differ():
+    scene = ball_scene()
+    orders = [
+        flat(scene, batches(scene, seed=seed).pixels_at(attempt, 0)) for seed, attempt in [(0, 0), (1, 0), (0, 1)]
+    ]
+    assert not torch.equal(orders[0], orders[1])
+    assert not torch.equal(orders[0], orders[2])
+    assert torch.equal(orders[0], flat(scene, batches(scene, seed=0).pixels_at(0, 0)))
+
+
+def test_the_crop_shows_centres_only_and_counts_no_epoch():
+    scene = ball_scene()
+    loader = batches(scene, batch_rays=48, crop_steps=3)
+    for step in range(3):
+        pixels = loader.pixels_at(0, 48 * step)
+        assert int(pixels.x.min()) >= 3
+        assert int(pixels.x.max()) < 9
+        assert int(pixels.y.min()) >= 3
+        assert int(pixels.y.max()) < 9
+    after = torch.cat([flat(scene, loader.pixels_at(0, 48 * (3 + step))) for step in range(9)])
+    assert torch.equal(after.sort().values, torch.arange(432))
+
+
+def test_a_gathered_batch_is_the_pixels_own_colour_and_ray():
+    scene = ball_scene()
+    pixels = batches(scene).pixels_at(0, 0)
+    batch = gather(scene, pixels)
+    for row in range(5):
+        view, x, y = int(pixels.view[row]), int(pixels.x[row]), int(pixels.y[row])
+        rays = rays_through_pixels(scene.cameras, all_pixels(scene.cameras, view), scene.near, scene.far)
+        assert torch.equal(batch.rays.directions[row], rays.directions[y, x])
+        assert torch.equal((batch.rgba[row] * 255).round().to(torch.uint8), scene.pixels.view(view)[y, x])
+
+
+def test_the_loader_follows_the_runs_progress():
+    scene = ball_scene()
+    loader = batches(scene)
+    stream = iter(loader)
+    first = next(stream)
+    assert torch.equal(next(stream).rgba, first.rgba)  # nothing was trained on: the same batch again
+    loader.progress.advance(32)
+    assert torch.equal(next(stream).rgba, loader.at(0, 32).rgba)
+    assert len(loader) == 100
+
+
+def test_validation_rays_are_fixed_and_keep_their_tail():
+    """The fault: validation that drops its last, smaller batch."""
+    scene = ball_scene()
+    rays = FixedRays(scene, "val", 100, 30)
+    assert [chunk.rgba.shape[0] for chunk in rays] == [30, 30, 30, 10]
+    assert all(torch.equal(a.rgba, b.rgba) for a, b in zip(rays, FixedRays(scene, "val", 100, 30), strict=True))
+    everything = FixedRays(scene, "val", 10**6, 1000)
+    assert sum(chunk.rgba.shape[0] for chunk in everything) == 3 * 144
+    assert set(next(iter(rays)).rays.camera_index.tolist()) <= {3, 4, 5}
+
+
+def test_views_of_different_sizes_share_one_domain():
+    scene = ball_scene()
+    domain = PixelDomain(scene, [1, 4], fraction=0.5)
+    located = domain.locate(torch.arange(len(domain)))
+    assert len(domain) == 2 * 36
+    assert located.view.tolist() == [1] * 36 + [4] * 36
+    assert (int(located.x.min()), int(located.x.max())) == (3, 8)

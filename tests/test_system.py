@@ -1,0 +1,122 @@
+import copy
+
+import pytest
+import torch
+from scenes import ball_scene, tiny_model
+
+from nerf_lightning.data.ray_batches import Progress, RayBatches
+from nerf_lightning.errors import InputError
+from nerf_lightning.losses.mse import MeanSquaredError
+from nerf_lightning.schedules.exponential import ExponentialDecay
+from nerf_lightning.system import RadianceFieldSystem
+
+
+class StubOptimizer:
+    """Stands in for Lightning's wrapper: counts, does not update."""
+
+    def __init__(self, parameters):
+        self.param_groups = [{"lr": 1.0, "params": list(parameters)}]
+
+    def zero_grad(self):
+        for parameter in self.param_groups[0]["params"]:
+            parameter.grad = None
+
+    def step(self):
+        pass
+
+
+def make_system(tile_points, model=None, background="white", clip_norm=None, seed=0):
+    system = RadianceFieldSystem(
+        model=model or tiny_model(density_bias=0.5),
+        loss=MeanSquaredError(),
+        optimizer=torch.optim.Adam,
+        schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
+        progress=Progress(),
+        seed=seed,
+        background=background,
+        tile_points=tile_points,
+        clip_norm=clip_norm,
+        record={},
+    )
+    optimizer = StubOptimizer(system.parameters())
+    system.optimizers = lambda: optimizer
+    system.manual_backward = lambda loss: loss.backward()
+    return system
+
+
+def gradients(system, scene, steps=1):
+    loader = RayBatches(scene, system.progress, 0, 64, 0, 0.5, 10)
+    for _ in range(steps):
+        system.training_step(loader.at(0, system.progress.rays_seen), 0)
+    return torch.cat([p.grad.flatten() for p in system.model.parameters()]), system.last_step["losses"]
+
+
+@pytest.mark.parametrize("background", ["white", "black", "random", "none"])
+@pytest.mark.parametrize("tile_points", [16, 100, 512])
+def test_a_tiled_step_equals_the_whole_step_up_to_rounding(tile_points, background):
+    scene = ball_scene()
+    model = tiny_model(density_bias=0.5)
+    whole, losses = gradients(make_system(None, copy.deepcopy(model), background), scene)
+    tiled, tiled_losses = gradients(make_system(tile_points, copy.deepcopy(model), background), scene)
+    torch.testing.assert_close(tiled, whole, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(tiled_losses, losses, rtol=1e-5, atol=1e-7)
+    assert float(whole.norm()) > 0
+
+
+def test_clipping_scales_the_whole_gradient():
+    gradient, _ = gradients(make_system(100, clip_norm=1e-3), ball_scene())
+    assert abs(float(gradient.norm()) - 1e-3) < 1e-6
+
+
+def test_batch_norm_with_tiles_is_refused_by_name():
+    with pytest.raises(InputError, match=r"field\.batch_norm=true .* trainer\.tile_points=null"):
+        make_system(64, tiny_model(batch_norm=True))
+    make_system(None, tiny_model(batch_norm=True))
+
+
+def test_a_loss_that_is_not_a_number_stops_the_run_before_the_weights_change():
+    system = make_system(None)
+    system._trainer = type("T", (), {"global_step": 7, "default_root_dir": "outputs/x"})()
+    with torch.no_grad():
+        system.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
+    with pytest.raises(InputError, match=r"loss of step 7 is not a finite number.*outputs/x/checkpoints/last\.ckpt"):
+        gradients(system, ball_scene())
+    assert system.progress.step == 0
+
+
+def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
+    states = []
+    for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:
+        torch.rand(3)  # what was drawn before must not matter
+        system = make_system(None, seed=seed)
+        system.progress.attempt = attempt
+        system.initialize()
+        states.append(torch.cat([p.detach().flatten() for p in system.parameters()]))
+    assert torch.equal(states[0], states[1])
+    assert not torch.equal(states[0], states[2])
+    assert not torch.equal(states[0], states[3])
+
+
+def test_the_learning_rate_follows_the_schedule():
+    system = make_system(None)
+    system.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
+    rates = []
+    loader = RayBatches(ball_scene(), system.progress, 0, 16, 0, 0.5, 10)
+    for _ in range(4):
+        system.training_step(loader.at(0, 0), 0)
+        rates.append(system.optimizers().param_groups[0]["lr"])
+    assert rates == [0.5, 0.5, 0.25, 0.125]
+
+
+def test_validation_has_no_jitter():
+    system = make_system(None)
+    logged = {}
+    system.log = lambda name, value: logged.__setitem__(name, float(value))
+    loader = RayBatches(ball_scene(), system.progress, 0, 64, 0, 0.5, 10)
+    values = []
+    for _ in range(2):
+        system.validation_step(loader.at(0, 0), 0)
+        system.on_validation_epoch_end()
+        values.append(dict(logged))
+    assert values[0] == values[1]
+    assert values[0]["val/psnr_standard_error"] > 0
