@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.sweep_arguments import sweep_arguments
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -82,7 +83,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
     with _explained(command):
         prepare = getattr(module, "prepare", list)
-        sys.argv = [f"nerf {command}", *prepare(arguments)]
+        sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)()
 
 

@@ -87,27 +87,35 @@ class RadianceFieldSystem(LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """Take one step: tiles forward and backward, clip, update."""
-        num_rays = batch.rays.near.numel()
         optimizer = self.optimizers()
         optimizer.zero_grad()  # type: ignore[union-attr]
-        key = fold(self.seed, self.progress.attempt, self.progress.step)
-        random = batch_random(key, num_rays, self.device)
-        background = background_colors(self.background, num_rays, self.device, random)
-        target = blend(batch.rgba, background)
-        parts = []
-        for tile in tiles(num_rays, self._tile_rays(num_rays)):
-            behind = None if background is None else background[tile]
-            renderings = self.model(batch.rays[tile], behind, random[tile])
-            losses = torch.stack(self.loss(renderings, target[tile])) * (target[tile].shape[0] / num_rays)
-            self.manual_backward(losses.sum())
-            parts.append((losses.detach(), renderings[-1].foreground.detach()))
-        losses, foreground = torch.stack([p[0] for p in parts]).sum(0), torch.cat([p[1] for p in parts])
-        self.last_step = {"losses": losses, "foreground": foreground, "target": target}
+        self.last_step = self.accumulate_gradients(batch, self.manual_backward)
         # Elsewhere than on the CPU the question costs a synchronisation, so it is asked seldom and before each save.
         if self.device.type == "cpu" or self.progress.step % 100 == 0:
             self.require_finite_loss()
         self._update(optimizer)
-        self.progress.advance(num_rays)
+        self.progress.advance(batch.rays.near.numel())
+
+    def accumulate_gradients(self, batch: Batch, backward: Callable[[Tensor], None]) -> dict[str, Tensor]:
+        """Send a batch forward and backward, tile by tile.
+
+        Returns:
+            `losses` per level, and each ray's `foreground` light and `target` colour, detached.
+        """
+        num_rays = batch.rays.near.numel()
+        key = fold(self.seed, self.progress.attempt, self.progress.step)
+        random = batch_random(key, num_rays, self.device)
+        background = background_colors(self.background, num_rays, self.device, random)
+        target = blend(batch.rgba, background)
+        losses, foreground = [], []
+        for tile in tiles(num_rays, self._tile_rays(num_rays)):
+            behind = None if background is None else background[tile]
+            renderings = self.model(batch.rays[tile], behind, random[tile])
+            share = torch.stack(self.loss(renderings, target[tile])) * (target[tile].shape[0] / num_rays)
+            backward(share.sum())
+            losses.append(share.detach())
+            foreground.append(renderings[-1].foreground.detach())
+        return {"losses": torch.stack(losses).sum(0), "foreground": torch.cat(foreground), "target": target}
 
     def require_finite_loss(self) -> None:
         """Stop the run at a loss that is not a number, before it ruins the weights or reaches a checkpoint."""

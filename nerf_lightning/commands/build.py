@@ -3,17 +3,20 @@
 import importlib
 from typing import Any
 
-import torch
 import yaml
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
+from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.samplers.base import Sampler
+from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.types import Scene
 
 CONTRACTS = (Encoder, Field, Sampler, Level, RadianceModel)
 ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
@@ -22,6 +25,26 @@ ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samp
 def build(node: DictConfig) -> Any:
     """Build one node of the user's own config."""
     return instantiate(node, _convert_="all")
+
+
+def build_system(
+    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, record: dict[str, Any]
+) -> RadianceFieldSystem:
+    """Build model, loss, optimizer and schedule into the system, with the weights of its seed."""
+    system = RadianceFieldSystem(
+        model=build(config.model),
+        loss=build(config.loss),
+        optimizer=build(config.optimizer),
+        schedule=build(config.scheduler),
+        progress=progress,
+        seed=config.seed,
+        background=scene.background,
+        tile_points=settings.tile_points,
+        clip_norm=settings.clip_norm,
+        record=record,
+    )
+    system.initialize()
+    return system
 
 
 def load_model(checkpoint: Checkpoint) -> RadianceModel:
@@ -59,12 +82,6 @@ def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
             f"The weights of {checkpoint.path} do not fit this model: {reason}. Give the model, field and encoder "
             "settings that they were trained with (.hydra/overrides.yaml of that run)."
         ) from error
-
-
-def model_from(path: str, device: str) -> tuple[RadianceModel, Checkpoint]:
-    """Read a checkpoint and its model."""
-    checkpoint = read_checkpoint(path)
-    return load_model(checkpoint).to(torch.device(device)), checkpoint
 
 
 def _require_our_own(node: Any, source: str) -> None:

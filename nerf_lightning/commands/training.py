@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.checkpoints import make_record, read_checkpoint
-from nerf_lightning.commands.build import build, load_weights
+from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import finish
 from nerf_lightning.commands.run_folder import RunFolder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
@@ -70,19 +70,7 @@ def _assemble(config: DictConfig, folder: RunFolder, settings: TrainerSettings, 
     plain = OmegaConf.to_container(config, resolve=True)
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
     progress = Progress()
-    system = RadianceFieldSystem(
-        model=build(config.model),
-        loss=build(config.loss),
-        optimizer=build(config.optimizer),
-        schedule=build(config.scheduler),
-        progress=progress,
-        seed=config.seed,
-        background=scene.background,
-        tile_points=None if settings.tile_points is None else settings.tile_points,
-        clip_norm=settings.clip_norm,
-        record=make_record(scene, yaml.safe_dump(plain), choices),
-    )
-    system.initialize()
+    system = build_system(config, settings, scene, progress, make_record(scene, yaml.safe_dump(plain), choices))
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, *build(config.callbacks).values()]

@@ -8,6 +8,7 @@ import pytest
 import torch
 from commands.conftest import FAST
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from videos import read_video
 
 
 def events(folder):
@@ -57,7 +58,7 @@ def test_metrics_carry_their_protocol(finished_run):
 
 
 def test_the_video_has_the_pictures_own_size(finished_run):
-    frames = iio.imread(finished_run / "video.mp4", plugin="FFMPEG")
+    _, frames = read_video(finished_run / "video.mp4")
     assert frames.shape == (2, 16, 16, 3)
 
 
@@ -113,7 +114,7 @@ def test_render_needs_nothing_but_the_file(finished_run, nerf, tmp_path):
     arguments = [f"ckpt={finished_run}/checkpoints/last.ckpt", "path=orbit", "path.num_frames=3", "path.width=21"]
     result = nerf("render", *arguments, f"paths.output_dir={tmp_path}")
     assert result.code == 0, result.err
-    frames = iio.imread(tmp_path / "video.mp4", plugin="FFMPEG")
+    _, frames = read_video(tmp_path / "video.mp4")
     assert frames.shape == (3, 22, 22, 3)  # 21 is odd: one pixel more, nothing rescaled
     result = nerf("render", *arguments, f"paths.output_dir={tmp_path}", "format=frames")
     assert result.code == 0, result.err

@@ -1,12 +1,12 @@
 import os
 import sys
-import warnings
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from videos import read_video
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.video import pad_to_even, write_frames, write_video
@@ -18,21 +18,10 @@ def plain(height, width, colors=COLORS):
     return [torch.tensor(color, dtype=torch.uint8).expand(height, width, 3) for color in colors]
 
 
-def read(path, **options):
-    reader = imageio_ffmpeg.read_frames(str(path), **options)
-    meta = next(reader)
-    width, height = meta["size"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # imageio-ffmpeg's reader forgets its pipes
-        frames = [np.frombuffer(frame, np.uint8) for frame in reader]
-        del reader
-    return meta, np.stack(frames).reshape(len(frames), height, width, -1)
-
-
 def test_a_video_reads_back(tmp_path):
     path = tmp_path / "new" / "orbit.mp4"
     write_video(path, iter(plain(64, 96)), fps=24, total=4)
-    meta, frames = read(path)
+    meta, frames = read_video(path)
     assert frames.shape == (4, 64, 96, 3)
     assert meta["codec"] == "h264"
     assert meta["pix_fmt"].startswith("yuv420p")
@@ -45,7 +34,7 @@ def test_a_video_reads_back(tmp_path):
 def test_brightness_is_stored_by_the_rule_that_the_file_names(tmp_path):
     path = tmp_path / "a.mp4"
     write_video(path, plain(64, 96), fps=24)
-    _, stored = read(path, pix_fmt="yuv444p", bits_per_pixel=24)
+    _, stored = read_video(path, pix_fmt="yuv444p", bits_per_pixel=24)
     wanted = 16 + 219 / 255 * (np.array(COLORS) @ np.array([0.2126, 0.7152, 0.0722]))
     luma = stored.reshape(4, 3, -1)[:, 0].mean(axis=-1)
     assert np.abs(luma - wanted).max() < 1.5
@@ -57,7 +46,7 @@ def test_an_odd_size_gets_one_pixel_and_no_rescaling(tmp_path):
     stripes[-1] = 128
     path = tmp_path / "odd.mp4"
     write_video(path, [stripes] * 3, fps=10)
-    _, frames = read(path)
+    _, frames = read_video(path)
     assert frames.shape == (3, 202, 302, 3)
     assert np.abs(frames[0, 100, :301:20].astype(int) - 255).max() < 20
     assert frames[0, 100, 10:300:20].max() < 20

@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -45,7 +46,7 @@ def test_depth_of_constant_density_converges_at_second_order():
         output = FieldOutput(torch.full((bins,), sigma, dtype=torch.float64), torch.zeros(bins, 3, dtype=torch.float64))
         rendering = composite(output, RaySamples(edges), rays, torch.zeros(3, dtype=torch.float64))
         errors.append(abs(float(rendering.depth) - exact))
-    slopes = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
+    slopes = [math.log2(a / b) for a, b in pairwise(errors)]
     assert all(abs(slope - 2.0) < 0.1 for slope in slopes)
 
 

@@ -1,0 +1,10 @@
+"""Measure training and rendering speed against plain float32 and against the machine's own matrix rate."""
+
+from omegaconf import DictConfig
+
+
+def run(config: DictConfig) -> float:
+    """Measure, print a table, write bench.json; return training rays per second."""
+    from nerf_lightning.commands.benchmark import benchmark
+
+    return benchmark(config)

@@ -1,0 +1,90 @@
+"""A run stopped anywhere and resumed ends with the weights, bit for bit, of one that was never stopped."""
+
+import random
+import signal
+import time
+
+import pytest
+import torch
+from commands.conftest import FAST, start
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+STEPS = 300
+
+
+def arguments(capture, folder, steps=STEPS):
+    return (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}", "trainer.num_threads=2",
+        "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto",
+        "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=7",
+        "trainer.val_every_steps=100", f"paths.output_dir={folder}",
+    )  # fmt: skip
+
+
+def state(folder):
+    content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    return content["global_step"], content["state_dict"], content["optimizer_states"][0]["state"]
+
+
+def assert_same_to_the_bit(ours, theirs):
+    assert ours[0] == theirs[0]
+    assert all(torch.equal(ours[1][key], theirs[1][key]) for key in theirs[1])
+    for parameter, moments in theirs[2].items():
+        assert all(torch.equal(ours[2][parameter][name], value) for name, value in moments.items())
+
+
+def steps_saved(folder):
+    last = folder / "checkpoints" / "last.ckpt"
+    return torch.load(last, weights_only=True)["global_step"] if last.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def never_stopped(capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("never_stopped") / "run"
+    process = start(*arguments(capture, folder))
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    return state(folder)
+
+
+def run_and_stop(capture, folder, how, after_step):
+    """Start or resume; stop as soon as `after_step` is saved; return what was said and the exit code."""
+    after_step = max(after_step, steps_saved(folder) + 7)
+    process = start(*arguments(capture, folder))
+    while process.poll() is None and steps_saved(folder) < after_step:
+        time.sleep(0.02)
+    if process.poll() is None:
+        process.send_signal(how)
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture, tmp_path, never_stopped):
+    folder = tmp_path / "run"
+    order = random.Random(time.time_ns())
+    points = sorted(order.sample(range(7, STEPS - 60), 3))
+    for point, how in zip(points, [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], strict=True):
+        code, output = run_and_stop(capture, folder, how, point)
+        assert code in (-how, 128 + how), (points, output)
+        if how != signal.SIGKILL:
+            assert "go on with: nerf train" in output
+            assert f"resume={folder}" in output
+    process = start(*arguments(capture, folder))
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert "going on from step" in output
+    assert_same_to_the_bit(state(folder), never_stopped)
+    steps = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("train/loss")]
+    assert steps == list(range(5, STEPS + 1, 5)), "TensorBoard shows each step once"
+
+
+@pytest.mark.slow
+def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped):
+    folder = tmp_path / "run"
+    for steps in (40, STEPS):
+        extra = ("scheduler.decay_steps=300",)
+        process = start(*arguments(capture, folder, steps), *extra)
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, output
+    assert_same_to_the_bit(state(folder), never_stopped)

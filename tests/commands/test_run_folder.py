@@ -1,0 +1,103 @@
+"""Which folder a run takes, and which it leaves alone."""
+
+import json
+
+import pytest
+from commands.conftest import FAST
+from configs import composed
+from omegaconf import OmegaConf
+
+from nerf_lightning.commands.run_folder import open_run, write_config
+from nerf_lightning.errors import InputError
+
+
+def config(tmp_path, *overrides):
+    return composed("train", f"paths.root_dir={tmp_path}", *overrides)
+
+
+def begin(cfg, steps=100, job_folder=None):
+    run = open_run(cfg, steps, job_folder)
+    hydra = OmegaConf.create({"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}})
+    write_config(run.path, cfg, hydra)
+    return run
+
+
+def test_without_a_name_the_folder_is_fresh_each_time(tmp_path):
+    first, second = begin(config(tmp_path)), begin(config(tmp_path))
+    assert first.path != second.path
+    assert first.path.parent == tmp_path / "bricks"
+    first.release()
+    second.release()
+
+
+def test_auto_finds_the_newest_unfinished_run_of_the_same_config(tmp_path):
+    done = begin(config(tmp_path))
+    done.finish(100)
+    done.release()
+    other = begin(config(tmp_path, "seed=1"))
+    other.release()
+    open_one = begin(config(tmp_path))
+    open_one.release()
+    again = begin(config(tmp_path, "resume=auto"))
+    assert again.path == open_one.path
+    again.finish(100)
+    again.release()
+    fresh = begin(config(tmp_path, "resume=auto"))
+    assert fresh.path not in (done.path, open_one.path, other.path)
+    fresh.release()
+
+
+def test_a_longer_run_takes_a_finished_one_for_unfinished(tmp_path):
+    run = begin(config(tmp_path, "trainer.max_steps=100"))
+    run.finish(100)
+    run.release()
+    assert begin(config(tmp_path, "trainer.max_steps=200", "resume=auto"), steps=200).path == run.path
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    run = begin(config(tmp_path, f"paths.output_dir={tmp_path}/here"))
+    with pytest.raises(InputError, match="in use by another process"):
+        open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here", "resume=auto"), 100, None)
+    run.release()
+
+
+def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path):
+    begin(config(tmp_path, f"paths.output_dir={tmp_path}/here")).release()
+    before = json.loads((tmp_path / "here/run.json").read_text())
+    with pytest.raises(InputError, match=r"occupied by a run of another config \(seed: there 0, here 3\)"):
+        open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here", "seed=3", "resume=auto"), 100, None)
+    with pytest.raises(InputError, match=r"already holds a run of this very config. Add resume=auto"):
+        open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here"), 100, None)
+    assert json.loads((tmp_path / "here/run.json").read_text()) == before
+
+
+def test_resume_of_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(InputError, match="there is no run in"):
+        open_run(config(tmp_path, f"resume={tmp_path}/nothing"), 100, None)
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cannot be written.*paths\.output_dir=DIR"):
+        open_run(config(tmp_path, f"paths.output_dir={tmp_path}/file/run"), 100, None)
+
+
+@pytest.mark.slow
+def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
+    result = nerf(
+        "train", "-m", "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1", "data.batch_rays=32,48",
+        "trainer.max_steps=3", "final.video=false", f"paths.root_dir={tmp_path}",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    runs = sorted((tmp_path / "sweeps").glob("*/*/metrics.json"))
+    assert len(runs) == 4
+    assert {run.parent.name for run in runs} == {
+        "0_seed=0_data.batch_rays=32", "1_seed=0_data.batch_rays=48",
+        "2_seed=1_data.batch_rays=32", "3_seed=1_data.batch_rays=48",
+    }  # fmt: skip
+    for run in runs:
+        folder = run.parent
+        assert (folder / "checkpoints/last.ckpt").is_file()
+        assert (folder / ".hydra/config.yaml").is_file()
+        assert len(list((folder / "tensorboard").glob("events*"))) == 1
