@@ -93,8 +93,8 @@ def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
     runs = sorted((tmp_path / "sweeps").glob("*/*/metrics.json"))
     assert len(runs) == 4
     assert {run.parent.name for run in runs} == {
-        "0_seed=0_data.batch_rays=32", "1_seed=0_data.batch_rays=48",
-        "2_seed=1_data.batch_rays=32", "3_seed=1_data.batch_rays=48",
+        "0_seed=0_data.batch_rays=32", "1_seed=1_data.batch_rays=32",
+        "2_seed=0_data.batch_rays=48", "3_seed=1_data.batch_rays=48",
     }  # fmt: skip
     for run in runs:
         folder = run.parent

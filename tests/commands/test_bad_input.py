@@ -1,0 +1,228 @@
+"""What a person reads when the input is bad: one paragraph that names the thing and the cure, exit code 2."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+
+from commands.conftest import FAST, REPOSITORY, start
+from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO, sweep_leftovers
+from nerf_lightning.errors import InputError
+
+
+def said(result, *parts):
+    assert result.code == 2, result.err
+    paragraph = result.err.strip()
+    assert len(paragraph.splitlines()) == 1, paragraph
+    assert "Traceback" not in paragraph
+    for part in parts:
+        assert part in paragraph, paragraph
+
+
+@pytest.fixture
+def last(finished_run):
+    return finished_run / "checkpoints" / "last.ckpt"
+
+
+@pytest.mark.parametrize("command", ["eval", "render"])
+def test_a_missing_checkpoint(nerf, tmp_path, command):
+    said(nerf(command, f"ckpt={tmp_path}/none.ckpt"), "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt")
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000])
+def test_a_truncated_checkpoint(nerf, last, tmp_path, size):
+    (tmp_path / "cut.ckpt").write_bytes(last.read_bytes()[:size])
+    said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), "cut.ckpt cannot be read", f"{size} bytes", "train again")
+
+
+def changed(last, tmp_path, change):
+    content = torch.load(last, weights_only=True)
+    change(content)
+    torch.save(content, tmp_path / "changed.ckpt")
+    return f"ckpt={tmp_path}/changed.ckpt"
+
+
+def test_a_checkpoint_of_another_format(nerf, last, tmp_path):
+    path = changed(last, tmp_path, lambda content: content["nerf_lightning"].__setitem__("format", 99))
+    said(nerf("render", path), "has checkpoint format 99", "reads format 1", "Use the version that wrote it")
+
+
+def test_a_file_of_torch_that_is_no_checkpoint_of_ours(nerf, tmp_path):
+    torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
+    said(nerf("render", f"ckpt={tmp_path}/other.ckpt"), "not a checkpoint of nerf_lightning")
+
+
+class Bomb:
+    """Would make a file if it were unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (open, (str(self.path), "w"))
+
+
+def test_nothing_from_a_file_is_executed(nerf, tmp_path):
+    torch.save({"state_dict": Bomb(tmp_path / "executed")}, tmp_path / "bomb.ckpt")
+    said(nerf("render", f"ckpt={tmp_path}/bomb.ckpt"), "nothing from a file is executed")
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "builtins.eval",
+        "lightning.pytorch.loggers.csv_logs.os.system",
+        "nerf_lightning.commands.build.instantiate",
+        "nerf_lightning.fields.nerf_mlp.torch.load",
+        "nerf_lightning.fields.nerf_mlp.functional.relu",
+        "nerf_lightning.fields.nerf_mlp.Encoder",
+        "nerf_lightning.encoders.nothing.Here",
+    ],
+)
+def test_a_checkpoint_builds_only_our_own_model_parts(nerf, last, tmp_path, target):
+    def plant(content):
+        config = yaml.safe_load(content["nerf_lightning"]["config"])
+        config["model"]["levels"]["fine"]["field"]["_target_"] = target
+        content["nerf_lightning"]["config"] = yaml.safe_dump(config)
+
+    said(nerf("render", changed(last, tmp_path, plant)), f"asks for {target}", "so it is not built")
+
+
+@pytest.mark.parametrize(("key", "value"), [("density_bias", "${oc.env:HOME}"), ("_partial_", True), ("_args_", [1])])
+def test_a_checkpoint_holds_no_interpolations_or_instructions(nerf, last, tmp_path, key, value):
+    def plant(content):
+        config = yaml.safe_load(content["nerf_lightning"]["config"])
+        config["model"]["levels"]["fine"]["field"][key] = value
+        content["nerf_lightning"]["config"] = yaml.safe_dump(config)
+
+    said(nerf("render", changed(last, tmp_path, plant)), "which is not read from files")
+
+
+def test_weights_that_do_not_fit(nerf, last, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "field.width=48", f"init_from={last}",
+        f"paths.output_dir={tmp_path}/run", "trainer.max_steps=1",
+    )  # fmt: skip
+    said(result, "do not fit this model", "size mismatch", "overrides.yaml")
+
+
+def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
+    (tmp_path / "file").write_text("")
+    for command in (
+        ("train", "scene=npz", f"scene.path={capture}", *FAST),
+        ("eval", f"ckpt={last}"),
+        ("render", f"ckpt={last}"),
+    ):
+        said(nerf(*command, f"paths.output_dir={tmp_path}/file/run"), "cannot be written", "paths.output_dir=DIR")
+
+
+def test_near_behind_far(nerf, capture, tmp_path):
+    result = nerf("train", "scene=npz", f"scene.path={capture}", "scene.near=7.0", f"paths.output_dir={tmp_path}/run")
+    said(result, "near", "7.0", "far")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_capture(nerf, tmp_path):
+    said(nerf("train", "scene=blender", f"scene.root={tmp_path}/none", f"paths.output_dir={tmp_path}/run"), "none")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_that_is_not_there(nerf):
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    said(nerf("train", "trainer=gpu"), "torch sees no CUDA device", "trainer=cpu")
+
+
+def test_batch_norm_with_tiles(nerf, capture, tmp_path):
+    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, "field.batch_norm=true",
+                  f"paths.output_dir={tmp_path}/run")  # fmt: skip
+    said(result, "field.batch_norm=true", "trainer.tile_points=null")
+
+
+def test_batch_norm_trains_whole_batches(nerf, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "field.batch_norm=true", "trainer.tile_points=null",
+        "trainer.max_steps=2", "final.video=false", f"paths.output_dir={tmp_path}/run",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+
+
+def test_a_loss_that_is_not_a_number(nerf, capture, tmp_path):
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "optimizer.lr=1e38", f"paths.output_dir={tmp_path}/run",
+        "trainer.max_steps=50",
+    )  # fmt: skip
+    said_lines = [line for line in result.err.splitlines() if line.startswith("nerf: ")]
+    assert result.code == 2
+    assert len(said_lines) == 1
+    assert "is not a finite number" in said_lines[0]
+    assert "optimizer.lr" in said_lines[0]
+
+
+def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
+    """A real limit on the size of files, in a process of its own."""
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"step": torch.tensor(1)}, path)
+    code = (
+        "import resource, signal, torch, sys\n"
+        "from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO\n"
+        "from nerf_lightning.errors import InputError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
+        "try:\n"
+        f"    AtomicCheckpointIO().save_checkpoint({{'step': torch.zeros(1_000_000)}}, {str(path)!r})\n"
+        "except InputError as error:\n"
+        "    print(error); sys.exit(2)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 2, done.stderr
+    assert "could not be saved" in done.stdout
+    assert f"The former checkpoint {path} is unharmed" in done.stdout
+    assert int(torch.load(path, weights_only=True)["step"]) == 1
+    assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
+
+
+def test_what_a_killed_process_left_is_swept(tmp_path):
+    (tmp_path / ".last.ckpt.abc.tmp").write_text("half")
+    (tmp_path / "last.ckpt").write_text("whole")
+    sweep_leftovers(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
+        AtomicCheckpointIO().save_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+
+
+def test_no_ffmpeg(nerf, last, tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    result = nerf("render", f"ckpt={last}", "path.num_frames=2", f"paths.output_dir={tmp_path}")
+    said(result, "ffmpeg", "PNG frames")
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_lpips_without_its_weights(nerf, last, tmp_path):
+    said(nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "there is no such file", "alexnet")
+
+
+@pytest.mark.slow
+def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
+    process = start("render", f"ckpt={last}", "path.num_frames=5000", "path.width=200", f"paths.output_dir={tmp_path}")
+    try:
+        process.wait(timeout=8)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    assert not list(tmp_path.glob("*.mp4"))

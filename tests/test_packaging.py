@@ -1,0 +1,33 @@
+"""The wheel is enough: conf/ travels inside the package."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_a_wheel_installed_elsewhere_gives_a_working_nerf(tmp_path):
+    def python(*arguments, cwd, **env):
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=cwd, env=os.environ | env, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    python("-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist"), cwd=REPOSITORY)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        packed = {name for name in content.namelist() if name.startswith("nerf_lightning/conf/")}
+        content.extractall(tmp_path / "site")
+    ours = {f"nerf_lightning/{file.relative_to(REPOSITORY)}" for file in (REPOSITORY / "conf").rglob("*.yaml")}
+    assert packed == ours
+    elsewhere = {"cwd": tmp_path, "PYTHONPATH": str(tmp_path / "site")}
+    where = python("-c", "import nerf_lightning.conf_folder as c; print(c.conf_folder())", **elsewhere)
+    assert where.strip() == str(tmp_path / "site" / "nerf_lightning" / "conf")
+    assert "num_frequencies: 10" in python("-m", "nerf_lightning", "train", "--cfg", "job", **elsewhere)
