@@ -63,6 +63,10 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         normal = metrics["normal_error"]
         angle = "" if normal is None else f"   normal error {normal:.1f} degrees"
         lines.append(f"depth error  {metrics['depth_error']:.4f} scene units{angle}")
+    if metrics["lpips"] is None:
+        lines.append(f"LPIPS        not computed: {metrics['lpips_hint']}")
+    else:
+        lines.append(f"LPIPS        {metrics['lpips']:.4f}")
     return [*lines, f"metrics      {folder / 'metrics.json'}"]
 
 

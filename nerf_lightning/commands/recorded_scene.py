@@ -1,5 +1,6 @@
 """The scene that a checkpoint was trained on, as overrides for our own conf/."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import yaml
@@ -25,12 +26,18 @@ def scene_overrides(path: str) -> list[str]:
         )
     recorded = yaml.safe_load(checkpoint.config).get("scene", {})
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
-    plain = {key: value for key, value in recorded.items() if key in ours and _is_plain(key, value)}
-    return [f"scene={name}", *(f"scene.{key}={_quoted(value)}" for key, value in plain.items())]
+    return [f"scene={name}", *(f"scene.{key}={_quoted(value)}" for key, value in _plain_values(recorded, ours))]
 
 
-def _is_plain(key: str, value: Any) -> bool:
-    return not key.startswith("_") and (value is None or isinstance(value, (bool, int, float, str)))
+def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what may be taken from a file: plain values of settings that we know, but no classes and no addresses."""
+    for key, value in recorded.items():
+        if key not in ours or key.startswith("_") or key == "download":
+            continue
+        if isinstance(value, dict) and isinstance(ours[key], dict):
+            yield from _plain_values(value, ours[key], f"{path}{key}.")
+        elif value is None or isinstance(value, (bool, int, float, str)):
+            yield f"{path}{key}", value
 
 
 def _quoted(value: Any) -> str:

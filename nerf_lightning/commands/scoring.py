@@ -76,7 +76,7 @@ class Scoring:
             rows.append({"name": scene.view_names[view]} | self._measure(picture, truth, scene, view))
             if view in kept:
                 panel = mosaic(truth, picture.rgb, picture.depth, picture.opacity)
-                save_png(folder / "images" / f"{self.split}_{_file_name(scene.view_names[view])}.png", panel)
+                save_png(folder / "images" / _file_name(self.split, scene.view_names[view]), panel)
         result: dict[str, Any] = mean_over_images([{m: row[m] for m in METRICS} for row in rows]) | {
             "num_images": len(rows),
             "seconds_per_image": (time.perf_counter() - started) / len(rows),
@@ -154,5 +154,6 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
     }
 
 
-def _file_name(view_name: str) -> str:
-    return view_name.replace("/", "_").replace("\\", "_")
+def _file_name(split: str, view_name: str) -> str:
+    plain = view_name.replace("/", "_").replace("\\", "_")
+    return f"{plain}.png" if plain.startswith(f"{split}_") else f"{split}_{plain}.png"

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from nerf_lightning.errors import InputError
 
 LPIPS_HINT = (
-    "LPIPS needs the weights of a backbone: where torchvision is installed, run "
+    "it needs the weights of a backbone: where torchvision is installed, run "
     "`torch.save(torchvision.models.alexnet(weights='DEFAULT').state_dict(), 'alexnet.pth')`, "
-    "copy the file here and set lpips_weights=alexnet.pth (vgg16 in place of alexnet for the net vgg)"
+    "copy the file here and set evaluation.lpips_weights=alexnet.pth (vgg16 in place of alexnet for the net vgg)"
 )
 
 Net = Literal["alex", "vgg"]
@@ -84,15 +84,19 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
     if weights is None:
         return None
     if not Path(weights).is_file():
-        raise InputError(f"lpips_weights={weights}: there is no such file. {LPIPS_HINT}")
+        raise InputError(f"evaluation.lpips_weights={weights}: there is no such file. To have LPIPS, {LPIPS_HINT}")
     try:
         state = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as error:  # a file of another kind can fail in any way
-        raise InputError(f"lpips_weights={weights}: this is not a file of weights. {LPIPS_HINT}") from error
+        raise InputError(
+            f"evaluation.lpips_weights={weights}: this is not a file of weights. To have LPIPS, {LPIPS_HINT}"
+        ) from error
     model = LPIPS(net)
     wrong = _mismatch(state, model.state_dict())
     if wrong is not None:
-        raise InputError(f"lpips_weights={weights}: this is not the backbone {net!r}: {wrong}. {LPIPS_HINT}")
+        raise InputError(
+            f"evaluation.lpips_weights={weights}: not the backbone {net!r}: {wrong}. To have LPIPS, {LPIPS_HINT}"
+        )
     model.load_state_dict({name: state[name] for name in model.state_dict()})
     return model.eval()
 

@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 import yaml
-
 from commands.conftest import FAST, REPOSITORY, start
+
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO, sweep_leftovers
 from nerf_lightning.errors import InputError
 
@@ -30,7 +30,9 @@ def last(finished_run):
 
 @pytest.mark.parametrize("command", ["eval", "render"])
 def test_a_missing_checkpoint(nerf, tmp_path, command):
-    said(nerf(command, f"ckpt={tmp_path}/none.ckpt"), "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt")
+    said(
+        nerf(command, f"ckpt={tmp_path}/none.ckpt"), "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt"
+    )
 
 
 @pytest.mark.parametrize("size", [0, 100, 5000])
@@ -212,7 +214,9 @@ def test_no_ffmpeg(nerf, last, tmp_path, monkeypatch):
 
 
 def test_lpips_without_its_weights(nerf, last, tmp_path):
-    said(nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "there is no such file", "alexnet")
+    said(
+        nerf("eval", f"ckpt={last}", f"evaluation.lpips_weights={tmp_path}/no.pth"), "there is no such file", "alexnet"
+    )
 
 
 @pytest.mark.slow

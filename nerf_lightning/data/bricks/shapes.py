@@ -54,9 +54,9 @@ def slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interva
 def box_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
     """Return entry and exit of a box.
 
-    >>> start, along = np.array([-4.0, 0, 0]), np.array([1.0, 0, 0])
-    >>> [float(t) for t in box_interval(start, along, np.array([1.0, 2, 3]))]
-    [3.0, 5.0]
+    >>> start, along = np.array([[-4.0], [0], [0]]), np.array([[1.0], [0], [0]])
+    >>> [t.tolist() for t in box_interval(start, along, np.array([[1.0], [2], [3]]))]
+    [[3.0], [5.0]]
     """
     entry, exit = slab_interval(origin[0], direction[0], size[0])
     for axis in (1, 2):

@@ -1,0 +1,76 @@
+import logging
+
+import pytest
+import torch
+
+from nerf_lightning.commands import trainer
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.errors import InputError
+
+
+@pytest.fixture
+def native(monkeypatch):
+    def pretend(answer):
+        monkeypatch.setattr(trainer, "has_native_bfloat16", lambda device_type: answer)
+
+    return pretend
+
+
+def test_precision_follows_the_machine(native):
+    native(True)
+    assert TrainerSettings(accelerator="cpu").precision == "bf16-mixed"
+    assert "native bfloat16" in TrainerSettings(accelerator="cpu").describe()
+    native(False)
+    assert TrainerSettings(accelerator="cpu").precision == "32-true"
+    assert "no native bfloat16" in TrainerSettings(accelerator="cpu").describe()
+
+
+def test_a_precision_that_is_asked_for_is_taken_with_a_warning_where_it_is_slow(native, caplog):
+    native(False)
+    with caplog.at_level(logging.WARNING):
+        assert TrainerSettings(accelerator="cpu", precision="bf16-mixed").precision == "bf16-mixed"
+    assert "no native bfloat16" in caplog.text
+
+
+def test_the_probe_answers_on_this_machine():
+    assert trainer.has_native_bfloat16("cpu") in (True, False)
+
+
+def test_the_length_is_the_smaller_of_steps_and_epochs():
+    assert TrainerSettings(max_steps=100).num_steps(1000, 10) == 100
+    assert TrainerSettings(max_steps=1000, max_epochs=1).num_steps(1000, 10) == 100
+    assert TrainerSettings(max_steps=1000, max_epochs=0.5).num_steps(1001, 10) == 50
+    assert TrainerSettings(max_steps=70, max_epochs=3).num_steps(1000, 10) == 70
+
+
+@pytest.mark.parametrize("name", ["max_steps", "val_every_steps"])
+def test_no_steps_at_all_are_refused(name):
+    with pytest.raises(InputError, match=f"trainer.{name}=0"):
+        TrainerSettings(**{name: 0})
+
+
+def test_tiles_can_be_chosen_and_switched_off():
+    assert TrainerSettings(accelerator="cpu").tile_points == trainer.CPU_TILE_POINTS
+    assert TrainerSettings(tile_points=99).tile_points == 99
+    whole = TrainerSettings(accelerator="cpu", tile_points=None)
+    assert whole.tile_points is None
+    assert whole.inference_tile_points == trainer.CPU_TILE_POINTS
+
+
+def test_inference_is_without_gradients_and_in_the_precision_of_training():
+    with TrainerSettings(accelerator="cpu", precision="32-true").inference():
+        assert not torch.is_grad_enabled()
+        assert not torch.is_autocast_enabled("cpu")
+
+
+@pytest.mark.slow
+def test_bfloat16_trains_and_evaluates(nerf, capture, tmp_path):
+    from commands.conftest import FAST
+
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.precision=bf16-mixed", "trainer.max_steps=3",
+        "callbacks.validation_pictures.every_steps=3", "path.width=8", f"paths.output_dir={tmp_path}/run",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    assert all(value.dtype == torch.float32 for value in weights.values())
