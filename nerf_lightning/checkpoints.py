@@ -51,6 +51,7 @@ class Checkpoint:
     """The model's state dict."""
     step: int
     """Optimizer steps of the run."""
+    precision: str
     tile_points: int | None
 
 
@@ -61,9 +62,8 @@ def scene_record(scene: Scene) -> SceneRecord:
 
 def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str, Any]:
     """Return the part of a checkpoint that does not change during a run."""
-    kept = {field.name: getattr(scene, field.name) for field in fields(SceneRecord)}
-    cameras = kept.pop("cameras")
-    kept["cameras"] = {field.name: getattr(cameras, field.name) for field in fields(cameras)}
+    kept = dict(vars(scene_record(scene)))
+    kept["cameras"] = dict(vars(scene.cameras))
     return {"format": FORMAT, "version": __version__, "config": config, "choices": choices, "scene": kept}
 
 
@@ -98,6 +98,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
             scene=SceneRecord(**scene),
             weights={key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)},
             step=int(content["global_step"]),
+            precision=record["precision"],
             tile_points=record["tile_points"],
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

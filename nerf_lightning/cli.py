@@ -103,6 +103,9 @@ def _explained(command: str) -> Iterator[None]:
         from nerf_lightning.commands.suggestions import explain
 
         _complain(explain(error, command, conf_folder()))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _complain(f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left.")
     except KeyboardInterrupt:
         sys.exit(130)
 

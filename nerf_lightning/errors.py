@@ -7,3 +7,14 @@ class InputError(Exception):
     The command line prints the message as one paragraph and exits with code 2; no traceback. The message names
     what is wrong, where (file, key, value), and what to do about it.
     """
+
+
+def require_positive(**counts: int) -> None:
+    """Refuse intervals that never come.
+
+    Raises:
+        InputError: a count below 1.
+    """
+    for name, count in counts.items():
+        if count < 1:
+            raise InputError(f"{name}={count}: give 1 or more.")

@@ -1,5 +1,6 @@
 """The one LightningModule: it wires model, loss, optimizer and schedule together, and holds no mathematics."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
@@ -32,6 +33,7 @@ class RadianceFieldSystem(LightningModule):
         optimizer: takes the parameters.
         schedule: factor on the learning rate as a function of the attempt's step.
         progress: the run's place, shared with the loader.
+        num_steps: the length of the run.
         seed: the run's seed.
         background: what lies behind the training rays.
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
@@ -46,6 +48,7 @@ class RadianceFieldSystem(LightningModule):
         optimizer: Callable[[Iterable[Any]], Optimizer],
         schedule: Schedule,
         progress: Progress,
+        num_steps: int,
         seed: int,
         background: Background,
         tile_points: int | None,
@@ -56,10 +59,11 @@ class RadianceFieldSystem(LightningModule):
         self.automatic_optimization = False
         self.model, self.loss = model, loss
         self.build_optimizer, self.schedule = optimizer, schedule
-        self.progress, self.seed = progress, seed
+        self.progress, self.num_steps, self.seed = progress, num_steps, seed
         self.background = background
         self.tile_points, self.clip_norm = tile_points, clip_norm
         self.record = record
+        self.start_weights: dict[str, Tensor] | None = None
         if tile_points is not None and model.needs_whole_batch:
             raise InputError(
                 "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
@@ -69,10 +73,12 @@ class RadianceFieldSystem(LightningModule):
         self.squared_errors: list[Tensor] = []
 
     def initialize(self) -> None:
-        """Draw the weights of this attempt: a function of (seed, attempt)."""
+        """Draw the weights of this attempt, a function of (seed, attempt), or take those it starts from."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(fold(self.seed, self.progress.attempt, "weights"))
             self.model.reset_parameters()
+        if self.start_weights is not None:
+            self.model.load_state_dict(self.start_weights)
 
     def restart(self) -> None:
         """Begin a new attempt with fresh weights, optimizer and order of rays."""
@@ -121,10 +127,19 @@ class RadianceFieldSystem(LightningModule):
         """Stop the run at a loss that is not a number, before it ruins the weights or reaches a checkpoint."""
         if self.last_step and not bool(torch.isfinite(self.last_step["losses"]).all()):
             raise InputError(
-                f"The loss of step {self.trainer.global_step} is not a finite number; the run stops before it ruins "
-                f"the weights. The last good checkpoint, where one was saved, is "
+                f"The loss of step {self.trainer.global_step} is not a finite number; the run stops. "
+                f"The last good checkpoint, where one was saved, is "
                 f"{self.trainer.default_root_dir}/checkpoints/last.ckpt. Try a smaller optimizer.lr, gradient "
                 "clipping (trainer.clip_norm=1), trainer.precision=32-true, or check the capture's poses, near and far."
+            )
+
+    def _require_finite_weights(self) -> None:
+        # A finite loss may still have had gradients that were not.
+        if not all(bool(torch.isfinite(parameter).all()) for parameter in self.model.parameters()):
+            raise InputError(
+                f"The weights of step {self.trainer.global_step} are not finite numbers, so they are not saved. The "
+                f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
+                "Go on from it with a smaller optimizer.lr, or add gradient clipping (trainer.clip_norm=1)."
             )
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
@@ -136,17 +151,26 @@ class RadianceFieldSystem(LightningModule):
             self.squared_errors.append((rendering.rgb - target[tile]).square().mean(dim=-1))
 
     def on_validation_epoch_end(self) -> None:
-        """Log the PSNR of the fixed rays and its standard error (delta method)."""
+        """Log the PSNR of the fixed rays and its standard error (delta method).
+
+        Straight to the loggers, since Lightning would count the step before.
+        """
         error = torch.cat(self.squared_errors).double()
         self.squared_errors.clear()
         mean = error.mean()
         standard_error = error.std() / error.numel() ** 0.5
-        self.log("val/psnr", -10.0 * torch.log10(mean))
-        self.log("val/psnr_standard_error", 10.0 / torch.log(mean.new_tensor(10.0)) * standard_error / mean)
+        values = {
+            "val/psnr": float(-10.0 * torch.log10(mean)),
+            "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean),
+        }
+        self.log("val/psnr", values["val/psnr"], logger=False)
+        for logger in self.trainer.loggers:
+            logger.log_metrics(values, self.trainer.global_step)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what makes the file self-contained, and the run's state beyond weights and optimizer."""
         self.require_finite_loss()
+        self._require_finite_weights()
         checkpoint["nerf_lightning"] = self.record | {
             "progress": asdict(self.progress),
             "tile_points": self.tile_points,
@@ -171,5 +195,5 @@ class RadianceFieldSystem(LightningModule):
         if self.clip_norm is not None:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
         for group in optimizer.param_groups:
-            group["lr"] = self.schedule(self.progress.step) * group.setdefault("base_lr", group["lr"])
+            group["lr"] = self.schedule(self.progress.step, self.num_steps) * group.setdefault("base_lr", group["lr"])
         optimizer.step()

@@ -32,6 +32,7 @@ def make_system(tile_points, model=None, background="white", clip_norm=None, see
         optimizer=torch.optim.Adam,
         schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
         progress=Progress(),
+        num_steps=100,
         seed=seed,
         background=background,
         tile_points=tile_points,
@@ -45,7 +46,7 @@ def make_system(tile_points, model=None, background="white", clip_norm=None, see
 
 
 def gradients(system, scene, steps=1):
-    loader = RayBatches(scene, system.progress, 0, 64, 0, 0.5, 10)
+    loader = RayBatches(scene, system.progress, 0, 64, 10)
     for _ in range(steps):
         system.training_step(loader.at(0, system.progress.rays_seen), 0)
     return torch.cat([p.grad.flatten() for p in system.model.parameters()]), system.last_step["losses"]
@@ -84,6 +85,22 @@ def test_a_loss_that_is_not_a_number_stops_the_run_before_the_weights_change():
     assert system.progress.step == 0
 
 
+def test_weights_that_are_not_finite_are_not_saved():
+    system = make_system(None)
+    system._trainer = type("T", (), {"global_step": 7, "default_root_dir": "outputs/x"})()
+    with torch.no_grad():
+        system.model.levels["fine"].field.color_head.bias[0] = float("inf")
+    with pytest.raises(InputError, match=r"weights of step 7 are not finite.*optimizer\.lr"):
+        system.on_save_checkpoint({})
+
+
+def test_a_run_that_starts_from_weights_restarts_from_them():
+    system = make_system(None)
+    system.start_weights = {name: torch.full_like(value, 0.25) for name, value in system.model.state_dict().items()}
+    system.initialize()
+    assert all(bool((parameter == 0.25).all()) for parameter in system.model.parameters())
+
+
 def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
     states = []
     for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:
@@ -101,7 +118,7 @@ def test_the_learning_rate_follows_the_schedule():
     system = make_system(None)
     system.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
     rates = []
-    loader = RayBatches(ball_scene(), system.progress, 0, 16, 0, 0.5, 10)
+    loader = RayBatches(ball_scene(), system.progress, 0, 16, 10)
     for _ in range(4):
         system.training_step(loader.at(0, 0), 0)
         rates.append(system.optimizers().param_groups[0]["lr"])
@@ -111,8 +128,10 @@ def test_the_learning_rate_follows_the_schedule():
 def test_validation_has_no_jitter():
     system = make_system(None)
     logged = {}
-    system.log = lambda name, value: logged.__setitem__(name, float(value))
-    loader = RayBatches(ball_scene(), system.progress, 0, 64, 0, 0.5, 10)
+    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
+    system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
+    system.log = lambda name, value, logger: None
+    loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
     values = []
     for _ in range(2):
         system.validation_step(loader.at(0, 0), 0)

@@ -6,6 +6,8 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning.errors import require_positive
+
 
 class Checkpoints(Callback):
     """Keep the last and the best.
@@ -16,6 +18,7 @@ class Checkpoints(Callback):
     """
 
     def __init__(self, every_steps: int = 500, monitor: str = "val/psnr"):
+        require_positive(every_steps=every_steps)
         self.every_steps, self.monitor = every_steps, monitor
         self.best: float | None = None
 

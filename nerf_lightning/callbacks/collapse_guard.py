@@ -8,6 +8,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.callbacks.writers import tensorboard_writers
+from nerf_lightning.errors import require_positive
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +23,7 @@ class CollapseGuard(Callback):
 
     Args:
         every_steps: steps between two looks.
-        until_step: the attempt's step after which the guard trusts the run.
+        until_step: steps after the crop from which on the guard trusts the run.
         patience: looks in a row that must fail.
         ratio: smallest share of the targets' spread that counts as alive.
         max_restarts: how often it restarts at most.
@@ -36,14 +37,16 @@ class CollapseGuard(Callback):
         ratio: float = 0.02,
         max_restarts: int = 3,
     ):
+        require_positive(every_steps=every_steps, patience=patience)
         self.every_steps, self.until_step, self.patience = every_steps, until_step, patience
         self.ratio, self.max_restarts = ratio, max_restarts
         self.failed = 0
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then."""
-        step = pl_module.progress.step
-        if step % self.every_steps or step > self.until_step:
+        progress, batches = pl_module.progress, trainer.datamodule.batches  # type: ignore[attr-defined]
+        after_crop = (progress.rays_seen - batches.crop_rays(progress.attempt)) / batches.batch_rays
+        if progress.step % self.every_steps or after_crop > self.until_step:
             return
         self.failed = self.failed + 1 if is_constant(pl_module.last_step, self.ratio) else 0
         if self.failed >= self.patience:

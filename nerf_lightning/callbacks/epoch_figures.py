@@ -6,10 +6,10 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.callbacks.validation_pictures import EVALUATION_TILE_POINTS
+from nerf_lightning.callbacks.validation_view import render_validation_view
+from nerf_lightning.errors import require_positive
 from nerf_lightning.export.figures import epoch_figure
 from nerf_lightning.export.pictures import save_png
-from nerf_lightning.models.pictures import render_picture
 
 
 class EpochFigures(Callback):
@@ -22,6 +22,7 @@ class EpochFigures(Callback):
     """
 
     def __init__(self, every_epochs: int = 1, every_steps: int = 25, view: int = 0):
+        require_positive(every_epochs=every_epochs, every_steps=every_steps)
         self.every_epochs, self.every_steps, self.view = every_epochs, every_steps, view
         self.steps: list[int] = []
         self.losses: list[float] = []
@@ -33,7 +34,7 @@ class EpochFigures(Callback):
             self.losses.append(float(pl_module.last_step["losses"].sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
         per_figure = self.every_epochs * len(batches.whole)
-        seen = pl_module.progress.rays_seen - batches.crop_rays
+        seen = pl_module.progress.rays_seen - batches.crop_rays(pl_module.progress.attempt)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
             self._draw(trainer, pl_module, epoch=seen // len(batches.whole))
 
@@ -46,12 +47,6 @@ class EpochFigures(Callback):
         self.steps, self.losses = list(state_dict["steps"]), list(state_dict["losses"])
 
     def _draw(self, trainer: Trainer, system: Any, epoch: int) -> None:
-        scene = trainer.datamodule.scene  # type: ignore[attr-defined]
-        view = scene.splits["val"][self.view % len(scene.splits["val"])]
-        system.eval()
-        tile = system.tile_points or EVALUATION_TILE_POINTS
-        with trainer.precision_plugin.forward_context():
-            picture = render_picture(system.model, scene.cameras, view, scene.near, scene.far, scene.background, tile)
-        system.train()
+        _, picture = render_validation_view(trainer, system, self.view)
         figure = epoch_figure(picture.rgb, picture.depth, self.steps, self.losses)
         save_png(Path(trainer.default_root_dir) / "images" / "epochs" / f"epoch_{epoch:04d}.png", figure)

@@ -9,6 +9,8 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from nerf_lightning.errors import require_positive
+
 GIGABYTE = 1e9
 
 
@@ -20,6 +22,7 @@ class Monitor(Callback):
     """
 
     def __init__(self, every_steps: int = 50):
+        require_positive(every_steps=every_steps)
         self.every_steps = every_steps
         self.since = (0.0, 0)
 

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM: finish the step, save, stop; the run can go on to the last bit."""
 
+import os
 import signal
 from types import FrameType
 from typing import Any
@@ -26,8 +27,11 @@ class StopSignals(Callback):
         self._listen()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Listen; Lightning puts handlers of its own in place shortly before."""
+        """Listen; Lightning puts a handler of its own in place shortly before, and what it heard is ours."""
         self._listen()
+        if trainer.received_sigterm:
+            trainer._signal_connector.received_sigterm = False
+            self.received = signal.SIGTERM
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -49,5 +53,5 @@ class StopSignals(Callback):
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
+            os._exit(128 + number)  # an exception would be caught on the way, and the process linger
         self.received = number

@@ -6,12 +6,11 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning.callbacks.validation_view import render_validation_view
 from nerf_lightning.callbacks.writers import tensorboard_writers
+from nerf_lightning.errors import require_positive
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
-from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.rendering.blending import photograph
-
-EVALUATION_TILE_POINTS = 65_536
 
 
 class ValidationPictures(Callback):
@@ -23,6 +22,7 @@ class ValidationPictures(Callback):
     """
 
     def __init__(self, every_steps: int = 1000, view: int = 0):
+        require_positive(every_steps=every_steps)
         self.every_steps, self.view = every_steps, view
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
@@ -30,16 +30,8 @@ class ValidationPictures(Callback):
         step = trainer.global_step
         if step % self.every_steps and step != trainer.max_steps:
             return
+        view, picture = render_validation_view(trainer, pl_module, self.view)
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
-        views = scene.splits["val"]
-        view = views[self.view % len(views)]
-        pl_module.eval()
-        tile = pl_module.tile_points or EVALUATION_TILE_POINTS
-        with trainer.precision_plugin.forward_context():
-            picture = render_picture(
-                pl_module.model, scene.cameras, view, scene.near, scene.far, scene.background, tile
-            )
-        pl_module.train()
         truth = photograph(scene, view, scene.background)
         panel = mosaic(truth, picture.rgb, picture.depth, picture.opacity)
         folder = Path(trainer.default_root_dir) / "images"

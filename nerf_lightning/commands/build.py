@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.encoders.base import Encoder
@@ -23,28 +24,43 @@ ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samp
 
 
 def build(node: DictConfig) -> Any:
-    """Build one node of the user's own config."""
+    """Build one node of the user's own config.
+
+    Raises:
+        InputError: a value of the wrong kind.
+    """
+    require_fitting_values(node, node._get_full_key(None))
     return instantiate(node, _convert_="all")
 
 
 def build_system(
-    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, record: dict[str, Any]
+    config: DictConfig,
+    settings: TrainerSettings,
+    scene: Scene,
+    progress: Progress,
+    num_steps: int,
+    record: dict[str, Any],
 ) -> RadianceFieldSystem:
-    """Build model, loss, optimizer and schedule into the system, with the weights of its seed."""
-    system = RadianceFieldSystem(
+    """Build model, loss, optimizer and schedule into the system.
+
+    Raises:
+        InputError: a value of the wrong kind, or a model that cannot be cut into tiles.
+    """
+    if not isinstance(config.seed, int):
+        raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
+    return RadianceFieldSystem(
         model=build(config.model),
         loss=build(config.loss),
         optimizer=build(config.optimizer),
         schedule=build(config.scheduler),
         progress=progress,
+        num_steps=num_steps,
         seed=config.seed,
         background=scene.background,
         tile_points=settings.tile_points,
         clip_norm=settings.clip_norm,
         record=record,
     )
-    system.initialize()
-    return system
 
 
 def load_model(checkpoint: Checkpoint) -> RadianceModel:

@@ -2,6 +2,8 @@
 
 from omegaconf import DictConfig
 
+from nerf_lightning.errors import InputError
+
 
 def prepare(arguments: list[str]) -> list[str]:
     """Name the run's own scene where the user names none, so that the checkpoint is enough.
@@ -11,12 +13,16 @@ def prepare(arguments: list[str]) -> list[str]:
     """
     given = [argument.partition("=") for argument in arguments]
     checkpoints = [value for key, _, value in given if key == "ckpt"]
-    named = any(key in ("scene", "--help", "-h", "-m", "--multirun") for key, _, _ in given)
-    if named or len(checkpoints) != 1:
+    if not checkpoints or any(key in ("scene", "--help", "-h") for key, _, _ in given):
         return arguments
+    if "," in checkpoints[-1]:
+        raise InputError("A sweep over checkpoints needs the scene by name: add scene=... and its settings.")
     from nerf_lightning.commands.recorded_scene import scene_overrides
 
-    return [*scene_overrides(checkpoints[0]), *arguments]
+    # Flags come first on Hydra's command line.
+    flags = [argument for argument in arguments if argument.startswith("-")]
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    return [*flags, *scene_overrides(checkpoints[-1]), *overrides]
 
 
 def run(config: DictConfig) -> float:

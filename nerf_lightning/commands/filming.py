@@ -33,12 +33,12 @@ def film(
 ) -> list[Path]:
     """Write `video.mp4` and `depth.mp4` (or folders of frames of these names) and return where they are.
 
-    Depth is in scene units along the ray, coloured between the nearest near and the farthest far of the photographs,
-    with its scale beside it.
+    Depth is in scene units along the ray, coloured over the range of what is seen on the whole path (its outer 1 % at
+    each end left out), with its scale beside it.
     """
     if form not in FORMATS:
         raise InputError(f"format={form}: choose video (mp4) or frames (PNG files).")
-    # Rendered once, kept as bytes and half floats: two videos come of it.
+    # Rendered once and kept: the scale of the depth is known at the end only.
     pictures = [picture for picture in render_path(model, scene, path, background, tile_points)]
     seen = torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
     near, far = float(scene.near.min()), float(scene.far.max())

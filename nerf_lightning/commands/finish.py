@@ -1,5 +1,6 @@
 """The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the person."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,43 +13,56 @@ from PIL import Image
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.scoring import Scoring
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
-from nerf_lightning.export.video import write_video
+from nerf_lightning.export.video import require_ffmpeg, write_video
+from nerf_lightning.geometry.paths.base import CameraPath
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.types import Scene
 
 PROGRESS_FPS = 4
 
 
-def finish(
-    config: DictConfig,
-    settings: TrainerSettings,
-    scene: Scene,
-    model: RadianceModel,
-    trainer: Trainer,
-    folder: Path,
-) -> float | None:
-    """Evaluate and film as the config says, print a summary, and return the test PSNR (else the validation's)."""
-    model.to(settings.device).eval()
-    lines, result = [], trainer.callback_metrics.get("val/psnr")
-    tile_points = settings.inference_tile_points
-    with settings.inference():
-        if config.final.evaluate:
-            metrics = build(config.evaluation).score(model, scene, scene.background, tile_points, folder)
-            result = metrics["psnr"]
-            _log_metrics(trainer, metrics)
-            lines += metric_lines(metrics, folder)
+@dataclass
+class Finish:
+    """What happens after training; built before it, so that bad input shows at once."""
+
+    scoring: Scoring | None
+    path: CameraPath | None
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> "Finish":
+        """Build what the config asks for.
+
+        Raises:
+            InputError: a setting is wrong, or a video is wanted and there is no ffmpeg.
+        """
+        scoring, path = build(config.evaluation), build(config.path)
         if config.final.video:
-            path = build(config.path)
-            video, depth = film(model, scene_record(scene), path, scene.background, tile_points, folder)
-            lines += [f"video        {video}", f"depth        {depth}"]
-    if progress := _film_progress(folder):
-        lines.append(f"progress     {progress}")
-    lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
-    lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
-    print("\n".join(lines))
-    return None if result is None else float(result)
+            require_ffmpeg()
+        return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
+
+    def __call__(
+        self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
+    ) -> float | None:
+        """Evaluate, film, print a summary, and return the test PSNR (else the validation's)."""
+        model.to(settings.device).eval()
+        lines, psnr = [], trainer.callback_metrics.get("val/psnr")
+        tile_points = settings.inference_tile_points
+        with settings.inference():
+            if self.scoring is not None:
+                metrics = self.scoring.score(model, scene, scene.background, tile_points, folder)
+                psnr = metrics["psnr"]
+                _log_metrics(trainer, metrics)
+                lines += metric_lines(metrics, folder)
+            if self.path is not None:
+                video, depth = film(model, scene_record(scene), self.path, scene.background, tile_points, folder)
+                lines += [f"video        {video}", f"depth        {depth}", *_film_progress(folder)]
+        lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
+        lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
+        print("\n".join(lines))
+        return None if psnr is None else float(psnr)
 
 
 def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
@@ -76,11 +90,11 @@ def _log_metrics(trainer: Trainer, metrics: dict[str, Any]) -> None:
         logger.log_metrics({name: v for name, v in values.items() if v is not None}, trainer.global_step)
 
 
-def _film_progress(folder: Path) -> Path | None:
-    """Join the pictures that were taken of one view during training."""
+def _film_progress(folder: Path) -> list[str]:
+    """Join the pictures that were taken of one view during training; return the line that says where."""
     files = sorted((folder / "images" / "progress").glob("step_*.png"))
     if len(files) < 2:
-        return None
+        return []
     frames = [torch.from_numpy(np.array(Image.open(file).convert("RGB"))) for file in files]
     write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
-    return folder / "progress.mp4"
+    return [f"progress     {folder / 'progress.mp4'}"]

@@ -6,6 +6,7 @@ from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.run_folder import output_folder
+from nerf_lightning.data.checks import known_background
 
 
 def render(config: DictConfig) -> None:
@@ -16,7 +17,7 @@ def render(config: DictConfig) -> None:
     model = load_model(checkpoint).to(settings.device)
     path = build(config.path)
     folder = output_folder(config.paths.output_dir, checkpoint.path, "render")
-    background = config.background or checkpoint.scene.background
+    background = known_background(config.background or checkpoint.scene.background)
     with settings.inference():
         written = film(model, checkpoint.scene, path, background, settings.inference_tile_points, folder, config.format)
     print("\n".join(str(file) for file in written))

@@ -4,7 +4,9 @@ A run folder has `run.json` (its config's fingerprint, and the step at which it 
 overrides), `checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
 """
 
+import contextlib
 import hashlib
+import itertools
 import json
 import os
 from dataclasses import dataclass
@@ -13,14 +15,20 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
 from nerf_lightning.commands.suggestions import flatten
 from nerf_lightning.errors import InputError
 
-# Where a run lies, how long it lasts and what happens after it do not make it another run.
-NOT_IDENTITY = ("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "final.", "path.")
+# Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
+NOT_IDENTITY = (
+    *("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
+    *("logger.", "evaluation.", "final.", "path.", "callbacks."),
+)
+IDENTITY = ("callbacks.collapse_guard.",)
 
 
 @dataclass
@@ -29,12 +37,14 @@ class RunFolder:
 
     path: Path
     lock: FileLock
+    named_checkpoint: Path | None
+    """The checkpoint that the user named to go on from."""
 
     @property
-    def last_checkpoint(self) -> Path | None:
+    def checkpoint(self) -> Path | None:
         """Where training goes on, or None where nothing was saved yet."""
         last = self.path / "checkpoints" / "last.ckpt"
-        return last if last.is_file() else None
+        return self.named_checkpoint or (last if last.is_file() else None)
 
     def finish(self, step: int) -> None:
         """Note that the run is complete."""
@@ -76,7 +86,14 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     started = note.get("started") or datetime.now().isoformat(timespec="seconds")
     _write_json(folder / "run.json", {"fingerprint": _digest(identity), "started": started})
     sweep_leftovers(folder / "checkpoints")
-    return RunFolder(folder, lock)
+    named = str(config.resume).endswith(".ckpt")
+    return RunFolder(folder, lock, Path(config.resume) if named else None)
+
+
+def job_folder() -> Path | None:
+    """Return the folder that a sweep gives this job, or None for a single run."""
+    hydra_config = HydraConfig.get()
+    return Path(hydra_config.runtime.output_dir) if hydra_config.mode == RunMode.MULTIRUN else None
 
 
 def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
@@ -89,9 +106,9 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
 
 
 def run_identity(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that make a run what it is; two runs of the same identity compute the same."""
+    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
     leaves = flatten(config)
-    return {key: value for key, value in leaves.items() if not key.startswith(NOT_IDENTITY)}
+    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
 
 
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
@@ -110,6 +127,8 @@ def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_fo
 
 def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
     folder = path.parent.parent if path.suffix == ".ckpt" else path
+    if path.suffix == ".ckpt" and not path.is_file():
+        raise InputError(f"resume={path}: there is no such checkpoint. A run keeps last.ckpt and best.ckpt.")
     if not (folder / "run.json").is_file():
         raise InputError(
             f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
@@ -154,10 +173,11 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int) -> Path | None:
 
 def _fresh(parent: Path) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder, number = parent / stamp, 2
-    while folder.exists():
-        folder, number = parent / f"{stamp}_{number}", number + 1
-    return folder
+    for name in itertools.chain([stamp], (f"{stamp}_{number}" for number in itertools.count(2))):
+        with contextlib.suppress(FileExistsError):
+            (parent / name).mkdir(parents=True)
+            return parent / name
+    raise AssertionError("unreachable: the names never end")
 
 
 def _read_note(folder: Path) -> dict[str, Any]:
@@ -181,10 +201,14 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 def output_folder(given: str | None, checkpoint: Path, name: str) -> Path:
     """Return where a command that reads a checkpoint writes: as given, else a folder of this name in its run folder.
 
+    The jobs of a sweep have folders of their own.
+
     Raises:
         InputError: the folder cannot be made or written.
     """
-    folder = Path(given) if given else checkpoint.absolute().parent.parent / name
+    beside = checkpoint.absolute().parent
+    run_folder = beside.parent if beside.name == "checkpoints" else beside
+    folder = job_folder() or (Path(given) if given else run_folder / name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{os.getpid()}.probe"

@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
+ALL_THREADS = torch.get_num_threads()
 M_MMAP_THRESHOLD = -3
 M_TRIM_THRESHOLD = -1
 
@@ -31,7 +32,8 @@ class TrainerSettings:
         max_steps: steps in all.
         max_epochs: epochs in all, an epoch being every training ray once; None: no bound. The smaller bound counts.
         accelerator: auto takes a GPU where there is one.
-        precision: Lightning's names; auto is bf16-mixed where the device computes it natively, else 32-true.
+        precision: auto is bf16-mixed (float32 weights, bfloat16 products) where the device computes it natively, else
+            32-true.
         tile_points: most points that a step sends through a field at once; auto suits the device's caches; None
             trains a batch whole. The result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
@@ -44,7 +46,7 @@ class TrainerSettings:
         max_steps: int = 200_000,
         max_epochs: int | float | None = None,
         accelerator: Literal["auto", "cpu", "gpu"] = "auto",
-        precision: str = "auto",
+        precision: Literal["auto", "32-true", "bf16-mixed"] = "auto",
         tile_points: int | Literal["auto"] | None = "auto",
         clip_norm: int | float | None = None,
         val_every_steps: int = 500,
@@ -53,6 +55,10 @@ class TrainerSettings:
         for name, value in (("max_steps", max_steps), ("val_every_steps", val_every_steps)):
             if value < 1:
                 raise InputError(f"trainer.{name}={value}: give a positive number of steps.")
+        if max_epochs is not None and max_epochs <= 0:
+            raise InputError(f"trainer.max_epochs={max_epochs}: give a positive number, or null for no bound.")
+        if isinstance(tile_points, int) and tile_points < 1:
+            raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
         if accelerator == "gpu" and not torch.cuda.is_available():
             raise InputError(
                 "trainer=gpu: torch sees no CUDA device here. Use trainer=cpu or trainer=auto, or install a CUDA build "
@@ -60,22 +66,22 @@ class TrainerSettings:
             )
         self.max_steps, self.max_epochs = max_steps, max_epochs
         self.device_type = "cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu"
+        self.reason = ""
         self.precision = self._precision(precision)
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
         self.tile_points = default_tile if tile_points == "auto" else tile_points
         self.clip_norm, self.val_every_steps = clip_norm, val_every_steps
         self.num_threads = num_threads
 
-    def num_steps(self, num_rays: int, batch_rays: int) -> int:
-        """Return the length of the run in steps, for a training split of `num_rays` rays."""
+    def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
+        """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
         if self.max_epochs is None:
             return self.max_steps
-        return min(self.max_steps, -(-int(self.max_epochs * num_rays) // batch_rays))
+        return min(self.max_steps, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
 
     def prepare_machine(self) -> None:
         """Set threads and the allocator, once per process."""
-        if self.num_threads is not None:
-            torch.set_num_threads(self.num_threads)
+        torch.set_num_threads(self.num_threads or ALL_THREADS)
         _keep_large_blocks()
         _quiet_libraries()
 
@@ -121,6 +127,11 @@ class TrainerSettings:
         """Say device and precision, with the reason where they were chosen."""
         threads = f", {torch.get_num_threads()} threads" if self.device_type == "cpu" else ""
         return f"{self.device_type}{threads}, {self.precision} ({self.reason})"
+
+    def keep_precision(self, former: str) -> None:
+        """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
+        if self.reason != "as asked":
+            self.precision, self.reason = former, "as the run began"
 
     def _precision(self, asked: str) -> str:
         if asked == "auto":

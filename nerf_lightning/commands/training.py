@@ -1,6 +1,7 @@
-"""The training run: build the parts, fit, evaluate, film."""
+"""The training run: build the parts, take the folder, fit, evaluate, film."""
 
 import logging
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,16 +10,16 @@ from typing import Any
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Callback
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.stop_signals import StopSignals
-from nerf_lightning.checkpoints import make_record, read_checkpoint
+from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
-from nerf_lightning.commands.finish import finish
-from nerf_lightning.commands.run_folder import RunFolder, open_run, write_config
+from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
@@ -30,17 +31,17 @@ log = logging.getLogger(__name__)
 
 
 @dataclass
-class Run:
-    """A run whose parts are built."""
+class Parts:
+    """Everything that a run is made of, but for its place on the disk."""
 
-    config: DictConfig
-    folder: RunFolder
     settings: TrainerSettings
     scene: Scene
+    num_steps: int
     data: RayDataModule
     system: RadianceFieldSystem
-    trainer: Trainer
     signals: StopSignals
+    callbacks: list[Callback]
+    finish: Finish
 
 
 def train(config: DictConfig) -> float | None:
@@ -49,79 +50,86 @@ def train(config: DictConfig) -> float | None:
     Raises:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
-    hydra_config = HydraConfig.get()
-    settings: TrainerSettings = build(config.trainer)
-    settings.prepare_machine()
-    scene: Scene = build(config.scene).read()
-    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
-    num_steps = settings.num_steps(num_rays, config.data.batch_rays)
-    in_sweep = hydra_config.mode == RunMode.MULTIRUN
-    folder = open_run(config, num_steps, Path(hydra_config.runtime.output_dir) if in_sweep else None)
+    # Whatever is wrong with the input shows here, before a folder is taken.
+    parts = _build_parts(config)
+    folder = open_run(config, parts.num_steps, job_folder())
     try:
-        write_config(folder.path, config, hydra_config)
+        write_config(folder.path, config, HydraConfig.get())
         with _log_file(folder.path):
-            run = _assemble(config, folder, settings, scene, num_steps)
-            return _fit(run)
+            return _run(config, parts, folder)
     finally:
         folder.release()
 
 
-def _assemble(config: DictConfig, folder: RunFolder, settings: TrainerSettings, scene: Scene, num_steps: int) -> Run:
-    plain = OmegaConf.to_container(config, resolve=True)
+def _build_parts(config: DictConfig) -> Parts:
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    finish = Finish.from_config(config)
+    scene: Scene = build(config.scene).read()
+    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
+    num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True))
     progress = Progress()
-    system = build_system(config, settings, scene, progress, make_record(scene, yaml.safe_dump(plain), choices))
+    system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
+    if config.init_from is not None:
+        start = read_checkpoint(config.init_from)
+        load_weights(system.model, start)
+        system.start_weights = start.weights
+    system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
-    trainer = settings.build(folder.path, num_steps, callbacks, _loggers(config, folder))
-    return Run(config, folder, settings, scene, data, system, trainer, signals)
+    # Checkpoints come last, so that they save what the others left.
+    callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
+    return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
 
 
-def _fit(run: Run) -> float | None:
-    last = run.folder.last_checkpoint
-    if last is not None:
-        log.info("going on from step %d of %s", read_checkpoint(last).step, run.folder.path)
-    elif run.config.init_from is not None:
-        load_weights(run.system.model, read_checkpoint(run.config.init_from))
-    parameters = sum(p.numel() for p in run.system.model.parameters())
+def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
+    former = None if folder.checkpoint is None else read_checkpoint(folder.checkpoint)
+    if former is not None:
+        log.info("going on from step %d of %s", former.step, folder.path)
+        parts.settings.keep_precision(former.precision)
+    parts.system.record["precision"] = parts.settings.precision
+    trainer = parts.settings.build(folder.path, parts.num_steps, parts.callbacks, _loggers(config, folder.path, former))
+    _announce(parts, folder.path, former)
+    if former is None:
+        describe_run(trainer.loggers, config)
+    trainer.fit(parts.system, parts.data, ckpt_path=folder.checkpoint, weights_only=True)
+    if parts.signals.received is not None:
+        log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder.path))
+        raise SystemExit(128 + parts.signals.received)
+    psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder.path)
+    folder.finish(trainer.global_step)
+    for logger in trainer.loggers:
+        logger.finalize("success")
+    return psnr
+
+
+def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:
+    parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
+    tile = parts.system.tile_points if former is None else former.tile_points
     log.info(
         "run folder %s: %d steps of %d rays, %s parameters, %s, %s",
-        run.folder.path,
-        run.trainer.max_steps,
-        run.data.batches.batch_rays,
+        folder,
+        parts.num_steps,
+        parts.data.batches.batch_rays,
         f"{parameters:,}",
-        run.settings.describe(),
-        "whole batches" if run.settings.tile_points is None else f"tiles of {run.settings.tile_points} points",
+        parts.settings.describe(),
+        "whole batches" if tile is None else f"tiles of {tile} points",
     )
-    if last is None:
-        describe_run(run.trainer.loggers, run.config)
-    run.trainer.fit(run.system, run.data, ckpt_path=last, weights_only=True)
-    if run.signals.received is not None:
-        overrides = " ".join(HydraConfig.get().overrides.task)
-        log.info(
-            "stopped at step %d; go on with: nerf train %s resume=%s",
-            run.trainer.global_step,
-            _without_resume(overrides),
-            run.folder.path,
-        )
-        raise SystemExit(128 + run.signals.received)
-    metrics = finish(run.config, run.settings, run.scene, run.system.model, run.trainer, run.folder.path)
-    run.folder.finish(run.trainer.global_step)
-    for logger in run.trainer.loggers:
-        logger.finalize("success")
-    return metrics
 
 
-def _loggers(config: DictConfig, folder: RunFolder) -> list[Logger]:
-    last = folder.last_checkpoint
-    # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
-    purge: dict[str, Any] = {} if last is None else {"purge_step": read_checkpoint(last).step + 1}
-    return [partial(save_dir=folder.path, **purge) for partial in build(config.logger).values()]
+def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> list[Logger]:
+    purge: dict[str, Any] = {}
+    if (folder / "tensorboard").exists():
+        # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
+        purge = {"purge_step": 0 if former is None else former.step + 1}
+    return [partial(save_dir=folder, **purge) for partial in build(config.logger).values()]
 
 
-def _without_resume(overrides: str) -> str:
-    return " ".join(part for part in overrides.split() if not part.startswith(("resume=", "paths.output_dir=")))
+def _resume_command(folder: Path) -> str:
+    return shlex.join(["nerf", "train", f"resume={folder}"])
 
 
 @contextmanager

@@ -18,6 +18,7 @@ class RayDataModule(LightningDataModule):
         batch_rays: rays per training step.
         crop_steps: steps at the start that see only the pictures' centres.
         crop_fraction: share of each side that the crop keeps.
+        restart_crop_steps: the least crop after a restart by the collapse guard.
         val_rays: size of the validation subset.
     """
 
@@ -30,6 +31,7 @@ class RayDataModule(LightningDataModule):
         batch_rays: int = 1024,
         crop_steps: int = 0,
         crop_fraction: float = 0.5,
+        restart_crop_steps: int = 500,
         val_rays: int = 4096,
     ):
         super().__init__()
@@ -38,8 +40,17 @@ class RayDataModule(LightningDataModule):
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
+        if scene.background == "none" and bool((scene.pixels.rgba[:, 3] < 255).any()):
+            raise InputError(
+                f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
+                "scene.background=none would train on colours without their alpha. Use white, black or random."
+            )
+        for split in ("train", "val"):
+            if not scene.splits.get(split):
+                raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays, crop_steps, crop_fraction, num_steps)
+        self.batches = RayBatches(scene, progress, seed, batch_rays, num_steps)
+        self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
 
     def train_dataloader(self) -> RayBatches:

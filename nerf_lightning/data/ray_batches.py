@@ -84,9 +84,6 @@ class RayBatches:
         progress: shared with the system, which advances it after each step.
         seed: the run's seed.
         batch_rays: rays per step.
-        crop_steps: for so many steps only the pictures' centres are seen; without this, runs on white backgrounds
-            may never start learning. The crop is a domain of its own and counts no epoch.
-        crop_fraction: share of each side that the crop keeps.
         num_steps: the length of the run, for those who ask.
     """
 
@@ -96,15 +93,29 @@ class RayBatches:
         progress: Progress,
         seed: int,
         batch_rays: int,
-        crop_steps: int,
-        crop_fraction: float,
         num_steps: int,
     ):
         self.scene, self.progress, self.seed = scene, progress, seed
         self.batch_rays, self.num_steps = batch_rays, num_steps
-        self.crop_rays = crop_steps * batch_rays
-        self.crop = PixelDomain(scene, scene.splits["train"], crop_fraction)
         self.whole = PixelDomain(scene, scene.splits["train"])
+        self.crop_to(1.0, 0, 0)
+
+    def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
+        """See only the pictures' centres at first; without this, runs on white backgrounds may never start learning.
+
+        The crop is a domain of its own and counts no epoch.
+
+        Args:
+            fraction: share of each side that the crop keeps.
+            steps: its length in the first attempt.
+            restart_steps: its least length in later attempts.
+        """
+        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
+        self.crop_steps, self.restart_crop_steps = steps, max(steps, restart_steps)
+
+    def crop_rays(self, attempt: int) -> int:
+        """Return how many rays an attempt takes from the crop."""
+        return self.batch_rays * (self.restart_crop_steps if attempt else self.crop_steps)
 
     def __len__(self) -> int:
         return self.num_steps
@@ -119,10 +130,11 @@ class RayBatches:
 
     def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
         """Return which pixels that batch holds."""
-        if rays_seen < self.crop_rays:
+        crop_rays = self.crop_rays(attempt)
+        if rays_seen < crop_rays:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:
-            domain, purpose, position = self.whole, "rays", rays_seen - self.crop_rays
+            domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
         place = position + torch.arange(self.batch_rays)
         epochs, epoch = torch.unique(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])

@@ -87,7 +87,7 @@ def _chain(first: Tensor, rest: Iterator[Tensor]) -> Iterator[Tensor]:
 def _encoder(path: Path, width: int, height: int, fps: int) -> Iterator[IO[bytes]]:
     """Lend the pipe that takes raw frames; wait for ffmpeg at the end, and stop it at once on an error."""
     source = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-    command = [_ffmpeg(), *source.split(), *_CODEC.split(), str(path)]
+    command = [require_ffmpeg(), *source.split(), *_CODEC.split(), str(path)]
     with TemporaryFile() as words:
         try:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words)
@@ -121,7 +121,12 @@ _CURE = (
 )
 
 
-def _ffmpeg() -> str:
+def require_ffmpeg() -> str:
+    """Return where ffmpeg is.
+
+    Raises:
+        InputError: there is none.
+    """
     import imageio_ffmpeg
 
     try:

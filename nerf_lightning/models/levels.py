@@ -41,22 +41,21 @@ class RadianceModel(nn.Module):
         levels: name -> level, in order.
     """
 
+    max_samples: int
+    """The largest number of points that one ray takes in any level: what tiles are cut by."""
+
     def __init__(self, levels: dict[str, Level]):
         super().__init__()
         self.levels = nn.ModuleDict(levels)
+        counts = [0]
+        for level in self._in_order():
+            counts.append(level.sampler.num_samples_after(counts[-1]))
+        self.max_samples = max(counts)
 
     @property
     def level_names(self) -> tuple[str, ...]:
         """The levels' names, first to last."""
         return tuple(self.levels)
-
-    @property
-    def max_samples(self) -> int:
-        """The largest number of points that one ray takes in any level: what tiles are cut by."""
-        counts = [0]
-        for level in self._in_order():
-            counts.append(level.sampler.num_samples_after(counts[-1]))
-        return max(counts)
 
     @property
     def needs_whole_batch(self) -> bool:

@@ -35,7 +35,7 @@ def closed_weights(weights: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*r
     tensor([0.5000, 0.2500, 0.2500])
     """
     first = weights[..., :-1]
-    return torch.cat([first, 1.0 - first.sum(dim=-1, keepdim=True)], dim=-1)
+    return torch.cat([first, (1.0 - first.sum(dim=-1, keepdim=True)).clamp(min=0.0)], dim=-1)
 
 
 def composite(

@@ -34,5 +34,11 @@ class ImportanceSampler(Sampler):
         return RaySamples(edges=torch.cat([edges, added], dim=-1).sort(dim=-1).values)
 
     def num_samples_after(self, before: int) -> int:
-        """Those of the level before, and `num_samples` more."""
+        """Those of the level before, and `num_samples` more.
+
+        Raises:
+            ValueError: the level before has no interior interval to sample from.
+        """
+        if before < 3:
+            raise ValueError(f"importance sampling needs at least 3 samples in the level before, not {before}")
         return before + self.num_samples

@@ -19,6 +19,8 @@ class StratifiedSampler(Sampler):
 
     def __init__(self, num_samples: int = 64):
         super().__init__()
+        if num_samples < 1:
+            raise ValueError(f"num_samples={num_samples}: at least one sample is needed")
         self.num_samples = num_samples
 
     def forward(self, rays: RayBundle, history: list[Rendering], random: RayRandom | None) -> RaySamples:

@@ -8,6 +8,9 @@ from nerf_lightning.callbacks.collapse_guard import CollapseGuard, is_constant
 
 class StubTrainer(Trainer):
     global_step, loggers = 0, ()
+    datamodule = type(
+        "D", (), {"batches": type("B", (), {"batch_rays": 64, "crop_rays": lambda self, attempt: 64 * 50})()}
+    )
 
     def __init__(self):
         pass
@@ -15,7 +18,7 @@ class StubTrainer(Trainer):
 
 class StubSystem:
     def __init__(self, alive):
-        self.progress = type("P", (), {"step": 0, "attempt": 0})()
+        self.progress = type("P", (), {"step": 0, "attempt": 0, "rays_seen": 0})()
         self.alive = alive
         self.restarts = 0
 
@@ -27,7 +30,7 @@ class StubSystem:
     def restart(self):
         self.restarts += 1
         self.progress.attempt += 1
-        self.progress.step = 0
+        self.progress.step = self.progress.rays_seen = 0
 
 
 def run(guard, system, steps):
@@ -35,6 +38,7 @@ def run(guard, system, steps):
     for _ in range(steps):
         trainer.global_step += 1
         system.progress.step += 1
+        system.progress.rays_seen += 64
         guard.on_train_batch_end(trainer, system, None, None, 0)
 
 
@@ -59,6 +63,13 @@ def test_it_gives_up_after_the_set_number(caplog):
         run(CollapseGuard(max_restarts=2, until_step=300), system, 2000)
     assert system.restarts == 2
     assert "after 2 restarts" in caplog.text
+
+
+def test_the_end_of_the_crop_is_watched_too():
+    """A run may die when it first sees the mostly empty whole pictures."""
+    system = StubSystem(alive=lambda restarts: restarts > 0 or system.progress.step < 300)
+    run(CollapseGuard(), system, 560)
+    assert system.restarts == 1
 
 
 def test_constant_photographs_are_no_collapse():

@@ -1,34 +1,15 @@
 """A capture that a command can read, a finished run on it, and ways to call `nerf`."""
 
-import os
-import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from running import FAST, start
 from scenes import ball_scene
 
 from nerf_lightning import cli
-
-REPOSITORY = Path(__file__).parents[2]
-
-# Small enough for a test: seconds in all.
-FAST = (
-    "model=nerf_tiny",
-    "data.batch_rays=64",
-    "data.crop_steps=3",
-    "data.val_rays=64",
-    "trainer.val_every_steps=10",
-    "callbacks.validation_pictures.every_steps=10",
-    "callbacks.monitor.every_steps=5",
-    "callbacks.checkpoints.every_steps=5",
-    "evaluation.max_views=2",
-    "evaluation.num_pictures=1",
-    "path.num_frames=2",
-)
 
 
 @dataclass
@@ -69,20 +50,6 @@ def nerf(monkeypatch, capfd):
         return Result(code, *capfd.readouterr())
 
     return call
-
-
-def start(*arguments: str, **options) -> subprocess.Popen:
-    """Start the command line as a process of its own."""
-    command = [sys.executable, "-m", "nerf_lightning", *map(str, arguments)]
-    return subprocess.Popen(
-        command,
-        cwd=options.pop("cwd", REPOSITORY),
-        env=os.environ | options.pop("env", {}),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        **options,
-    )
 
 
 @pytest.fixture(scope="session")

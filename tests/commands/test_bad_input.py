@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 import yaml
-from commands.conftest import FAST, REPOSITORY, start
+from running import FAST, REPOSITORY, start
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO, sweep_leftovers
 from nerf_lightning.errors import InputError
@@ -145,6 +145,63 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
     result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, "field.batch_norm=true",
                   f"paths.output_dir={tmp_path}/run")  # fmt: skip
     said(result, "field.batch_norm=true", "trainer.tile_points=null")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("scene.near=close", "scene.near=close does not fit: it must be a number"),
+        ("seed=1.5", "seed=1.5 does not fit"),
+        ("trainer.precision=16-mixed", "it must be auto, 32-true, bf16-mixed"),
+        ("trainer.accelerator=tpu", "trainer.accelerator=tpu does not fit: it must be auto, cpu, gpu"),
+        ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
+        ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
+        ("path.elevation=95", "path.elevation is 95"),
+        ("evaluation.max_views=0", "evaluation.max_views=0"),
+        ("evaluation.split=all", "evaluation.split=all does not fit"),
+        ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
+        ("data.batch_rays=0", "data.batch_rays=0"),
+        ("init_from=nowhere.ckpt", "There is no checkpoint at nowhere.ckpt"),
+        ("trainer.max_epochs=0", "trainer.max_epochs=0"),
+    ],
+)
+def test_a_bad_setting_is_named_before_a_folder_is_taken(nerf, capture, tmp_path, override, words):
+    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run", override)
+    said(result, words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_ffmpeg_is_said_before_the_training(nerf, capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run")
+    said(result, "ffmpeg")
+    assert not (tmp_path / "run").exists()
+
+
+def test_transparent_pictures_need_a_background(nerf, tmp_path):
+    result = nerf("train", "scene.resolution=4", "scene.num_train=1", "scene.num_val=1", "scene.num_test=1",
+                  f"scene.cache_dir={tmp_path}", "scene.background=none", *FAST, f"paths.output_dir={tmp_path}/run")  # fmt: skip
+    said(result, "transparent pixels", "scene.background=none", "white, black or random")
+
+
+@pytest.mark.parametrize("background", ["red", "random-ish"])
+def test_an_unknown_background_of_a_render(nerf, last, tmp_path, background):
+    said(nerf("render", f"ckpt={last}", f"background={background}", f"paths.output_dir={tmp_path}"), background)
+
+
+def test_a_full_disk_outside_checkpoints_is_one_paragraph(nerf, last, tmp_path, monkeypatch):
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device", "metrics.json")
+
+    monkeypatch.setattr("nerf_lightning.commands.scoring.write_metrics", full)
+    import sys as system
+
+    from nerf_lightning import cli
+
+    monkeypatch.setattr(system, "argv", ["nerf", "eval", f"ckpt={last}", f"paths.output_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
 
 
 def test_batch_norm_trains_whole_batches(nerf, capture, tmp_path):

@@ -6,7 +6,7 @@ import time
 
 import pytest
 import torch
-from commands.conftest import FAST, start
+from running import FAST, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 STEPS = 300
@@ -17,7 +17,7 @@ def arguments(capture, folder, steps=STEPS):
         "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}", "trainer.num_threads=2",
         "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto",
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=7",
-        "trainer.val_every_steps=100", f"paths.output_dir={folder}",
+        "trainer.val_every_steps=14", f"paths.output_dir={folder}",
     )  # fmt: skip
 
 
@@ -77,13 +77,29 @@ def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture,
     assert_same_to_the_bit(state(folder), never_stopped)
     steps = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("train/loss")]
     assert steps == list(range(5, STEPS + 1, 5)), "TensorBoard shows each step once"
+    validated = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("val/psnr")]
+    assert len(set(validated)) == len(validated)
+    assert {14 * number for number in range(1, STEPS // 14)} <= set(validated)
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped):
+    """The command that a stopped run prints: no override needs to be repeated."""
+    folder = tmp_path / "run"
+    code, output = run_and_stop(capture, folder, signal.SIGTERM, 50)
+    assert code == 143, output
+    assert f"go on with: nerf train resume={folder}" in output
+    process = start("train", f"resume={folder}")
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert_same_to_the_bit(state(folder), never_stopped)
 
 
 @pytest.mark.slow
 def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped):
     folder = tmp_path / "run"
     for steps in (40, STEPS):
-        extra = ("scheduler.decay_steps=300",)
+        extra = (f"scheduler.decay_steps={STEPS}",)  # null stretches the schedule over the new length
         process = start(*arguments(capture, folder, steps), *extra)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 0, output

@@ -3,9 +3,9 @@
 import json
 
 import pytest
-from commands.conftest import FAST
 from configs import composed
 from omegaconf import OmegaConf
+from running import FAST
 
 from nerf_lightning.commands.run_folder import open_run, write_config
 from nerf_lightning.errors import InputError

@@ -6,7 +6,7 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
-from commands.conftest import FAST
+from running import FAST
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from videos import read_video
 
@@ -119,6 +119,23 @@ def test_render_needs_nothing_but_the_file(finished_run, nerf, tmp_path):
     result = nerf("render", *arguments, f"paths.output_dir={tmp_path}", "format=frames")
     assert result.code == 0, result.err
     assert iio.imread(tmp_path / "video" / "frame_0002.png").shape == (21, 21, 3)
+
+
+@pytest.mark.slow
+def test_a_sweep_of_eval_keeps_the_scene_and_has_a_folder_per_job(finished_run, nerf, tmp_path):
+    last = finished_run / "checkpoints" / "last.ckpt"
+    result = nerf("eval", "-m", f"ckpt={last}", "evaluation.split=val,train", f"paths.output_dir={tmp_path}")
+    assert result.code == 0, result.err
+    protocols = [json.loads(file.read_text())["protocol"] for file in sorted(tmp_path.glob("*/metrics.json"))]
+    assert [protocol["split"] for protocol in protocols] == ["val", "train"]
+    assert {protocol["scene"] for protocol in protocols} == {"npz"}
+
+
+def test_a_loose_checkpoint_is_evaluated_beside_itself(finished_run, nerf, tmp_path):
+    loose = tmp_path / "loose.ckpt"
+    loose.write_bytes((finished_run / "checkpoints" / "last.ckpt").read_bytes())
+    assert nerf("eval", f"ckpt={loose}", "evaluation.max_views=1").code == 0
+    assert (tmp_path / "evaluation" / "metrics.json").is_file()
 
 
 def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture, tmp_path):

@@ -37,10 +37,11 @@ def test_the_probe_answers_on_this_machine():
 
 
 def test_the_length_is_the_smaller_of_steps_and_epochs():
-    assert TrainerSettings(max_steps=100).num_steps(1000, 10) == 100
-    assert TrainerSettings(max_steps=1000, max_epochs=1).num_steps(1000, 10) == 100
-    assert TrainerSettings(max_steps=1000, max_epochs=0.5).num_steps(1001, 10) == 50
-    assert TrainerSettings(max_steps=70, max_epochs=3).num_steps(1000, 10) == 70
+    assert TrainerSettings(max_steps=100).num_steps(1000, 10, 0) == 100
+    assert TrainerSettings(max_steps=1000, max_epochs=1).num_steps(1000, 10, 0) == 100
+    assert TrainerSettings(max_steps=1000, max_epochs=0.5).num_steps(1001, 10, 0) == 50
+    assert TrainerSettings(max_steps=70, max_epochs=3).num_steps(1000, 10, 0) == 70
+    assert TrainerSettings(max_epochs=2).num_steps(995, 10, 30) == 229  # the crop is no epoch
 
 
 @pytest.mark.parametrize("name", ["max_steps", "val_every_steps"])
@@ -65,7 +66,7 @@ def test_inference_is_without_gradients_and_in_the_precision_of_training():
 
 @pytest.mark.slow
 def test_bfloat16_trains_and_evaluates(nerf, capture, tmp_path):
-    from commands.conftest import FAST
+    from running import FAST
 
     result = nerf(
         "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.precision=bf16-mixed", "trainer.max_steps=3",

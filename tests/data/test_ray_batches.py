@@ -6,7 +6,9 @@ from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 
 
 def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
-    return RayBatches(scene, Progress(), seed, batch_rays, crop_steps, crop_fraction, num_steps=100)
+    loader = RayBatches(scene, Progress(), seed, batch_rays, num_steps=100)
+    loader.crop_to(crop_fraction, crop_steps, restart_steps=5)
+    return loader
 
 
 def flat(scene, pixels):
@@ -53,6 +55,15 @@ def test_the_crop_shows_centres_only_and_counts_no_epoch():
         assert int(pixels.y.max()) < 9
     after = torch.cat([flat(scene, loader.pixels_at(0, 48 * (3 + step))) for step in range(9)])
     assert torch.equal(after.sort().values, torch.arange(432))
+
+
+def test_a_restarted_run_goes_through_a_crop_even_where_the_first_had_none():
+    scene = ball_scene()
+    loader = batches(scene)
+    assert int(loader.pixels_at(0, 0).x.min()) < 3
+    for step in range(5):
+        assert int(loader.pixels_at(1, 32 * step).x.min()) >= 3
+    assert int(loader.pixels_at(1, 32 * 5).x.min()) < 3
 
 
 def test_a_gathered_batch_is_the_pixels_own_colour_and_ray():

@@ -1,0 +1,37 @@
+"""Ways to run the command line in tests."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[1]
+
+# Small enough for a test: seconds in all.
+FAST = (
+    "model=nerf_tiny",
+    "data.batch_rays=64",
+    "data.crop_steps=3",
+    "data.val_rays=64",
+    "trainer.val_every_steps=10",
+    "callbacks.validation_pictures.every_steps=10",
+    "callbacks.monitor.every_steps=5",
+    "callbacks.checkpoints.every_steps=5",
+    "evaluation.max_views=2",
+    "evaluation.num_pictures=1",
+    "path.num_frames=2",
+)
+
+
+def start(*arguments: str, **options) -> subprocess.Popen:
+    """Start the command line as a process of its own."""
+    command = [sys.executable, "-m", "nerf_lightning", *map(str, arguments)]
+    return subprocess.Popen(
+        command,
+        cwd=options.pop("cwd", REPOSITORY),
+        env=os.environ | options.pop("env", {}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        **options,
+    )
