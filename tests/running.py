@@ -20,6 +20,7 @@ FAST = (
     "evaluation.max_views=2",
     "evaluation.num_pictures=1",
     "path.num_frames=2",
+    "trainer.max_steps=4",
 )
 
 

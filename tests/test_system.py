@@ -134,8 +134,9 @@ def test_validation_has_no_jitter():
     loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
     values = []
     for _ in range(2):
-        system.validation_step(loader.at(0, 0), 0)
-        system.on_validation_epoch_end()
+        with torch.no_grad():
+            system.validation_step(loader.at(0, 0), 0)
+            system.on_validation_epoch_end()
         values.append(dict(logged))
     assert values[0] == values[1]
     assert values[0]["val/psnr_standard_error"] > 0

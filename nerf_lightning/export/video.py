@@ -3,6 +3,7 @@
 ffmpeg is run here, not by imageio's writer, which rescales odd sizes and says nothing when ffmpeg fails.
 """
 
+import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -130,6 +131,9 @@ def require_ffmpeg() -> str:
     import imageio_ffmpeg
 
     try:
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
+        program = str(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError as error:
         raise InputError(f"A video needs ffmpeg, and there is none. {_CURE}") from error
+    if shutil.which(program) is None:
+        raise InputError(f"ffmpeg ({program}) does not start: there is no such program. {_CURE}")
+    return program

@@ -1,4 +1,5 @@
 import logging
+from types import SimpleNamespace
 
 import torch
 from lightning.pytorch import Trainer
@@ -8,9 +9,7 @@ from nerf_lightning.callbacks.collapse_guard import CollapseGuard, is_constant
 
 class StubTrainer(Trainer):
     global_step, loggers = 0, ()
-    datamodule = type(
-        "D", (), {"batches": type("B", (), {"batch_rays": 64, "crop_rays": lambda self, attempt: 64 * 50})()}
-    )
+    datamodule = SimpleNamespace(batches=SimpleNamespace(batch_rays=64, crop_rays=lambda attempt: 64 * 50))
 
     def __init__(self):
         pass
@@ -18,7 +17,7 @@ class StubTrainer(Trainer):
 
 class StubSystem:
     def __init__(self, alive):
-        self.progress = type("P", (), {"step": 0, "attempt": 0, "rays_seen": 0})()
+        self.progress = SimpleNamespace(step=0, attempt=0, rays_seen=0)
         self.alive = alive
         self.restarts = 0
 

@@ -156,7 +156,7 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("trainer.accelerator=tpu", "trainer.accelerator=tpu does not fit: it must be auto, cpu, gpu"),
         ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
-        ("path.elevation=95", "path.elevation is 95"),
+        ("path.elevation=95.0", "path.elevation is 95"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("evaluation.split=all", "evaluation.split=all does not fit"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
@@ -179,8 +179,9 @@ def test_no_ffmpeg_is_said_before_the_training(nerf, capture, tmp_path, monkeypa
 
 
 def test_transparent_pictures_need_a_background(nerf, tmp_path):
-    result = nerf("train", "scene.resolution=4", "scene.num_train=1", "scene.num_val=1", "scene.num_test=1",
-                  f"scene.cache_dir={tmp_path}", "scene.background=none", *FAST, f"paths.output_dir={tmp_path}/run")  # fmt: skip
+    small = ("scene.resolution=4", "scene.num_train=1", "scene.num_val=1", "scene.num_test=1")
+    where = (f"scene.cache_dir={tmp_path}", f"paths.output_dir={tmp_path}/run")
+    result = nerf("train", *small, *where, "scene.background=none", *FAST)
     said(result, "transparent pixels", "scene.background=none", "white, black or random")
 
 

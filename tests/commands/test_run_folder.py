@@ -6,6 +6,7 @@ import pytest
 from configs import composed
 from omegaconf import OmegaConf
 from running import FAST
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerf_lightning.commands.run_folder import open_run, write_config
 from nerf_lightning.errors import InputError
@@ -100,4 +101,4 @@ def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
         folder = run.parent
         assert (folder / "checkpoints/last.ckpt").is_file()
         assert (folder / ".hydra/config.yaml").is_file()
-        assert len(list((folder / "tensorboard").glob("events*"))) == 1
+        assert len(EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("test/psnr")) == 1
