@@ -8,7 +8,7 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.callbacks.validation_view import render_validation_view
 from nerf_lightning.errors import require_positive
-from nerf_lightning.export.figures import epoch_figure
+from nerf_lightning.export.figures import epoch_figure, loss_curve
 from nerf_lightning.export.pictures import save_png
 
 
@@ -37,6 +37,11 @@ class EpochFigures(Callback):
         seen = pl_module.progress.rays_seen - batches.crop_rays(pl_module.progress.attempt)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
             self._draw(trainer, pl_module, epoch=seen // len(batches.whole))
+
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+        """Draw the whole curve."""
+        path = Path(trainer.default_root_dir) / "images" / "loss_curve.png"
+        save_png(path, loss_curve(self.steps, self.losses))
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the curve across a resume."""

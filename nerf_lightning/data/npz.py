@@ -25,7 +25,7 @@ from nerf_lightning.data.images import area_downscale
 from nerf_lightning.data.pixel_store import empty_store
 from nerf_lightning.data.splits import every_kth, in_order
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.cameras import pinhole_cameras
+from nerf_lightning.geometry.cameras import pinhole_cameras, resized
 from nerf_lightning.types import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
@@ -92,10 +92,10 @@ class NpzReader(Reader):
         height, width = images.shape[1:3]
         check_divisible(width, height, self.downscale)
         train, held = self._split(len(images))
-        small = (width // self.downscale, height // self.downscale)
+        full = pinhole_cameras(c2w, focal, width, height)
         return Scene(
             name=self.name,
-            cameras=pinhole_cameras(c2w, focal / self.downscale, *small),
+            cameras=resized(full, full.width // self.downscale, full.height // self.downscale),
             pixels=_pixels(images, self.downscale, self.path),
             near=torch.full((len(images),), float(self.near)),
             far=torch.full((len(images),), float(self.far)),
