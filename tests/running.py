@@ -1,6 +1,7 @@
 """Ways to run the command line in tests."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,8 @@ def start(*arguments: str, **options) -> subprocess.Popen:
     command = [sys.executable, "-m", "nerf_lightning", *map(str, arguments)]
     return subprocess.Popen(
         command,
+        # A shell's background jobs ignore Ctrl-C and so would their children; a person's terminal does not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         cwd=options.pop("cwd", REPOSITORY),
         env=os.environ | options.pop("env", {}),
         stdout=subprocess.PIPE,

@@ -2,12 +2,14 @@
 
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.commands.suggestions import flatten
 
+CHOICES = ("encoder", "experiment", "field", "model", "scene")
 COMPARED = ("seed", "optimizer", "scheduler", "data", "field", "encoder", "model", "trainer", "scene")
 FINAL_METRICS = ("test/psnr", "test/ssim")
 
@@ -29,7 +31,9 @@ def hyper_parameters(config: DictConfig) -> dict[str, Any]:
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     assert isinstance(resolved, DictConfig)
     leaves = {key: value for key, value in flatten(resolved).items() if key.startswith(COMPARED)}
-    return {
+    # TensorBoard sorts by name and shows the first few: what was chosen comes first.
+    chosen = {f"choice.{group}": HydraConfig.get().runtime.choices.get(group) for group in CHOICES}
+    return {name: str(choice) for name, choice in chosen.items()} | {
         key: value if isinstance(value, (bool, int, float, str)) else str(value)
         for key, value in leaves.items()
         if not key.rpartition(".")[2].startswith("_")

@@ -284,7 +284,10 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
         process.wait(timeout=8)
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
+    try:
+        output, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130, output
     assert "Traceback" not in output
     assert not list(tmp_path.glob("*.mp4"))
