@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
 from nerf_lightning.commands.suggestions import flatten
 from nerf_lightning.errors import InputError
+from nerf_lightning.export.atomic import whole_file
 
 # Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
 NOT_IDENTITY = (
@@ -193,9 +194,8 @@ def _digest(identity: dict[str, Any]) -> str:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(temporary, path)
+    with whole_file(path) as part:
+        part.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def output_folder(given: str | None, checkpoint: Path, name: str) -> Path:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from rich.console import Console
 from rich.progress import Progress
 
 from nerf_lightning.data.base import Reader
@@ -18,6 +17,7 @@ from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached, defau
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
 from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.bricks.views import bricks_cameras
+from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Background, Cameras, PixelStore, Scene, Truth
 
@@ -169,4 +169,4 @@ def _render_chunk(tracer: Tracer, views: list[Pinhole]) -> Rendered:
 def _progress() -> Progress:
     """One bar per run: not in the workers of a loader, nor on the other ranks."""
     main = multiprocessing.parent_process() is None and os.environ.get("LOCAL_RANK", "0") == "0"
-    return Progress(console=Console(stderr=True), transient=True, disable=not main)
+    return progress_bar(shown=main)
