@@ -70,6 +70,9 @@ def _help(commands: dict[str, str]) -> str:
 
 def _run(command: str, arguments: list[str]) -> None:
     """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
+    # Read by GNU's OpenMP when torch is loaded.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     # Hydra would print its own short traceback and exit with 1; we want the exceptions.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     import hydra

@@ -10,15 +10,20 @@ from lightning.pytorch import LightningModule
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nerf_lightning.data.ray_batches import Progress
+from nerf_lightning.data.ray_batches import Progress, batch_size
+from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import tile_rays_for, tiles
+from nerf_lightning.optimizers.step_guard import StepGuard
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors, blend
 from nerf_lightning.schedules.base import Schedule
 from nerf_lightning.types import Background, Batch, RayBundle, Rendering
+
+# The number of rays per step changes no more often.
+BATCH_STEPS = 16
 
 
 class RadianceFieldSystem(LightningModule):
@@ -38,6 +43,7 @@ class RadianceFieldSystem(LightningModule):
         background: what lies behind the training rays.
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
         clip_norm: gradients are scaled down to this norm; None leaves them.
+        sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         record: what a checkpoint needs to be used alone (config text, cameras, bounds).
     """
 
@@ -53,6 +59,7 @@ class RadianceFieldSystem(LightningModule):
         background: Background,
         tile_points: int | None,
         clip_norm: int | float | None,
+        sample_budget: int | None,
         record: dict[str, Any],
     ):
         super().__init__()
@@ -62,6 +69,7 @@ class RadianceFieldSystem(LightningModule):
         self.progress, self.num_steps, self.seed = progress, num_steps, seed
         self.background = background
         self.tile_points, self.clip_norm = tile_points, clip_norm
+        self.sample_budget = sample_budget
         self.record = record
         self.start_weights: dict[str, Tensor] | None = None
         if tile_points is not None and model.needs_whole_batch:
@@ -69,6 +77,7 @@ class RadianceFieldSystem(LightningModule):
                 "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
                 "add trainer.tile_points=null, or leave batch_norm off."
             )
+        self.guard = StepGuard()
         self.last_step: dict[str, Tensor] = {}
         self.squared_errors: list[Tensor] = []
 
@@ -88,19 +97,28 @@ class RadianceFieldSystem(LightningModule):
         optimizer.state.clear()
 
     def configure_optimizers(self) -> Optimizer:
-        """Complete the optimizer."""
-        return self.build_optimizer(self.model.parameters())
+        """Complete the optimizer; the parameters of encoders are tables, which do not decay."""
+        tables, others = [], []
+        for level in self.model.modules():
+            if isinstance(level, Encoder):
+                tables += list(level.parameters())
+        known = {id(parameter) for parameter in tables}
+        others = [parameter for parameter in self.model.parameters() if id(parameter) not in known]
+        groups: list[dict[str, Any]] = [{"params": others}]
+        return self.build_optimizer(groups + ([{"params": tables, "weight_decay": 0.0}] if tables else []))
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """Take one step: tiles forward and backward, clip, update."""
-        optimizer = self.optimizers()
+        optimizer, progress = self.optimizers(), self.progress
         optimizer.zero_grad()  # type: ignore[union-attr]
+        self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         self.last_step = self.accumulate_gradients(batch, self.manual_backward)
-        # Elsewhere than on the CPU the question costs a synchronisation, so it is asked seldom and before each save.
-        if self.device.type == "cpu" or self.progress.step % 100 == 0:
-            self.require_finite_loss()
-        self._update(optimizer)
-        self.progress.advance(batch.rays.near.numel())
+        if self.guard.allows(self.last_step["losses"], self.model.parameters(), progress.step):
+            self._update(optimizer)
+        progress.advance(batch.rays.near.numel())
+        if self.sample_budget is not None and (progress.step == 1 or progress.step % BATCH_STEPS == 0):
+            points = self.model.points_per_ray(training=True)
+            progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
 
     def accumulate_gradients(self, batch: Batch, backward: Callable[[Tensor], None]) -> dict[str, Tensor]:
         """Send a batch forward and backward, tile by tile.
@@ -114,7 +132,7 @@ class RadianceFieldSystem(LightningModule):
         background = background_colors(self.background, num_rays, self.device, random)
         target = blend(batch.rgba, background)
         losses, foreground = [], []
-        for tile in tiles(num_rays, self._tile_rays(num_rays)):
+        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
             behind = None if background is None else background[tile]
             renderings = self.model(batch.rays[tile], behind, random[tile])
             share = torch.stack(self.loss(renderings, target[tile])) * (target[tile].shape[0] / num_rays)
@@ -122,16 +140,6 @@ class RadianceFieldSystem(LightningModule):
             losses.append(share.detach())
             foreground.append(renderings[-1].foreground.detach())
         return {"losses": torch.stack(losses).sum(0), "foreground": torch.cat(foreground), "target": target}
-
-    def require_finite_loss(self) -> None:
-        """Stop the run at a loss that is not a number, before it ruins the weights or reaches a checkpoint."""
-        if self.last_step and not bool(torch.isfinite(self.last_step["losses"]).all()):
-            raise InputError(
-                f"The loss of step {self.trainer.global_step} is not a finite number; the run stops. "
-                f"The last good checkpoint, where one was saved, is "
-                f"{self.trainer.default_root_dir}/checkpoints/last.ckpt. Try a smaller optimizer.lr, gradient "
-                "clipping (trainer.clip_norm=1), trainer.precision=32-true, or check the capture's poses, near and far."
-            )
 
     def _require_finite_weights(self) -> None:
         # A finite loss may still have had gradients that were not.
@@ -169,10 +177,10 @@ class RadianceFieldSystem(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what makes the file self-contained, and the run's state beyond weights and optimizer."""
-        self.require_finite_loss()
         self._require_finite_weights()
         checkpoint["nerf_lightning"] = self.record | {
             "progress": asdict(self.progress),
+            "bad_steps": self.guard.state(),
             "tile_points": self.tile_points,
             "num_threads": torch.get_num_threads(),
         }
@@ -182,11 +190,12 @@ class RadianceFieldSystem(LightningModule):
         state = checkpoint["nerf_lightning"]
         for name, value in state["progress"].items():
             setattr(self.progress, name, value)
+        self.guard.restore(state["bad_steps"], self.device)
         self.tile_points = state["tile_points"]
         torch.set_num_threads(state["num_threads"])
 
-    def _tile_rays(self, num_rays: int) -> int:
-        return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points)
+    def _tile_rays(self, num_rays: int, training: bool = False) -> int:
+        return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)
 
     def _render(self, rays: RayBundle, background: Tensor | None) -> Rendering:
         return self.model(rays, background, random=None)[-1]

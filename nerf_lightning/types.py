@@ -153,6 +153,31 @@ class RaySamples(TensorStruct):
 
 
 @dataclass(frozen=True)
+class PackedSamples(TensorStruct):
+    """Only the intervals that may hold something, ray after ray, each ray's in order.
+
+    The arrays have a capacity; what lies beyond the last bound is padding of zero length. It is packed for speed, and
+    has functions of its own (`rendering.packed`).
+    """
+
+    ray_index: Int[Tensor, "capacity"]
+    starts: Float[Tensor, "capacity"]
+    ends: Float[Tensor, "capacity"]
+    bounds: Int[Tensor, "bounds"]
+    """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
+
+    @property
+    def midpoints(self) -> Float[Tensor, "capacity"]:
+        """Where the field is asked."""
+        return 0.5 * (self.starts + self.ends)
+
+    @property
+    def deltas(self) -> Float[Tensor, "capacity"]:
+        """Length of each interval."""
+        return self.ends - self.starts
+
+
+@dataclass(frozen=True)
 class FieldOutput(TensorStruct):
     """What a field says of points in space."""
 
@@ -174,8 +199,22 @@ class Rendering(TensorStruct):
     """Sum of weights."""
     depth: Float[Tensor, "*rays"]
     """Expected distance along the ray; light that escapes ends at far."""
+
+
+@dataclass(frozen=True)
+class DenseRendering(Rendering):
+    """A level whose rays all have the same number of samples."""
+
     weights: Float[Tensor, "*rays samples"]
     samples: RaySamples
+
+
+@dataclass(frozen=True)
+class PackedRendering(Rendering):
+    """A level that skipped what is empty."""
+
+    weights: Float[Tensor, "capacity"]
+    samples: PackedSamples
 
 
 @dataclass(frozen=True)

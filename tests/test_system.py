@@ -25,7 +25,7 @@ class StubOptimizer:
         pass
 
 
-def make_system(tile_points, model=None, background="white", clip_norm=None, seed=0):
+def make_system(tile_points, model=None, background="white", clip_norm=None, seed=0, sample_budget=None):
     system = RadianceFieldSystem(
         model=model or tiny_model(density_bias=0.5),
         loss=MeanSquaredError(),
@@ -37,6 +37,7 @@ def make_system(tile_points, model=None, background="white", clip_norm=None, see
         background=background,
         tile_points=tile_points,
         clip_norm=clip_norm,
+        sample_budget=sample_budget,
         record={},
     )
     optimizer = StubOptimizer(system.parameters())
@@ -75,14 +76,30 @@ def test_batch_norm_with_tiles_is_refused_by_name():
     make_system(None, tiny_model(batch_norm=True))
 
 
-def test_a_loss_that_is_not_a_number_stops_the_run_before_the_weights_change():
+def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     system = make_system(None)
-    system._trainer = type("T", (), {"global_step": 7, "default_root_dir": "outputs/x"})()
+    steps = []
+    system.optimizers().step = lambda: steps.append(system.progress.step)
+    color = system.model.levels["fine"].field.color_head.weight
+    good, broken = color.detach().clone(), torch.full_like(color, float("nan"))
+    loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
+    for weights in (good, broken, broken, good):
+        with torch.no_grad():
+            color.copy_(weights)
+        system.training_step(loader.at(0, system.progress.rays_seen), 0)
+    assert steps == [0, 3]
+    assert system.guard.skipped == 2
+    assert system.guard.state() == [2, 0]
+    assert system.progress.step == 4
+
+
+def test_gradients_that_stay_not_finite_stop_the_run_with_advice():
+    system = make_system(None)
     with torch.no_grad():
         system.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    with pytest.raises(InputError, match=r"loss of step 7 is not a finite number.*outputs/x/checkpoints/last\.ckpt"):
-        gradients(system, ball_scene())
-    assert system.progress.step == 0
+    with pytest.raises(InputError, match=r"not a finite number since 10 steps .*optimizer\.lr.*trainer\.clip_norm=1"):
+        gradients(system, ball_scene(), steps=20)
+    assert system.progress.step == 9
 
 
 def test_weights_that_are_not_finite_are_not_saved():

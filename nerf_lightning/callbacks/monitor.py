@@ -24,23 +24,27 @@ class Monitor(Callback):
     def __init__(self, every_steps: int = 50):
         require_positive(every_steps=every_steps)
         self.every_steps = every_steps
-        self.since = (0.0, 0)
+        self.since = 0.0
+        self.rays_seen = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Start the clock."""
-        self.since = (time.perf_counter(), trainer.global_step)
+        self.since = time.perf_counter()
+        self.rays_seen = pl_module.progress.rays_seen
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Log a row when it is time."""
         if trainer.global_step % self.every_steps:
             return
         now, step = time.perf_counter(), trainer.global_step
-        steps, seconds = step - self.since[1], now - self.since[0]
-        self.since = (now, step)
+        rays, seconds = pl_module.progress.rays_seen - self.rays_seen, now - self.since
+        self.since, self.rays_seen = now, pl_module.progress.rays_seen
         values = level_scalars(pl_module.model.level_names, pl_module.last_step["losses"])
         values["train/learning_rate"] = pl_module.optimizers().param_groups[0]["lr"]
-        if steps > 0 and seconds > 0:
-            values["speed/rays_per_second"] = steps * batch.rays.near.numel() / seconds
+        if rays > 0 and seconds > 0:
+            values["speed/rays_per_second"] = rays / seconds
+        values["speed/rays_per_step"] = batch.rays.near.numel()
+        values["train/skipped_steps"] = pl_module.guard.skipped
         values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
         if pl_module.device.type == "cuda":
             values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE

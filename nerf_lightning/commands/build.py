@@ -14,12 +14,12 @@ from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import Level, RadianceModel
-from nerf_lightning.samplers.base import Sampler
+from nerf_lightning.models.levels import AnyLevel, RadianceModel
+from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types import Scene
 
-CONTRACTS = (Encoder, Field, Sampler, Level, RadianceModel)
+CONTRACTS = (Encoder, Field, AnySampler, AnyLevel, RadianceModel)
 ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
 
 
@@ -48,8 +48,10 @@ def build_system(
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
+    model: RadianceModel = build(config.model)
+    model.place(scene)
     return RadianceFieldSystem(
-        model=build(config.model),
+        model=model,
         loss=build(config.loss),
         optimizer=build(config.optimizer),
         schedule=build(config.scheduler),
@@ -59,6 +61,7 @@ def build_system(
         background=scene.background,
         tile_points=settings.tile_points,
         clip_norm=settings.clip_norm,
+        sample_budget=config.data.sample_budget,
         record=record,
     )
 

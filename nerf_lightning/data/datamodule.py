@@ -15,7 +15,9 @@ class RayDataModule(LightningDataModule):
         progress: the run's place, shared with the system.
         seed: the run's seed.
         num_steps: the length of the run.
-        batch_rays: rays per training step.
+        batch_rays: rays per training step; the most, with a budget.
+        sample_budget: rays per step adapt, in a few fixed sizes, so that a step has about so many samples; None: they
+            do not. It needs a model that skips empty space.
         crop_steps: steps at the start that see only the pictures' centres.
         crop_fraction: share of each side that the crop keeps.
         restart_crop_steps: the least crop after a restart by the collapse guard.
@@ -29,6 +31,7 @@ class RayDataModule(LightningDataModule):
         seed: int,
         num_steps: int,
         batch_rays: int = 1024,
+        sample_budget: int | None = None,
         crop_steps: int = 0,
         crop_fraction: float = 0.5,
         restart_crop_steps: int = 500,
@@ -38,6 +41,11 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
+        if sample_budget is not None and (sample_budget < 1 or crop_steps):
+            raise InputError(
+                f"data.sample_budget={sample_budget} with data.crop_steps={crop_steps}: give a positive budget and no "
+                "crop (whose length is counted in batches of one size), or data.sample_budget=null."
+            )
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
         if scene.background == "none" and bool((scene.pixels.rgba[:, 3] < 255).any()):

@@ -26,6 +26,10 @@ class Progress:
     """Steps taken in this attempt."""
     rays_seen: int = 0
     """Rays trained on in this attempt, those of the centre crop included."""
+    batch_rays: int = 0
+    """Rays of the next step; they may adapt to how many samples a ray has."""
+    largest_batch: int = 0
+    """Rays of a step at most."""
 
     def advance(self, num_rays: int) -> None:
         """Count one step of `num_rays` rays."""
@@ -35,6 +39,19 @@ class Progress:
     def restart(self) -> None:
         """Begin a new attempt."""
         self.attempt, self.step, self.rays_seen = self.attempt + 1, 0, 0
+
+
+BATCH_SIZES = 8
+
+
+def batch_size(largest: int, wanted: float) -> int:
+    """Return the largest of a few fixed sizes (`largest`, its half, its quarter, ...) that is at most `wanted`.
+
+    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0)
+    (1024, 4096, 32)
+    """
+    sizes = [max(1, largest >> number) for number in range(BATCH_SIZES)]
+    return next((size for size in sizes if size <= wanted), sizes[-1])
 
 
 class PixelDomain:
@@ -97,6 +114,7 @@ class RayBatches:
     ):
         self.scene, self.progress, self.seed = scene, progress, seed
         self.batch_rays, self.num_steps = batch_rays, num_steps
+        progress.batch_rays = progress.largest_batch = batch_rays
         self.whole = PixelDomain(scene, scene.splits["train"])
         self.crop_to(1.0, 0, 0)
 
@@ -125,7 +143,7 @@ class RayBatches:
             yield self.at(self.progress.attempt, self.progress.rays_seen)
 
     def at(self, attempt: int, rays_seen: int) -> Batch:
-        """Return the batch that follows `rays_seen` rays of an attempt."""
+        """Return the batch that follows `rays_seen` rays of an attempt, as large as batches are now."""
         return gather(self.scene, self.pixels_at(attempt, rays_seen))
 
     def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
@@ -135,7 +153,7 @@ class RayBatches:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:
             domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
-        place = position + torch.arange(self.batch_rays)
+        place = position + torch.arange(self.progress.batch_rays)
         epochs, epoch = torch.unique(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
         return domain.locate(permute(place % len(domain), len(domain), keys[epoch]))

@@ -10,6 +10,8 @@ class Encoder(nn.Module, ABC):
     """Map coordinates to features that an MLP can resolve. `in_dim` is 3: positions or unit directions."""
 
     in_dim: int = 3
+    needs_unit_cube: bool = False
+    """True where points outside of the unit cube mean nothing; the field must map its positions there."""
 
     @property
     @abstractmethod

@@ -49,6 +49,8 @@ class NerfMLP(Field):
         super().__init__()
         if skip is not None and not 0 < skip < depth:
             raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
+        if position_encoder.needs_unit_cube:
+            raise ValueError(f"{type(position_encoder).__name__} needs a field that knows the scene's box: field=hash")
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
         self.skip = skip

@@ -1,6 +1,7 @@
 """A method as named levels of (sampler, field): each level samples where the one before saw something."""
 
-from typing import cast
+from abc import abstractmethod
+from typing import Any, cast
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,24 +10,60 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import RayBundle, Rendering
+from nerf_lightning.types import DenseRendering, RayBundle, Rendering, Scene
 
 
-class Level(nn.Module):
-    """One round of sampling and rendering."""
+class AnyLevel(nn.Module):
+    """The contract of a level: one round of sampling and rendering."""
+
+    sampler: nn.Module
+    field: Field
+
+    @abstractmethod
+    def forward(
+        self,
+        rays: RayBundle,
+        background: Float[Tensor, "*rays 3"] | None,
+        history: list[Any],
+        random: RayRandom | None,
+    ) -> Rendering:
+        """Render rays; `history` is what the earlier levels saw, `random` is None outside training."""
+
+    @abstractmethod
+    def points_per_ray(self, before: float, training: bool) -> float:
+        """Return how many points a ray sends through the field at once, given how many the level before had."""
+
+    def place(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
+        self.field.place(scene.aabb)
+
+    def update(self, step: int, key: int) -> None:  # noqa: B027
+        """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
+
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
+        self.field.reset_parameters()
+
+
+class Level(AnyLevel):
+    """A level in which every ray has the same number of samples."""
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()
         self.sampler = sampler
         self.field = field
 
+    def points_per_ray(self, before: float, training: bool) -> float:
+        """As the sampler says."""
+        return float(self.sampler.num_samples_after(int(before)))
+
     def forward(
         self,
         rays: RayBundle,
         background: Float[Tensor, "*rays 3"] | None,
-        history: list[Rendering],
+        history: list[DenseRendering],
         random: RayRandom | None,
-    ) -> Rendering:
+    ) -> DenseRendering:
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
         along = samples.midpoints[..., None] * rays.directions[..., None, :]
@@ -41,16 +78,10 @@ class RadianceModel(nn.Module):
         levels: name -> level, in order.
     """
 
-    max_samples: int
-    """The largest number of points that one ray takes in any level: what tiles are cut by."""
-
-    def __init__(self, levels: dict[str, Level]):
+    def __init__(self, levels: dict[str, AnyLevel]):
         super().__init__()
         self.levels = nn.ModuleDict(levels)
-        counts = [0]
-        for level in self._in_order():
-            counts.append(level.sampler.num_samples_after(counts[-1]))
-        self.max_samples = max(counts)
+        self.points_per_ray(training=False)  # levels that do not fit each other are refused here
 
     @property
     def level_names(self) -> tuple[str, ...]:
@@ -61,6 +92,13 @@ class RadianceModel(nn.Module):
     def needs_whole_batch(self) -> bool:
         """Whether any field forbids tiles."""
         return any(level.field.needs_whole_batch for level in self._in_order())
+
+    def points_per_ray(self, training: bool) -> float:
+        """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
+        counts = [0.0]
+        for level in self._in_order():
+            counts.append(level.points_per_ray(counts[-1], training))
+        return max(counts)
 
     def forward(
         self,
@@ -80,10 +118,20 @@ class RadianceModel(nn.Module):
             history.append(level(rays, background, history, random))
         return history
 
+    def place(self, scene: Scene) -> None:
+        """Tell the levels where the scene's content lies, once, before training."""
+        for level in self._in_order():
+            level.place(scene)
+
+    def update(self, step: int, key: int) -> None:
+        """Do what the levels do between steps of training."""
+        for level in self._in_order():
+            level.update(step, key)
+
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
         for level in self._in_order():
-            level.field.reset_parameters()
+            level.reset_parameters()
 
-    def _in_order(self) -> list[Level]:
-        return cast(list[Level], list(self.levels.values()))
+    def _in_order(self) -> list[AnyLevel]:
+        return cast(list[AnyLevel], list(self.levels.values()))

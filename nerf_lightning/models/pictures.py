@@ -38,9 +38,9 @@ def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
         start = stop
 
 
-def tile_rays_for(model: RadianceModel, tile_points: int) -> int:
-    """Return how many rays make a tile of at most `tile_points` points, at least one."""
-    return max(1, tile_points // model.max_samples)
+def tile_rays_for(model: RadianceModel, tile_points: int, training: bool = False) -> int:
+    """Return how many rays make a tile of about `tile_points` points, at least one."""
+    return max(1, int(tile_points / model.points_per_ray(training)))
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import FieldOutput, RayBundle, RaySamples, Rendering
+from nerf_lightning.types import FieldOutput, RayBundle, RaySamples, DenseRendering
 
 
 def weights_from_density(
@@ -43,7 +43,7 @@ def composite(
     samples: RaySamples,
     rays: RayBundle,
     background: Float[Tensor, "*rays 3"] | None,
-) -> Rendering:
+) -> DenseRendering:
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
@@ -58,7 +58,7 @@ def composite(
     opacity = weights.sum(dim=-1)
     escaped = 1.0 - opacity
     foreground = (weights[..., None] * output.rgb).sum(dim=-2)
-    return Rendering(
+    return DenseRendering(
         rgb=foreground if background is None else foreground + escaped[..., None] * background,
         foreground=foreground,
         opacity=opacity,

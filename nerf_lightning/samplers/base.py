@@ -5,14 +5,18 @@ from abc import ABC, abstractmethod
 from torch import nn
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import RayBundle, RaySamples, Rendering
+from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
 
 
-class Sampler(nn.Module, ABC):
-    """Choose intervals along rays."""
+class AnySampler(nn.Module):
+    """What chooses where along rays to ask the field, in whatever layout."""
+
+
+class Sampler(AnySampler, ABC):
+    """Choose intervals along rays, as many on each."""
 
     @abstractmethod
-    def forward(self, rays: RayBundle, history: list[Rendering], random: RayRandom | None) -> RaySamples:
+    def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
         """Return the intervals.
 
         Args:

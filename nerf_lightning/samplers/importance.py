@@ -5,7 +5,7 @@ import torch
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.histograms import sample_histogram
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import RayBundle, RaySamples, Rendering
+from nerf_lightning.types import RayBundle, RaySamples, DenseRendering
 
 
 class ImportanceSampler(Sampler):
@@ -23,7 +23,7 @@ class ImportanceSampler(Sampler):
         super().__init__()
         self.num_samples = num_samples
 
-    def forward(self, rays: RayBundle, history: list[Rendering], random: RayRandom | None) -> RaySamples:
+    def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
         """Return the union of the last level's fenceposts and the new ones, sorted."""
         edges = history[-1].samples.edges.detach()
         weights = history[-1].weights.detach()

@@ -4,7 +4,7 @@ import torch
 
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import RayBundle, RaySamples, Rendering
+from nerf_lightning.types import RayBundle, RaySamples, DenseRendering
 
 
 class StratifiedSampler(Sampler):
@@ -23,7 +23,7 @@ class StratifiedSampler(Sampler):
             raise ValueError(f"num_samples={num_samples}: at least one sample is needed")
         self.num_samples = num_samples
 
-    def forward(self, rays: RayBundle, history: list[Rendering], random: RayRandom | None) -> RaySamples:
+    def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
         """Return `num_samples` intervals from near to far."""
         s = torch.linspace(0.0, 1.0, self.num_samples + 1, device=rays.near.device)
         s = s.expand(*rays.near.shape, -1)

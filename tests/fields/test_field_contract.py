@@ -10,7 +10,7 @@ from nerf_lightning.fields.base import Field
 
 @pytest.fixture(params=options("field"))
 def field(request):
-    return build(composed("train", f"field={request.param}", "model=nerf_tiny").field)
+    return build(composed("train", f"field={request.param}").field)
 
 
 def points_and_directions(rays=5, samples=4):

@@ -11,7 +11,7 @@ def test_levels_run_in_order_and_the_fine_one_sees_the_union():
     renderings = model(some_rays(5), torch.ones(5, 3), batch_random(0, 5))
     assert model.level_names == ("coarse", "fine")
     assert [r.weights.shape[-1] for r in renderings] == [8, 16]
-    assert model.max_samples == 16
+    assert model.points_per_ray(training=True) == 16
     assert isinstance(model, RadianceModel)
 
 

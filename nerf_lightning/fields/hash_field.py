@@ -1,0 +1,119 @@
+"""Two small MLPs behind an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989)."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.fields.base import Field
+from nerf_lightning.geometry.boxes import contract, to_unit_cube
+from nerf_lightning.randomness import RayRandom
+from nerf_lightning.types import FieldOutput
+
+LARGEST_EXPONENT = 15.0
+
+
+class HashField(Field):
+    """Density from one hidden layer, colour from two more that see the direction; exponential density.
+
+    Positions are mapped from the scene's box, or from contracted space, to the unit cube. Outside of the box (without
+    contraction) there is nothing.
+
+    Args:
+        position_encoder: features of points in the unit cube.
+        direction_encoder: features of unit directions.
+        width: width of every hidden layer.
+        feature_dim: what the density's MLP hands to the colour's, the raw density included.
+        density_bias: added to the raw density, before the exponential; negative values start from thin space.
+        contraction: map all space, contracted around the box, instead of the box alone; for unbounded captures.
+    """
+
+    aabb: Tensor
+
+    def __init__(
+        self,
+        position_encoder: Encoder,
+        direction_encoder: Encoder,
+        width: int = 64,
+        feature_dim: int = 16,
+        density_bias: float = -1.0,
+        contraction: bool = False,
+    ):
+        super().__init__()
+        self.position_encoder = position_encoder
+        self.direction_encoder = direction_encoder
+        self.density_bias = density_bias
+        self.contraction = contraction
+        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.density_mlp = nn.Sequential(
+            nn.Linear(position_encoder.out_dim, width, bias=False),
+            nn.ReLU(inplace=True),
+            nn.Linear(width, feature_dim, bias=False),
+        )
+        self.color_mlp = nn.Sequential(
+            nn.Linear(feature_dim + direction_encoder.out_dim, width, bias=False),
+            nn.ReLU(inplace=True),
+            nn.Linear(width, width, bias=False),
+            nn.ReLU(inplace=True),
+            nn.Linear(width, 3, bias=False),
+        )
+
+    def place(self, aabb: Float[Tensor, "2 3"]) -> None:
+        """Take note of the box that holds the scene's content."""
+        self.aabb.copy_(aabb)
+
+    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Return the density per unit length, without paying for colour."""
+        return self._density(self._features(positions), positions)
+
+    def forward(
+        self,
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
+        random: RayRandom | None,
+    ) -> FieldOutput:
+        """Return density and colour; density does not depend on the direction."""
+        features = self._features(positions)
+        direction = self.direction_encoder(directions).to(features.dtype)
+        direction = direction.expand(*features.shape[:-1], direction.shape[-1])
+        raw_rgb = self.color_mlp(torch.cat([features, direction], dim=-1))
+        return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator."""
+        self.position_encoder.reset_parameters()
+        self.direction_encoder.reset_parameters()
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                module.reset_parameters()
+
+    def _features(self, positions: Tensor) -> Tensor:
+        unit = to_unit_cube(positions, self.aabb)
+        if self.contraction:
+            # The box becomes the cube that the unit ball just holds; the ball of radius 2 fills the unit cube.
+            unit = contract((2.0 * unit - 1.0) / 3**0.5) / 4.0 + 0.5
+        return self.density_mlp(self.position_encoder(unit))
+
+    def _density(self, features: Tensor, positions: Tensor) -> Tensor:
+        density = _TruncatedExponential.apply(features[..., 0].float() + self.density_bias)
+        if self.contraction:
+            return density
+        inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(dim=-1)
+        return torch.where(inside, density, 0.0)
+
+
+class _TruncatedExponential(torch.autograd.Function):
+    """exp(x), whose gradient stops growing at exp(15): one wild sample must not end the run."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
+        return torch.exp(raw.clamp(max=2 * LARGEST_EXPONENT))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (raw,) = ctx.saved_tensors
+        return grad * torch.exp(raw.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT))

@@ -1,0 +1,41 @@
+"""Boxes along the axes of the world, and the contraction of all space into a ball."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.types import RayBundle
+
+
+def to_unit_cube(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3"]) -> Float[Tensor, "*points 3"]:
+    """Map a box onto the unit cube.
+
+    >>> to_unit_cube(torch.tensor([0.0, 1.0, 3.0]), torch.tensor([[-1.0, -1, -1], [3, 3, 3]]))
+    tensor([0.2500, 0.5000, 1.0000])
+    """
+    return (positions - aabb[0]) / (aabb[1] - aabb[0])
+
+
+def contract(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    """Bring all space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
+
+    Eq. 10 of arXiv 2111.12077.
+
+    >>> contract(torch.tensor([[0.5, 0.0, 0.0], [4.0, 0.0, 0.0]]))
+    tensor([[0.5000, 0.0000, 0.0000],
+            [1.7500, 0.0000, 0.0000]])
+    """
+    norm = positions.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    return positions * (2.0 - 1.0 / norm) / norm
+
+
+def distances_in_box(
+    rays: RayBundle, aabb: Float[Tensor, "2 3"]
+) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
+    """Return where each ray enters and leaves a box, within its near and far; the first is not smaller on a miss."""
+    # A direction of exactly zero gives infinities, which order rightly; on a face they would give nan.
+    inverse = 1.0 / torch.where(rays.directions == 0, 1e-20, rays.directions)
+    a, b = (aabb[0] - rays.origins) * inverse, (aabb[1] - rays.origins) * inverse
+    enter = torch.minimum(a, b).amax(dim=-1)
+    leave = torch.maximum(a, b).amin(dim=-1)
+    return torch.maximum(enter, rays.near), torch.minimum(leave, rays.far)

@@ -1,0 +1,39 @@
+"""Adam's step for the CPU, in one pass."""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit, prange
+from torch import Tensor
+
+CHUNK = 16384
+
+
+def adam_step(
+    parameter: Tensor,
+    grad: Tensor,
+    first: Tensor,
+    second: Tensor,
+    step_size: float,
+    root_scale: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Update contiguous float32 arrays in place."""
+    arrays = (x.view(-1).numpy() for x in (parameter, grad, first, second))
+    _adam_step(*arrays, *(np.float32(x) for x in (step_size, root_scale, *betas, eps)))
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _adam_step(parameter, grad, first, second, step_size, root_scale, beta1, beta2, eps):
+    count, one = parameter.shape[0], np.float32(1.0)
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+            g = grad[i]
+            if g != 0:
+                m = beta1 * first[i] + (one - beta1) * g
+                v = beta2 * second[i] + (one - beta2) * g * g
+                first[i], second[i] = m, v
+                parameter[i] -= step_size * m / (np.sqrt(v) * root_scale + eps)
+                grad[i] = 0

@@ -1,0 +1,66 @@
+"""Which twin of a kernel runs: numba on the CPU, triton on CUDA, plain torch elsewhere and where those are missing."""
+
+import functools
+import importlib
+import logging
+import os
+from collections.abc import Callable
+from types import ModuleType
+
+import torch
+
+log = logging.getLogger(__name__)
+
+
+@functools.cache
+def twin(module: str) -> ModuleType | None:
+    """Import a module of compiled kernels; None, and one warning that names the cause, where that is impossible."""
+    library = "triton" if module.endswith("_triton") else "numba"
+    try:
+        if library == "numba":
+            _choose_threads()
+        return importlib.import_module(f"nerf_lightning.kernels.{module}")
+    except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
+        _warn_once(library, f"{type(error).__name__}: {error}")
+        return None
+
+
+def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
+    """Return a numba module for tensors on the CPU, with its threads set to torch's; else None."""
+    if device.type != "cpu":
+        return None
+    found = twin(module)
+    if found is not None:
+        set_threads()
+    return found
+
+
+def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
+    """Return a triton module for tensors on a CUDA device; else None."""
+    return twin(module) if device.type == "cuda" else None
+
+
+def set_threads() -> None:
+    """Give numba as many threads as torch has."""
+    import numba
+
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+
+
+def _choose_threads() -> None:
+    # The layer that every platform has, and whose threads sleep while torch works.
+    import numba
+
+    if "NUMBA_THREADING_LAYER" not in os.environ:
+        numba.config.THREADING_LAYER = "workqueue"
+
+
+@functools.cache
+def _warn_once(library: str, reason: str) -> None:
+    log.warning(
+        "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. "
+        "Reinstall it (pip install --force-reinstall %s), or read its list of supported machines.",
+        library,
+        " ".join(reason.split())[:200],
+        library,
+    )

@@ -1,0 +1,186 @@
+"""The hash grid for the CPU. The backward pass goes level by level in parallel, so two threads never write one entry.
+
+`lanes` is a tuple of F zeros: its length is part of the compiled signature, so the loops over features become vectors.
+"""
+
+from typing import TYPE_CHECKING, Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit, prange
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from nerf_lightning.kernels.hash_grid import HashGridLayout
+
+CHUNK = 1024
+PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
+ONE = np.float32(1.0)
+
+
+def forward(
+    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
+) -> Float[Tensor, "points out"]:
+    """Return the features."""
+    lanes = (0,) * table.shape[1]
+    out = torch.empty(points.shape[0], len(layout.resolutions) * len(lanes))
+    _forward(table.numpy(), points.numpy(), *_arrays(layout), lanes, out.numpy())
+    return out
+
+
+def add_table_gradient(
+    into: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    grad: Float[Tensor, "points out"],
+    layout: "HashGridLayout",
+) -> None:
+    """Add the gradient with respect to the table to `into`."""
+    _add_table_gradient(into.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), (0,) * into.shape[1])
+
+
+def point_gradient(
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    grad: Float[Tensor, "points out"],
+    layout: "HashGridLayout",
+) -> Float[Tensor, "points 3"]:
+    """Return the gradient with respect to the points."""
+    out = torch.empty_like(points)
+    lanes = (0,) * table.shape[1]
+    _point_gradient(table.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), lanes, out.numpy())
+    return out
+
+
+def _arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
+    resolutions = np.array(layout.resolutions, np.int32)
+    hashed = np.array([layout.is_hashed(level) for level in range(len(resolutions))])
+    return resolutions, np.array(layout.offsets, np.int64), hashed, np.uint32(layout.table_size - 1)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _cell(coordinate, resolution):
+    scaled = min(max(coordinate, np.float32(0.0)), ONE) * np.float32(resolution)
+    cell = min(np.int32(scaled), np.int32(resolution - 1))
+    return cell, np.float32(scaled - np.float32(cell))
+
+
+@njit(fastmath=True)
+@no_type_check
+def _corners(x, y, z, resolution, offset, hashed, mask):
+    if hashed:
+        x0, x1 = np.uint32(x), np.uint32(x + 1)
+        y0 = np.uint32(np.uint32(y) * PRIME_Y)
+        y1 = np.uint32(y0 + PRIME_Y)
+        z0 = np.uint32(np.uint32(z) * PRIME_Z)
+        z1 = np.uint32(z0 + PRIME_Z)
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        return (
+            offset + np.int64((x0 ^ a) & mask),
+            offset + np.int64((x1 ^ a) & mask),
+            offset + np.int64((x0 ^ b) & mask),
+            offset + np.int64((x1 ^ b) & mask),
+            offset + np.int64((x0 ^ c) & mask),
+            offset + np.int64((x1 ^ c) & mask),
+            offset + np.int64((x0 ^ d) & mask),
+            offset + np.int64((x1 ^ d) & mask),
+        )
+    row = np.int64(resolution + 1)
+    plane = row * row
+    first = offset + np.int64(x) + np.int64(y) * row + np.int64(z) * plane
+    above = first + plane
+    return first, first + 1, first + row, first + row + 1, above, above + 1, above + row, above + row + 1
+
+
+@njit(fastmath=True)
+@no_type_check
+def _weights(x, y, z):
+    u, v, w = ONE - x, ONE - y, ONE - z
+    a, b, c, d = v * w, y * w, v * z, y * z
+    return u * a, x * a, u * b, x * b, u * c, x * c, u * d, x * d
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):
+    count, width = points.shape[0], len(lanes)
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        for level in range(resolutions.shape[0]):
+            resolution, column = resolutions[level], level * width
+            for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                x, fx = _cell(points[i, 0], resolution)
+                y, fy = _cell(points[i, 1], resolution)
+                z, fz = _cell(points[i, 2], resolution)
+                e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+                w = _weights(fx, fy, fz)
+                for f in range(width):
+                    out[i, column + f] = (
+                        w[0] * table[e[0], f]
+                        + w[1] * table[e[1], f]
+                        + w[2] * table[e[2], f]
+                        + w[3] * table[e[3], f]
+                        + w[4] * table[e[4], f]
+                        + w[5] * table[e[5], f]
+                        + w[6] * table[e[6], f]
+                        + w[7] * table[e[7], f]
+                    )
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _add_table_gradient(into, points, grad, resolutions, offsets, hashed, mask, lanes):
+    width = len(lanes)
+    for level in prange(resolutions.shape[0]):
+        resolution, column = resolutions[level], level * width
+        for i in range(points.shape[0]):
+            x, fx = _cell(points[i, 0], resolution)
+            y, fy = _cell(points[i, 1], resolution)
+            z, fz = _cell(points[i, 2], resolution)
+            e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+            w = _weights(fx, fy, fz)
+            for f in range(width):
+                into[e[0], f] += w[0] * grad[i, column + f]
+            for f in range(width):
+                into[e[1], f] += w[1] * grad[i, column + f]
+            for f in range(width):
+                into[e[2], f] += w[2] * grad[i, column + f]
+            for f in range(width):
+                into[e[3], f] += w[3] * grad[i, column + f]
+            for f in range(width):
+                into[e[4], f] += w[4] * grad[i, column + f]
+            for f in range(width):
+                into[e[5], f] += w[5] * grad[i, column + f]
+            for f in range(width):
+                into[e[6], f] += w[6] * grad[i, column + f]
+            for f in range(width):
+                into[e[7], f] += w[7] * grad[i, column + f]
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _point_gradient(table, points, grad, resolutions, offsets, hashed, mask, lanes, out):
+    count, width = points.shape[0], len(lanes)
+    for i in prange(count):
+        gx = gy = gz = np.float32(0.0)
+        for level in range(resolutions.shape[0]):
+            resolution, column = resolutions[level], level * width
+            x, fx = _cell(points[i, 0], resolution)
+            y, fy = _cell(points[i, 1], resolution)
+            z, fz = _cell(points[i, 2], resolution)
+            e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+            for k in range(8):
+                value = np.float32(0.0)
+                for f in range(width):
+                    value += grad[i, column + f] * table[e[k], f]
+                wx = fx if k & 1 else ONE - fx
+                wy = fy if k & 2 else ONE - fy
+                wz = fz if k & 4 else ONE - fz
+                value *= np.float32(resolution)
+                gx += (value if k & 1 else -value) * wy * wz
+                gy += (value if k & 2 else -value) * wx * wz
+                gz += (value if k & 4 else -value) * wx * wy
+        # Outside of the cube the features do not change.
+        out[i, 0] = gx if 0.0 <= points[i, 0] <= 1.0 else np.float32(0.0)
+        out[i, 1] = gy if 0.0 <= points[i, 1] <= 1.0 else np.float32(0.0)
+        out[i, 2] = gz if 0.0 <= points[i, 2] <= 1.0 else np.float32(0.0)

@@ -1,0 +1,63 @@
+"""The march in plain torch: every interval of the lattice is looked up. The reference, and what runs on GPUs."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf_lightning.kernels.march import March, OccupancyCells
+from nerf_lightning.types import PackedSamples, RayBundle
+
+
+def march_torch(
+    rays: RayBundle,
+    state: March,
+    lattice: Float[Tensor, "edges"],
+    grid: OccupancyCells,
+    limit: int | None,
+    capacity: int | None,
+) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+    """Return the occupied intervals and where each ray would go on."""
+    edges = lattice[:-1] + state.jitter[:, None] * (lattice[1:] - lattice[:-1])
+    midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
+    number = torch.arange(midpoints.shape[1], device=edges.device)
+    keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
+    keep &= is_occupied(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    following = torch.full_like(state.next, number.numel())
+    if limit is not None:
+        rank = keep.cumsum(dim=-1)
+        keep &= rank <= limit
+        last = torch.where(keep & (rank == limit), number, number.numel() - 1).amin(dim=-1)
+        following = torch.where(keep.sum(dim=-1) == limit, last + 1, following)
+    return _packed(keep, edges, capacity), following
+
+
+def is_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
+    """Look positions up in the smallest cascade that holds them; outside of all there is nothing."""
+    cascades, resolution = grid.cells.shape[:2]
+    center, half = grid.aabb.mean(dim=0), 0.5 * (grid.aabb[1] - grid.aabb[0])
+    scaled = (positions - center) / half
+    reach = scaled.abs().amax(dim=-1)
+    cascade = torch.zeros_like(reach, dtype=torch.long)
+    for number in range(cascades - 1):
+        cascade += (reach > 2.0**number).long()
+    unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
+    cell = (unit * resolution).long().clamp(0, resolution - 1)
+    inside = reach <= 2.0 ** (cascades - 1)
+    return inside & grid.cells[cascade, cell[..., 0], cell[..., 1], cell[..., 2]].bool()
+
+
+def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:
+    counts = keep.sum(dim=-1)
+    bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    if capacity is None:
+        flat = keep.flatten().nonzero()[:, 0]
+        filled = torch.ones_like(flat, dtype=torch.bool)
+    else:
+        # A fixed size, so that nothing is read on the host.
+        flat = torch.nonzero_static(keep.flatten(), size=capacity, fill_value=0)[:, 0]
+        bounds = bounds.clamp(max=capacity)
+        filled = torch.arange(capacity, device=keep.device) < bounds[-1]
+    ray = flat // keep.shape[1]
+    number = flat - ray * keep.shape[1]
+    starts, ends = edges[ray, number], edges[ray, number + 1]
+    return PackedSamples(ray, starts * filled, ends * filled, bounds)

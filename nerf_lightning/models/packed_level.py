@@ -1,0 +1,118 @@
+"""A level whose samples are packed: only what an occupancy grid does not rule out is computed."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.fields.base import Field
+from nerf_lightning.kernels.march import march
+from nerf_lightning.models.levels import AnyLevel
+from nerf_lightning.randomness import RayRandom
+from nerf_lightning.rendering.packed import composite_packed
+from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
+from nerf_lightning.types import FieldOutput, PackedRendering, PackedSamples, RayBundle, Rendering, Scene
+
+# A ray's random numbers are numbered by its samples: no ray has more.
+MOST_SAMPLES = 1 << 12
+# Samples that a ray takes in one round of rendering; more where few rays are left.
+ROUND_SAMPLES, MOST_ROUND_SAMPLES = 4, 64
+
+
+class PackedLevel(AnyLevel):
+    """March, drop what lies behind opaque samples, ask the field, composite."""
+
+    tally: Tensor
+    measured: Tensor
+
+    def __init__(self, sampler: OccupancySampler, field: Field):
+        super().__init__()
+        self.sampler: OccupancySampler = sampler
+        self.field = field
+        # Samples and rays since the last update of the grid, and samples per ray before it; negative: unknown.
+        self.register_buffer("tally", torch.zeros(2, dtype=torch.float64))
+        self.register_buffer("measured", torch.tensor(-1.0, dtype=torch.float64))
+        self._samples_per_ray: float | None = None
+
+    def points_per_ray(self, before: float, training: bool) -> float:
+        """In training, as lately measured; in rendering, those of a round."""
+        if not training:
+            return float(ROUND_SAMPLES)
+        if self._samples_per_ray is None:
+            self._samples_per_ray = float(self.measured)
+        return max(1.0, self._samples_per_ray if self._samples_per_ray >= 0 else self.sampler.num_steps)
+
+    def place(self, scene: Scene) -> None:
+        """Hand the scene's box to the field, and all of it to the sampler."""
+        super().place(scene)
+        self.sampler.place(scene)
+
+    def reset_parameters(self) -> None:
+        """Draw the field anew and empty the grid."""
+        super().reset_parameters()
+        self.sampler.reset()
+        self.tally.zero_()
+        self.measured.fill_(-1.0)
+        self._samples_per_ray = None
+
+    def update(self, step: int, key: int) -> None:
+        """Bring the grid up to date, where it is time, and count the samples per ray of the steps since."""
+        if step % self.sampler.update_every and step != 1:
+            return
+        self.sampler.update(self.field.density, step, key)
+        if step:
+            self.measured.copy_(self.tally[0] / self.tally[1].clamp(min=1.0))
+            self.tally.zero_()
+            self._samples_per_ray = None
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._samples_per_ray = None
+
+    def forward(
+        self,
+        rays: RayBundle,
+        background: Float[Tensor, "rays 3"] | None,
+        history: list[Rendering],
+        random: RayRandom | None,
+    ) -> Rendering:
+        """Render rays; without random numbers round by round, until each ray is opaque or has left the scene."""
+        if random is None and not torch.is_grad_enabled():
+            return self._render(rays, background)
+        candidates, samples = self.sampler(rays, self.field.density, random)
+        self.tally += torch.stack([candidates, torch.full_like(candidates, rays.near.shape[0])]).double()
+        return composite_packed(self._ask(rays, samples, random), samples, rays, background)
+
+    def _ask(self, rays: RayBundle, samples: PackedSamples, random: RayRandom | None) -> FieldOutput:
+        index = samples.ray_index
+        if random is not None:
+            place = torch.arange(index.shape[0], device=index.device) - samples.bounds[index]
+            random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + place)
+        # To the field, each sample is a ray with one sample.
+        output = self.field(positions_of(rays, samples)[:, None], rays.directions[index][:, None], random)
+        return FieldOutput(density=output.density[:, 0], rgb=output.rgb[:, 0])
+
+    def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
+        state, lattice, grid = self.sampler.start(rays, None), self.sampler.lattice, self.sampler.grid
+        rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
+        light = torch.ones_like(rays.near)  # what no sample has absorbed yet
+        alive = torch.arange(rays.near.shape[0], device=rays.near.device)
+        while alive.numel():
+            limit = min(MOST_ROUND_SAMPLES, ROUND_SAMPLES * rays.near.shape[0] // alive.numel())
+            left = rays[alive]
+            samples, following = march(left, state[alive], lattice, grid, limit)
+            part: PackedRendering = composite_packed(self._ask(left, samples, None), samples, left, None)
+            before = light[alive]
+            rgb[alive] += before[:, None] * part.foreground
+            depth[alive] += before * (part.depth - (1.0 - part.opacity) * left.far)
+            light[alive] = before * (1.0 - part.opacity)
+            state.next[alive] = following
+            going = (following < lattice.numel() - 2) & (light[alive] > self.sampler.opaque_below)
+            alive = alive[going]
+        return Rendering(
+            rgb=rgb if background is None else rgb + light[:, None] * background,
+            foreground=rgb,
+            opacity=1.0 - light,
+            depth=depth + light * rays.far,
+        )

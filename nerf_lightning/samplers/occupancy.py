@@ -1,0 +1,210 @@
+"""An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989)."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.boxes import distances_in_box
+from nerf_lightning.geometry.carving import possible_cells
+from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march, with_blocks
+from nerf_lightning.kernels.packed import num_visible
+from nerf_lightning.randomness import RayRandom, batch_random, fold
+from nerf_lightning.samplers.base import AnySampler
+from nerf_lightning.types import PackedSamples, RayBundle, Scene
+
+CELLS_AT_ONCE = 1 << 18
+DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
+
+
+class OccupancySampler(AnySampler):
+    """Keep a moving average of the density in each cell, and sample only where it is high enough.
+
+    Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
+    the new one, and is occupied above the smaller of the mean and the density that makes one interval `min_alpha`
+    opaque. Cells that no training view sees, and those through which a photograph's alpha shows nothing, are
+    empty from the start.
+
+    Args:
+        resolution: cells along a side of the box; a multiple of 4.
+        num_cascades: boxes, each twice as large as the one before, the first being the scene's; 1 for bounded scenes.
+        num_steps: intervals across the diagonal of the scene's box.
+        cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike.
+        update_every: steps between two updates of the grid.
+        warmup_steps: until then every cell is asked at each update, later every other one.
+        prune_after: steps before which no cell is given up; larger where the background is baked into the pictures,
+            so that dark content is not lost before it is learnt.
+        decay: of the average, per update.
+        min_alpha: opacity of an interval that counts.
+        opaque_below: a ray's samples end where less light than this is left.
+        capacity: size of the arrays of samples on GPUs, where no size is read on the host.
+    """
+
+    aabb: Tensor
+    range: Tensor
+    density: Tensor
+    possible: Tensor
+    cells: Tensor
+    blocks: Tensor
+
+    def __init__(
+        self,
+        resolution: int = 128,
+        num_cascades: int = 1,
+        num_steps: int = 512,
+        cone_angle: float = 0.0,
+        update_every: int = 16,
+        warmup_steps: int = 256,
+        prune_after: int = 0,
+        decay: float = 0.95,
+        min_alpha: float = 0.01,
+        opaque_below: float = 1e-4,
+        capacity: int = 1 << 20,
+    ):
+        super().__init__()
+        if resolution % BLOCK or resolution < BLOCK:
+            raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
+        self.resolution, self.num_cascades = resolution, num_cascades
+        self.num_steps, self.cone_angle = num_steps, cone_angle
+        self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
+        self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
+        side = (num_cascades, resolution, resolution, resolution)
+        blocks = (num_cascades, *(resolution // BLOCK,) * 3)
+        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.register_buffer("density", torch.zeros(side))
+        self.register_buffer("possible", torch.ones(side, dtype=torch.bool))
+        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
+        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
+        self.register_buffer("range", torch.tensor([0.0, 1.0]))
+        self._lattice: Tensor | None = None
+
+    def place(self, scene: Scene) -> None:
+        """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
+
+        Raises:
+            InputError: no training ray meets the box, or nothing is left in it.
+        """
+        self.aabb.copy_(scene.aabb)
+        self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
+        self._lattice = None
+        for cascade in range(self.num_cascades):
+            centers, half_diagonal = self._cell_centers(cascade)
+            possible = possible_cells(scene, centers, half_diagonal)
+            self.possible[cascade] = possible.view(self.possible.shape[1:])
+        if not bool(self.possible.any()):
+            lower, upper = ([round(float(x), 3) for x in corner] for corner in scene.aabb)
+            raise InputError(
+                f"The box of the scene {scene.name}, from {lower} to {upper}, holds nothing that the training views "
+                "show: no camera sees it, or all that they see there is transparent. Correct the box "
+                "(scene.aabb_half), or the cameras' poses."
+            )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was learnt: every possible cell is occupied."""
+        self.density.zero_()
+        self._occupy(self.possible)
+
+    def forward(
+        self, rays: RayBundle, density_fn: DensityFn, random: RayRandom | None
+    ) -> tuple[Int[Tensor, ""], PackedSamples]:
+        """Return how many intervals are occupied, and those of each ray up to where it is opaque.
+
+        Args:
+            rays: unit directions.
+            density_fn: the field's, asked without gradients.
+            random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
+        """
+        capacity = self.capacity if rays.near.is_cuda else None
+        samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
+        if capacity is not None:
+            return samples.bounds[-1], samples
+        with torch.no_grad():
+            density = density_fn(positions_of(rays, samples)).float()
+            return samples.bounds[-1], first_of_each_ray(samples, num_visible(density, samples, self.opaque_below))
+
+    def start(self, rays: RayBundle, random: RayRandom | None) -> March:
+        """Return the beginning of a march along rays."""
+        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        half = half * 2.0 ** (self.num_cascades - 1)
+        enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
+        jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
+        return March(enter, leave, jitter, torch.zeros_like(rays.camera_index))
+
+    @property
+    def grid(self) -> OccupancyCells:
+        """What is occupied now."""
+        return OccupancyCells(self.aabb, self.cells, self.blocks)
+
+    @property
+    def step_size(self) -> float:
+        """The shortest interval, in scene units."""
+        return float((self.aabb[1] - self.aabb[0]).norm()) / self.num_steps
+
+    @property
+    def lattice(self) -> Float[Tensor, "edges"]:
+        """The distances that intervals begin at, from the scene's near to beyond its far."""
+        if self._lattice is None or self._lattice.device != self.aabb.device:
+            near, far = self.range.tolist()
+            edges, step = [near], self.step_size
+            while edges[-1] <= far:
+                edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
+            edges.append(2 * edges[-1] - edges[-2])
+            self._lattice = torch.tensor(edges, device=self.aabb.device)
+        return self._lattice
+
+    @torch.no_grad()
+    def update(self, density_fn: DensityFn, step: int, key: int) -> None:
+        """Ask the field about the cells, where it is time; without reading anything on the host.
+
+        Args:
+            density_fn: the field's.
+            step: steps that this attempt has taken.
+            key: of this step's random numbers.
+        """
+        if step % self.update_every or step == 0:
+            return
+        number = self.possible.flatten().nonzero()[:, 0]
+        if step > self.warmup_steps:
+            number = number[(step // self.update_every) % 2 :: 2]
+        within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
+        for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
+            found = density_fn(self._positions(cells, part)).float()
+            self.density.view(-1)[cells] = torch.maximum(self.decay * self.density.view(-1)[cells], found)
+        if step >= self.prune_after:
+            mean = self.density.sum() / self.possible.sum()
+            threshold = (0.5 * mean).clamp(max=self.min_alpha / self.step_size)
+            self._occupy((self.density > threshold) & self.possible)
+
+    def _occupy(self, occupied: Tensor) -> None:
+        grid = with_blocks(self.aabb, occupied.to(torch.uint8))
+        self.cells.copy_(grid.cells)
+        self.blocks.copy_(grid.blocks)
+
+    def _positions(self, number: Tensor, within: Tensor) -> Tensor:
+        side = self.resolution
+        cascade, rest = number // side**3, number % side**3
+        cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
+        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        return center + (2.0 * (cell + within) / side - 1.0) * half * (2.0**cascade)[:, None]
+
+    def _cell_centers(self, cascade: int) -> tuple[Tensor, float]:
+        number = torch.arange(self.resolution**3, device=self.aabb.device) + cascade * self.resolution**3
+        half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) * 2**cascade / self.resolution
+        return self._positions(number, torch.full((1, 3), 0.5, device=number.device)), half_diagonal
+
+
+def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:
+    """Return the samples' midpoints in space."""
+    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
+    return rays.origins[samples.ray_index] + along
+
+
+def first_of_each_ray(samples: PackedSamples, counts: Tensor) -> PackedSamples:
+    """Return the first `counts` samples of each ray."""
+    place = torch.arange(samples.ray_index.shape[0], device=counts.device) - samples.bounds[samples.ray_index]
+    kept = (place < counts[samples.ray_index]).nonzero()[:, 0]
+    bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return PackedSamples(samples.ray_index[kept], samples.starts[kept], samples.ends[kept], bounds)
