@@ -15,7 +15,7 @@ class Field(nn.Module, ABC):
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
 
-    def place(self, aabb: Float[Tensor, "2 3"]) -> None:  # noqa: B027
+    def place(self, aabb: Float[Tensor, "2 3"]) -> None:
         """Take note of the box that holds the scene's content, once, before training; a checkpoint carries it."""
 
     @abstractmethod

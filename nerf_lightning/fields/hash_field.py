@@ -1,5 +1,6 @@
 """Two small MLPs behind an encoder of the unit cube (Sec. 5.4, arXiv 2201.05989)."""
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, to_unit_cube
+from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types import FieldOutput
 
@@ -47,18 +49,9 @@ class HashField(Field):
         self.density_bias = density_bias
         self.contraction = contraction
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
-        self.density_mlp = nn.Sequential(
-            nn.Linear(position_encoder.out_dim, width, bias=False),
-            nn.ReLU(inplace=True),
-            nn.Linear(width, feature_dim, bias=False),
-        )
-        self.color_mlp = nn.Sequential(
-            nn.Linear(feature_dim + direction_encoder.out_dim, width, bias=False),
-            nn.ReLU(inplace=True),
-            nn.Linear(width, width, bias=False),
-            nn.ReLU(inplace=True),
-            nn.Linear(width, 3, bias=False),
-        )
+        self.density_mlp = _weights(position_encoder.out_dim, width, feature_dim)
+        self.color_mlp = _weights(feature_dim + direction_encoder.out_dim, width, width, 3)
+        self.reset_parameters()
 
     def place(self, aabb: Float[Tensor, "2 3"]) -> None:
         """Take note of the box that holds the scene's content."""
@@ -78,23 +71,22 @@ class HashField(Field):
         features = self._features(positions)
         direction = self.direction_encoder(directions).to(features.dtype)
         direction = direction.expand(*features.shape[:-1], direction.shape[-1])
-        raw_rgb = self.color_mlp(torch.cat([features, direction], dim=-1))
+        raw_rgb = _along_rows(torch.cat([features, direction], dim=-1), self.color_mlp)
         return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
         self.position_encoder.reset_parameters()
         self.direction_encoder.reset_parameters()
-        for module in self.modules():
-            if isinstance(module, nn.Linear):
-                module.reset_parameters()
+        for weight in (*self.density_mlp, *self.color_mlp):
+            nn.init.kaiming_uniform_(weight, a=5**0.5)
 
     def _features(self, positions: Tensor) -> Tensor:
         unit = to_unit_cube(positions, self.aabb)
         if self.contraction:
             # The box becomes the cube that the unit ball just holds; the ball of radius 2 fills the unit cube.
             unit = contract((2.0 * unit - 1.0) / 3**0.5) / 4.0 + 0.5
-        return self.density_mlp(self.position_encoder(unit))
+        return _along_rows(self.position_encoder(unit), self.density_mlp)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.density_bias)
@@ -102,6 +94,15 @@ class HashField(Field):
             return density
         inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(dim=-1)
         return torch.where(inside, density, 0.0)
+
+
+def _weights(*sizes: int) -> nn.ParameterList:
+    return nn.ParameterList(torch.empty(after, before) for before, after in pairwise(sizes))
+
+
+def _along_rows(features: Tensor, weights: nn.ParameterList) -> Tensor:
+    out = mlp(features.flatten(0, -2), list(weights))
+    return out.view(*features.shape[:-1], out.shape[-1])
 
 
 class _TruncatedExponential(torch.autograd.Function):

@@ -4,7 +4,6 @@ import functools
 import importlib
 import logging
 import os
-from collections.abc import Callable
 from types import ModuleType
 
 import torch

@@ -25,9 +25,7 @@ def integrate(
     return _Integrate.apply(density, rgb, samples.starts, samples.ends, samples.bounds, twin)
 
 
-def num_visible(
-    density: Float[Tensor, "capacity"], samples: PackedSamples, opaque_below: float
-) -> Int[Tensor, "rays"]:
+def num_visible(density: Float[Tensor, "capacity"], samples: PackedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
     twin = cpu_twin("packed_numba", density.device)
     if twin is not None and density.dtype == torch.float32:

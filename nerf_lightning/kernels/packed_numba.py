@@ -41,9 +41,7 @@ def integrate_gradient(
     return out
 
 
-def num_visible(
-    density: Float[Tensor, "n"], samples: PackedSamples, opaque_below: float
-) -> Int[Tensor, "rays"]:
+def num_visible(density: Float[Tensor, "n"], samples: PackedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
     out = torch.empty_like(samples.bounds[1:])
     arrays = (density.detach().contiguous(), samples.starts, samples.ends, samples.bounds, out)

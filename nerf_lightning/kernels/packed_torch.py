@@ -7,9 +7,7 @@ from torch import Tensor
 from nerf_lightning.types import PackedSamples
 
 
-def transmittance_torch(
-    density: Float[Tensor, "capacity"], samples: PackedSamples
-) -> Float[Tensor, "capacity"]:
+def transmittance_torch(density: Float[Tensor, "capacity"], samples: PackedSamples) -> Float[Tensor, "capacity"]:
     """Return the light that reaches the start of each interval."""
     # One sum over all rays, less what the earlier rays added: only float64 keeps the small difference.
     optical = (density * samples.deltas).double()

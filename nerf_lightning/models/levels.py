@@ -37,7 +37,7 @@ class AnyLevel(nn.Module):
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
         self.field.place(scene.aabb)
 
-    def update(self, step: int, key: int) -> None:  # noqa: B027
+    def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
     def reset_parameters(self) -> None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import FieldOutput, RayBundle, RaySamples, DenseRendering
+from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle, RaySamples
 
 
 def weights_from_density(

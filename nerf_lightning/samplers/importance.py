@@ -5,7 +5,7 @@ import torch
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.histograms import sample_histogram
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import RayBundle, RaySamples, DenseRendering
+from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
 
 
 class ImportanceSampler(Sampler):

@@ -4,7 +4,7 @@ import torch
 
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import RayBundle, RaySamples, DenseRendering
+from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
 
 
 class StratifiedSampler(Sampler):

@@ -1,7 +1,7 @@
 """What a person reads when the input is bad: one paragraph that names the thing and the cure, exit code 2."""
 
-import re
 import os
+import re
 import signal
 import subprocess
 import sys

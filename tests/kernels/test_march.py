@@ -1,0 +1,79 @@
+"""The march: what it keeps, against looking every interval up."""
+
+import pytest
+import torch
+from scenes import some_rays
+
+from nerf_lightning.geometry.boxes import distances_in_box
+from nerf_lightning.kernels.march import March, march, with_blocks
+from nerf_lightning.kernels.march_torch import march_torch
+
+AABB = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
+
+
+def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0):
+    rays = some_rays(count)
+    cells = (torch.rand(cascades, resolution, resolution, resolution) < share).to(torch.uint8)
+    enter, leave = distances_in_box(rays, AABB * 2.0 ** (cascades - 1))
+    state = March(enter, leave, torch.rand(count), torch.zeros(count, dtype=torch.long))
+    edges = [1.9]
+    while edges[-1] < 6.1:
+        edges.append(edges[-1] + max(0.02, growth * edges[-1]))
+    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), with_blocks(AABB, cells)
+
+
+@pytest.mark.parametrize("limit", [None, 1, 5])
+@pytest.mark.parametrize(("cascades", "growth"), [(1, 0.0), (3, 0.0), (2, 0.01)])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
+def test_skipping_keeps_what_looking_everywhere_keeps(cascades, growth, share, limit):
+    given = a_march(cascades=cascades, growth=growth, share=share)
+    fast, fast_next = march(*given, limit)
+    slow, slow_next = march_torch(*given, limit, None)
+    assert torch.equal(fast.bounds, slow.bounds)
+    assert torch.equal(fast_next, slow_next)
+    assert torch.equal(fast.ray_index, slow.ray_index)
+    torch.testing.assert_close(fast.starts, slow.starts)
+    torch.testing.assert_close(fast.ends, slow.ends)
+
+
+def test_marching_in_rounds_finds_what_one_march_finds():
+    rays, state, lattice, grid = a_march(share=0.3)
+    whole, _ = march(rays, state, lattice, grid)
+    found = []
+    while bool((state.next < lattice.numel() - 2).any()):
+        part, following = march(rays, state, lattice, grid, limit=3)
+        state.next.copy_(following)
+        found.append(torch.stack([part.ray_index.double(), part.starts.double()], dim=-1))
+    everything = torch.cat(found)
+    order = (everything[:, 0] * 1e3 + everything[:, 1]).argsort()
+    torch.testing.assert_close(everything[order, 1].float(), whole.starts)
+
+
+def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
+    rays, state, lattice, grid = a_march(count=50, share=2.0)
+    samples, _ = march(rays, state, lattice, grid)
+    lengths = torch.zeros(50).index_add(0, samples.ray_index, samples.deltas)
+    chord = (state.leave - state.enter).clamp(min=0)
+    assert float((lengths - chord).abs().max()) <= 0.021  # an interval at either end, half of it each
+    assert bool((samples.deltas > 0).all())
+
+
+def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():
+    rays, state, lattice, grid = a_march(count=40, share=0.5)
+    whole, _ = march(rays, state, lattice, grid)
+    total = int(whole.bounds[-1])
+    for capacity in (total + 100, total // 2):
+        samples, _ = march(rays, state, lattice, grid, capacity=capacity)
+        kept = min(capacity, total)
+        assert samples.starts.shape == (capacity,)
+        assert int(samples.bounds[-1]) == kept
+        torch.testing.assert_close(samples.starts[:kept], whole.starts[:kept])
+        assert bool((samples.deltas[kept:] == 0).all())
+
+
+def test_rays_that_miss_the_box_have_no_samples():
+    rays, state, lattice, grid = a_march(count=20, share=1.0)
+    rays.directions.mul_(-1.0)
+    enter, leave = distances_in_box(rays, AABB)
+    samples, _ = march(rays, March(enter, leave, state.jitter, state.next), lattice, grid)
+    assert samples.starts.numel() == 0
