@@ -166,6 +166,10 @@ class PackedSamples(TensorStruct):
     bounds: Int[Tensor, "bounds"]
     """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
 
+    def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
+        """Return some of the samples, in order, with the bounds that they have then."""
+        return PackedSamples(self.ray_index[kept], self.starts[kept], self.ends[kept], bounds)
+
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:
         """Where the field is asked."""

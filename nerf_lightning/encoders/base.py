@@ -22,6 +22,12 @@ class Encoder(nn.Module, ABC):
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
         """Return the features, in the points' dtype."""
 
+    def recall(
+        self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
+    ) -> Float[Tensor, "*points features"]:
+        """Return the features of points, with gradients, where they have been computed without them before."""
+        return self(points)
+
     @abstractmethod
     def reset_parameters(self) -> None:
         """Draw the parameters anew from torch's generator; nothing to do where there are none."""

@@ -57,9 +57,18 @@ class HashGridEncoder(Encoder):
 
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
         """Return the features, coarsest level first."""
+        return self._interpolate(points, None)
+
+    def recall(
+        self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
+    ) -> Float[Tensor, "*points features"]:
+        """Return the features of points, with gradients, where they have been computed without them before."""
+        return self._interpolate(points, features.reshape(-1, self.out_dim))
+
+    def _interpolate(self, points: Tensor, known: Tensor | None) -> Tensor:
         # Half-precision tables halve the traffic on a GPU; the float32 ones stay the optimizer's.
         table = self.table.half() if points.is_cuda else self.table
-        return interpolate(table, points.reshape(-1, 3), self.layout).view(*points.shape[:-1], self.out_dim)
+        return interpolate(table, points.reshape(-1, 3), self.layout, known).view(*points.shape[:-1], self.out_dim)
 
     def reset_parameters(self) -> None:
         """Draw the tables anew: uniform within 1e-4, as the paper has it."""

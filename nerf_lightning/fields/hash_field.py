@@ -59,7 +59,14 @@ class HashField(Field):
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
-        return self._density(self._features(positions), positions)
+        return self._density(_along_rows(self.position_encoder(self._unit(positions)), self.density_mlp), positions)
+
+    def screen(
+        self, positions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points features"]]:
+        """Return the density, and the encoder's features."""
+        encoded = self.position_encoder(self._unit(positions))
+        return self._density(_along_rows(encoded, self.density_mlp), positions), encoded
 
     def forward(
         self,
@@ -68,11 +75,17 @@ class HashField(Field):
         random: RayRandom | None,
     ) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
-        features = self._features(positions)
-        direction = self.direction_encoder(directions).to(features.dtype)
-        direction = direction.expand(*features.shape[:-1], direction.shape[-1])
-        raw_rgb = _along_rows(torch.cat([features, direction], dim=-1), self.color_mlp)
-        return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
+        return self._output(self.position_encoder(self._unit(positions)), positions, directions)
+
+    def recall(
+        self,
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
+        random: RayRandom | None,
+        features: Float[Tensor, "*rays samples features"],
+    ) -> FieldOutput:
+        """Return what `forward` returns, without encoding the positions again."""
+        return self._output(self.position_encoder.recall(self._unit(positions), features), positions, directions)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
@@ -81,12 +94,19 @@ class HashField(Field):
         for weight in (*self.density_mlp, *self.color_mlp):
             nn.init.kaiming_uniform_(weight, a=5**0.5)
 
-    def _features(self, positions: Tensor) -> Tensor:
+    def _output(self, encoded: Tensor, positions: Tensor, directions: Tensor) -> FieldOutput:
+        features = _along_rows(encoded, self.density_mlp)
+        direction = self.direction_encoder(directions).to(features.dtype)
+        direction = direction.expand(*features.shape[:-1], direction.shape[-1])
+        raw_rgb = _along_rows(torch.cat([features, direction], dim=-1), self.color_mlp)
+        return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def _unit(self, positions: Tensor) -> Tensor:
         unit = to_unit_cube(positions, self.aabb)
         if self.contraction:
             # The box becomes the cube that the unit ball just holds; the ball of radius 2 fills the unit cube.
             unit = contract((2.0 * unit - 1.0) / 3**0.5) / 4.0 + 0.5
-        return _along_rows(self.position_encoder(unit), self.density_mlp)
+        return unit
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.density_bias)

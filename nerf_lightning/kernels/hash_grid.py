@@ -50,28 +50,37 @@ def hash_grid_layout(num_levels: int, log2_table_size: int, min_resolution: int,
 
 
 def interpolate(
-    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: HashGridLayout
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    layout: HashGridLayout,
+    known: Float[Tensor, "points out"] | None = None,
 ) -> Float[Tensor, "points out"]:
     """Return the trilinear features of points in the unit cube, level by level; points outside are moved to its face.
 
     Gradients go to the table and, where asked for, to the points. Once differentiable.
+
+    Args:
+        table: the entries of all levels.
+        points: in the unit cube.
+        layout: where the levels' entries lie.
+        known: what this function returned for the same arguments without gradients: it is not computed again.
     """
     twin = cpu_twin("hash_grid_numba", points.device) or cuda_twin("hash_grid_triton", points.device)
     if twin is None or table.dtype == torch.float64:
         return interpolate_torch(table, points, layout)
-    return _Interpolate.apply(table, points.float().contiguous(), layout, twin)
+    return _Interpolate.apply(table, points.float().contiguous(), layout, twin, known)
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, twin: Any) -> Tensor:
+    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, twin: Any, known: Any) -> Tensor:
         ctx.save_for_backward(table, points)
         ctx.layout, ctx.twin = layout, twin
-        return twin.forward(table.detach(), points.detach(), layout)
+        return twin.forward(table.detach(), points.detach(), layout) if known is None else known.view_as(known)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         table, points = ctx.saved_tensors  # type: ignore[attr-defined]
         layout, twin = ctx.layout, ctx.twin  # type: ignore[attr-defined]
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
@@ -85,4 +94,4 @@ class _Interpolate(torch.autograd.Function):
             twin.add_table_gradient(into, points, grad, layout)
             grad_table = into if kept is None else None
         grad_points = twin.point_gradient(table.detach(), points, grad, layout) if wants_points else None
-        return grad_table, grad_points, None, None
+        return grad_table, grad_points, None, None, None

@@ -15,6 +15,9 @@ from nerf_lightning.types import PackedSamples, RayBundle, TensorStruct
 
 BLOCK = 4
 """Side of the blocks of cells that are skipped at once where all are empty."""
+OPAQUE = 40.0
+"""Optical depth, by the grid's densities, behind which nothing is kept. exp(-40) is far below what a picture shows, so
+that cells whose density is overestimated several times do not hide what can be seen."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +30,14 @@ class OccupancyCells(TensorStruct):
     """1 where occupied."""
     blocks: UInt8[Tensor, "cascades a b c"]
     """1 where any cell of a block is."""
+    density: Float[Tensor, "cascades x y z"]
+    """About the largest density in each cell: a march ends where so much matter lies before it that nothing behind
+    can be seen, even if this is a generous guess."""
 
 
-def with_blocks(aabb: Float[Tensor, "2 3"], cells: UInt8[Tensor, "cascades x y z"]) -> OccupancyCells:
-    """Return the cells with their blocks; the grid's side is a multiple of 4."""
-    blocks = torch.nn.functional.max_pool3d(cells.float(), BLOCK).to(torch.uint8)
-    return OccupancyCells(aabb, cells, blocks)
+def blocks_of(cells: UInt8[Tensor, "cascades x y z"]) -> UInt8[Tensor, "cascades a b c"]:
+    """Return which blocks of cells hold an occupied one; the grid's side is a multiple of 4."""
+    return torch.nn.functional.max_pool3d(cells.float(), BLOCK).to(torch.uint8)
 
 
 @dataclass(frozen=True)

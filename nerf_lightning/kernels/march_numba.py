@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
-from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells
+from nerf_lightning.kernels.march import BLOCK, OPAQUE, March, OccupancyCells
 from nerf_lightning.types import PackedSamples, RayBundle
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -24,7 +24,8 @@ def march(
     # In coordinates of the box, which is the cube from -1 to 1.
     half = 0.5 * (grid.aabb[1] - grid.aabb[0])
     origins = (rays.origins - grid.aabb.mean(dim=0)) / half
-    path = (origins, rays.directions / half, state.enter, state.leave, state.jitter, lattice, grid.cells, grid.blocks)
+    path = (origins, rays.directions / half, state.enter, state.leave, state.jitter, lattice)
+    path = (*path, grid.cells, grid.blocks, grid.density)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
     _find(*(x.contiguous().numpy() for x in (*path, state.next, numbers, bounds, following)))
@@ -74,13 +75,14 @@ def _ahead(unit, speed, inverse):
 
 @njit(parallel=True, fastmath=True, cache=True)
 @no_type_check
-def _find(o, d, enter, leave, jitters, lattice, cells, blocks, first, numbers, bounds, following):
+def _find(o, d, enter, leave, jitters, lattice, cells, blocks, density, first, numbers, bounds, following):
     end, limit = lattice.shape[0] - 2, numbers.shape[1]
+    longest = lattice[end + 1] - lattice[end]
     cascades, resolution = cells.shape[0], np.int32(cells.shape[1])
     for r in prange(o.shape[0]):
         jitter, ox, oy, oz, dx, dy, dz = jitters[r], o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
         ix, iy, iz = ONE / (dx if dx != 0 else ONE), ONE / (dy if dy != 0 else ONE), ONE / (dz if dz != 0 else ONE)
-        found, k = 0, end
+        found, k, optical = 0, end, np.float32(0.0)
         if enter[r] < leave[r]:
             k = _first_from(lattice, jitter, first[r], enter[r])
         while k < end and found < limit:
@@ -103,6 +105,10 @@ def _find(o, d, enter, leave, jitters, lattice, cells, blocks, first, numbers, b
             j = min(np.int32(uy), resolution - np.int32(1))
             m = min(np.int32(uz), resolution - np.int32(1))
             if cells[cascade, i, j, m]:
+                if optical > OPAQUE:
+                    k = end
+                    break
+                optical += density[cascade, i, j, m] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
                 numbers[r, found] = k
                 found += 1
                 k += 1
@@ -112,11 +118,11 @@ def _find(o, d, enter, leave, jitters, lattice, cells, blocks, first, numbers, b
                 ux, uy, uz = ux / np.float32(BLOCK), uy / np.float32(BLOCK), uz / np.float32(BLOCK)
             ahead = min(_ahead(ux, dx, ix), _ahead(uy, dy, iy), _ahead(uz, dz, iz)) / scale
             beyond = t + ahead * np.float32(0.9999)
-            k += 1
+            k += max(1, int((beyond - t) / longest))
             while k < end and _middle(lattice, jitter, k) < beyond:
                 k += 1
         bounds[r + 1] = found
-        following[r] = k
+        following[r] = min(k, end)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

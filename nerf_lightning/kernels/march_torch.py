@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.march import March, OccupancyCells
+from nerf_lightning.kernels.march import OPAQUE, March, OccupancyCells
 from nerf_lightning.types import PackedSamples, RayBundle
 
 
@@ -21,7 +21,10 @@ def march_torch(
     midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
     number = torch.arange(midpoints.shape[1], device=edges.device)
     keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
-    keep &= is_occupied(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    density = density_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    keep &= density >= 0
+    optical = torch.where(keep, density * (edges[:, 1:] - edges[:, :-1]), 0.0)
+    keep &= optical.cumsum(dim=-1) - optical <= OPAQUE
     following = torch.full_like(state.next, number.numel())
     if limit is not None:
         rank = keep.cumsum(dim=-1)
@@ -31,8 +34,8 @@ def march_torch(
     return _packed(keep, edges, capacity), following
 
 
-def is_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
-    """Look positions up in the smallest cascade that holds them; outside of all there is nothing."""
+def density_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
+    """Look positions up in the smallest cascade that holds them; -1 in empty cells and outside of all."""
     cascades, resolution = grid.cells.shape[:2]
     center, half = grid.aabb.mean(dim=0), 0.5 * (grid.aabb[1] - grid.aabb[0])
     scaled = (positions - center) / half
@@ -42,8 +45,9 @@ def is_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> 
         cascade += (reach > 2.0**number).long()
     unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
     cell = (unit * resolution).long().clamp(0, resolution - 1)
-    inside = reach <= 2.0 ** (cascades - 1)
-    return inside & grid.cells[cascade, cell[..., 0], cell[..., 1], cell[..., 2]].bool()
+    place = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
+    occupied = (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
+    return torch.where(occupied, grid.density[place], -1.0)
 
 
 def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:

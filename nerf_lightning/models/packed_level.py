@@ -80,17 +80,23 @@ class PackedLevel(AnyLevel):
         """Render rays; without random numbers round by round, until each ray is opaque or has left the scene."""
         if random is None and not torch.is_grad_enabled():
             return self._render(rays, background)
-        candidates, samples = self.sampler(rays, self.field.density, random)
+        candidates, samples, features = self.sampler(rays, self.field.screen, random)
         self.tally += torch.stack([candidates, torch.full_like(candidates, rays.near.shape[0])]).double()
-        return composite_packed(self._ask(rays, samples, random), samples, rays, background)
+        return composite_packed(self._ask(rays, samples, random, features), samples, rays, background)
 
-    def _ask(self, rays: RayBundle, samples: PackedSamples, random: RayRandom | None) -> FieldOutput:
+    def _ask(
+        self, rays: RayBundle, samples: PackedSamples, random: RayRandom | None, features: Tensor | None = None
+    ) -> FieldOutput:
         index = samples.ray_index
         if random is not None:
             place = torch.arange(index.shape[0], device=index.device) - samples.bounds[index]
             random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + place)
         # To the field, each sample is a ray with one sample.
-        output = self.field(positions_of(rays, samples)[:, None], rays.directions[index][:, None], random)
+        positions, directions = positions_of(rays, samples)[:, None], rays.directions[index][:, None]
+        if features is None:
+            output = self.field(positions, directions, random)
+        else:
+            output = self.field.recall(positions, directions, random, features[:, None])
         return FieldOutput(density=output.density[:, 0], rgb=output.rgb[:, 0])
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
-from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march, with_blocks
+from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
@@ -17,6 +17,7 @@ from nerf_lightning.types import PackedSamples, RayBundle, Scene
 
 CELLS_AT_ONCE = 1 << 18
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
+ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
 
 
 class OccupancySampler(AnySampler):
@@ -108,22 +109,23 @@ class OccupancySampler(AnySampler):
         self._occupy(self.possible)
 
     def forward(
-        self, rays: RayBundle, density_fn: DensityFn, random: RayRandom | None
-    ) -> tuple[Int[Tensor, ""], PackedSamples]:
-        """Return how many intervals are occupied, and those of each ray up to where it is opaque.
+        self, rays: RayBundle, screen_fn: ScreenFn, random: RayRandom | None
+    ) -> tuple[Int[Tensor, ""], PackedSamples, Float[Tensor, "capacity f"] | None]:
+        """Return how many intervals are occupied, those of each ray up to where it is opaque, and their features.
 
         Args:
             rays: unit directions.
-            density_fn: the field's, asked without gradients.
+            screen_fn: the field's, asked without gradients.
             random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
         """
         capacity = self.capacity if rays.near.is_cuda else None
         samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
         if capacity is not None:
-            return samples.bounds[-1], samples
+            return samples.bounds[-1], samples, None
         with torch.no_grad():
-            density = density_fn(positions_of(rays, samples)).float()
-            return samples.bounds[-1], first_of_each_ray(samples, num_visible(density, samples, self.opaque_below))
+            density, features = screen_fn(positions_of(rays, samples))
+            kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
+            return samples.bounds[-1], samples.at(*kept), None if features is None else features[kept[0]]
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""
@@ -136,7 +138,7 @@ class OccupancySampler(AnySampler):
     @property
     def grid(self) -> OccupancyCells:
         """What is occupied now."""
-        return OccupancyCells(self.aabb, self.cells, self.blocks)
+        return OccupancyCells(self.aabb, self.cells, self.blocks, self.density)
 
     @property
     def step_size(self) -> float:
@@ -179,9 +181,8 @@ class OccupancySampler(AnySampler):
             self._occupy((self.density > threshold) & self.possible)
 
     def _occupy(self, occupied: Tensor) -> None:
-        grid = with_blocks(self.aabb, occupied.to(torch.uint8))
-        self.cells.copy_(grid.cells)
-        self.blocks.copy_(grid.blocks)
+        self.cells.copy_(occupied)
+        self.blocks.copy_(blocks_of(self.cells))
 
     def _positions(self, number: Tensor, within: Tensor) -> Tensor:
         side = self.resolution
@@ -202,9 +203,8 @@ def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capa
     return rays.origins[samples.ray_index] + along
 
 
-def first_of_each_ray(samples: PackedSamples, counts: Tensor) -> PackedSamples:
-    """Return the first `counts` samples of each ray."""
+def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
+    """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
     place = torch.arange(samples.ray_index.shape[0], device=counts.device) - samples.bounds[samples.ray_index]
     kept = (place < counts[samples.ray_index]).nonzero()[:, 0]
-    bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    return PackedSamples(samples.ray_index[kept], samples.starts[kept], samples.ends[kept], bounds)
+    return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -5,13 +5,13 @@ import torch
 from scenes import some_rays
 
 from nerf_lightning.geometry.boxes import distances_in_box
-from nerf_lightning.kernels.march import March, march, with_blocks
+from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.march_torch import march_torch
 
 AABB = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
 
 
-def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0):
+def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0, density=0.0):
     rays = some_rays(count)
     cells = (torch.rand(cascades, resolution, resolution, resolution) < share).to(torch.uint8)
     enter, leave = distances_in_box(rays, AABB * 2.0 ** (cascades - 1))
@@ -19,7 +19,11 @@ def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0):
     edges = [1.9]
     while edges[-1] < 6.1:
         edges.append(edges[-1] + max(0.02, growth * edges[-1]))
-    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), with_blocks(AABB, cells)
+    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), grid_of(cells, density)
+
+
+def grid_of(cells, density):
+    return OccupancyCells(AABB, cells, blocks_of(cells), density * torch.rand(cells.shape))
 
 
 @pytest.mark.parametrize("limit", [None, 1, 5])
@@ -56,6 +60,25 @@ def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
     chord = (state.leave - state.enter).clamp(min=0)
     assert float((lengths - chord).abs().max()) <= 0.021  # an interval at either end, half of it each
     assert bool((samples.deltas > 0).all())
+
+
+def test_a_march_ends_behind_what_is_opaque_by_a_wide_margin():
+    rays, state, lattice, grid = a_march(count=200, share=1.0, density=500.0)
+    fast, _ = march(rays, state, lattice, grid)
+    slow, _ = march_torch(rays, state, lattice, grid, None, None)
+    assert torch.equal(fast.bounds, slow.bounds)
+    everything, _ = march(rays, state, lattice, OccupancyCells(AABB, grid.cells, grid.blocks, 0 * grid.density))
+    assert fast.starts.numel() < 0.5 * everything.starts.numel()
+    optical = torch.zeros(200).index_add(0, fast.ray_index, density_at(rays, fast, grid) * fast.deltas)
+    cut = fast.bounds.diff() < everything.bounds.diff()
+    assert bool((optical[cut] > 40).all())
+
+
+def density_at(rays, samples, grid):
+    from nerf_lightning.kernels.march_torch import density_of_cells
+
+    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
+    return density_of_cells(rays.origins[samples.ray_index] + along, grid)
 
 
 def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():
