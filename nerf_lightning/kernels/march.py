@@ -15,9 +15,8 @@ from nerf_lightning.types import PackedSamples, RayBundle, TensorStruct
 
 BLOCK = 4
 """Side of the blocks of cells that are skipped at once where all are empty."""
-OPAQUE = 40.0
-"""Optical depth, by the grid's densities, behind which nothing is kept. exp(-40) is far below what a picture shows, so
-that cells whose density is overestimated several times do not hide what can be seen."""
+OPAQUE = 12.0
+"""Optical depth, by the floor of the cells' densities, behind which nothing is kept."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class OccupancyCells(TensorStruct):
     """1 where occupied."""
     blocks: UInt8[Tensor, "cascades a b c"]
     """1 where any cell of a block is."""
-    density: Float[Tensor, "cascades x y z"]
-    """About the largest density in each cell: a march ends where so much matter lies before it that nothing behind
-    can be seen, even if this is a generous guess."""
+    floor: Float[Tensor, "cascades x y z"]
+    """About the smallest density in each cell: a march ends where so much matter lies before it that nothing behind
+    can be seen, even by this cautious guess."""
 
 
 def blocks_of(cells: UInt8[Tensor, "cascades x y z"]) -> UInt8[Tensor, "cascades a b c"]:

@@ -25,7 +25,7 @@ def march(
     half = 0.5 * (grid.aabb[1] - grid.aabb[0])
     origins = (rays.origins - grid.aabb.mean(dim=0)) / half
     path = (origins, rays.directions / half, state.enter, state.leave, state.jitter, lattice)
-    path = (*path, grid.cells, grid.blocks, grid.density)
+    path = (*path, grid.cells, grid.blocks, grid.floor)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
     _find(*(x.contiguous().numpy() for x in (*path, state.next, numbers, bounds, following)))
@@ -75,7 +75,7 @@ def _ahead(unit, speed, inverse):
 
 @njit(parallel=True, fastmath=True, cache=True)
 @no_type_check
-def _find(o, d, enter, leave, jitters, lattice, cells, blocks, density, first, numbers, bounds, following):
+def _find(o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following):
     end, limit = lattice.shape[0] - 2, numbers.shape[1]
     longest = lattice[end + 1] - lattice[end]
     cascades, resolution = cells.shape[0], np.int32(cells.shape[1])
@@ -108,7 +108,7 @@ def _find(o, d, enter, leave, jitters, lattice, cells, blocks, density, first, n
                 if optical > OPAQUE:
                     k = end
                     break
-                optical += density[cascade, i, j, m] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
+                optical += floor[cascade, i, j, m] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
                 numbers[r, found] = k
                 found += 1
                 k += 1

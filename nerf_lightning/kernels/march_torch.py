@@ -21,9 +21,9 @@ def march_torch(
     midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
     number = torch.arange(midpoints.shape[1], device=edges.device)
     keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
-    density = density_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
-    keep &= density >= 0
-    optical = torch.where(keep, density * (edges[:, 1:] - edges[:, :-1]), 0.0)
+    floor = floor_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    keep &= floor >= 0
+    optical = torch.where(keep, floor * (edges[:, 1:] - edges[:, :-1]), 0.0)
     keep &= optical.cumsum(dim=-1) - optical <= OPAQUE
     following = torch.full_like(state.next, number.numel())
     if limit is not None:
@@ -34,7 +34,7 @@ def march_torch(
     return _packed(keep, edges, capacity), following
 
 
-def density_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
+def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
     """Look positions up in the smallest cascade that holds them; -1 in empty cells and outside of all."""
     cascades, resolution = grid.cells.shape[:2]
     center, half = grid.aabb.mean(dim=0), 0.5 * (grid.aabb[1] - grid.aabb[0])
@@ -47,7 +47,7 @@ def density_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells
     cell = (unit * resolution).long().clamp(0, resolution - 1)
     place = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
     occupied = (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
-    return torch.where(occupied, grid.density[place], -1.0)
+    return torch.where(occupied, grid.floor[place], -1.0)
 
 
 def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:

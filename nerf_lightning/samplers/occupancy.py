@@ -16,6 +16,9 @@ from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.types import PackedSamples, RayBundle, Scene
 
 CELLS_AT_ONCE = 1 << 18
+# The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
+# counts as thin, and only solid matter ends a march.
+RISE = 0.3
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
 
@@ -46,6 +49,7 @@ class OccupancySampler(AnySampler):
     aabb: Tensor
     range: Tensor
     density: Tensor
+    floor: Tensor
     possible: Tensor
     cells: Tensor
     blocks: Tensor
@@ -75,6 +79,7 @@ class OccupancySampler(AnySampler):
         blocks = (num_cascades, *(resolution // BLOCK,) * 3)
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.register_buffer("density", torch.zeros(side))
+        self.register_buffer("floor", torch.zeros(side))
         self.register_buffer("possible", torch.ones(side, dtype=torch.bool))
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
@@ -106,6 +111,7 @@ class OccupancySampler(AnySampler):
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""
         self.density.zero_()
+        self.floor.zero_()
         self._occupy(self.possible)
 
     def forward(
@@ -138,7 +144,7 @@ class OccupancySampler(AnySampler):
     @property
     def grid(self) -> OccupancyCells:
         """What is occupied now."""
-        return OccupancyCells(self.aabb, self.cells, self.blocks, self.density)
+        return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
 
     @property
     def step_size(self) -> float:
@@ -175,6 +181,8 @@ class OccupancySampler(AnySampler):
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
             found = density_fn(self._positions(cells, part)).float()
             self.density.view(-1)[cells] = torch.maximum(self.decay * self.density.view(-1)[cells], found)
+            floor = self.floor.view(-1)[cells]
+            self.floor.view(-1)[cells] = torch.minimum(found, floor + RISE * (found - floor))
         if step >= self.prune_after:
             mean = self.density.sum() / self.possible.sum()
             threshold = (0.5 * mean).clamp(max=self.min_alpha / self.step_size)
