@@ -141,6 +141,15 @@ class RadianceFieldSystem(LightningModule):
             foreground.append(renderings[-1].foreground.detach())
         return {"losses": torch.stack(losses).sum(0), "foreground": torch.cat(foreground), "target": target}
 
+    def learn_points_per_ray(self) -> None:
+        """Take over how many samples the rays rendered so far have had, where a level measures it."""
+        self.model.update(0, 0)
+
+    def forget_measurements(self) -> None:
+        """Undo what trial steps have left behind: gradients and counts, no weights."""
+        self.model.zero_grad(set_to_none=True)
+        self.model.forget_measurements()
+
     def _require_finite_weights(self) -> None:
         # A finite loss may still have had gradients that were not.
         if not all(bool(torch.isfinite(parameter).all()) for parameter in self.model.parameters()):

@@ -65,10 +65,10 @@ class TrainingProgress(ProgressBar):
             f"{rays_per_second:,.0f} rays/s"
         )
         if self.bar is not None:
-            self.bar.update(self.task, completed=step, description=text)
+            self.bar.update(self.task, completed=step, total=pl_module.num_steps, description=text)
         else:
-            left = (trainer.max_steps - step) / per_second
-            log.info("step %d/%d  %s  about %.0f s left", step, trainer.max_steps, text, left)
+            left = (pl_module.num_steps - step) / per_second
+            log.info("step %d/%d  %s  about %.0f s left", step, pl_module.num_steps, text, left)
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""

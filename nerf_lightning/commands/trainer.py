@@ -34,8 +34,8 @@ class TrainerSettings:
         accelerator: auto takes a GPU where there is one.
         precision: auto is bf16-mixed (float32 weights, bfloat16 products) where the device computes it natively, else
             32-true.
-        tile_points: most points that a step sends through a field at once; auto suits the device's caches; None
-            trains a batch whole. The result is the same up to rounding.
+        tile_points: most points that a step sends through a field at once; auto takes the fastest of a few sizes,
+            measured at the start of a run and kept; None trains a batch whole. The result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
         val_every_steps: steps between two looks at the validation rays.
         num_threads: torch's threads on the CPU; None: one per core.
@@ -69,6 +69,7 @@ class TrainerSettings:
         self.reason = ""
         self.precision = self._precision(precision)
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
+        self.measures_tile = tile_points == "auto"
         self.tile_points = default_tile if tile_points == "auto" else tile_points
         self.clip_norm, self.val_every_steps = clip_norm, val_every_steps
         self.num_threads = num_threads

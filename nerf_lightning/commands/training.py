@@ -16,11 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.stop_signals import StopSignals
+from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
+from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
@@ -80,6 +82,8 @@ def _build_parts(config: DictConfig) -> Parts:
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    if config.budget.seconds is not None:
+        callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
     callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
     return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
@@ -91,6 +95,10 @@ def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
         log.info("going on from step %d of %s", former.step, folder.path)
         parts.settings.keep_precision(former.precision)
     parts.system.record["precision"] = parts.settings.precision
+    if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
+        parts.system.tile_points = parts.settings.tile_points = measured_tile(
+            parts.settings, parts.system, parts.data.batches
+        )
     trainer = parts.settings.build(folder.path, parts.num_steps, parts.callbacks, _loggers(config, folder.path, former))
     _announce(parts, folder.path, former)
     if former is None:

@@ -40,6 +40,9 @@ class AnyLevel(nn.Module):
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
+    def forget_measurements(self) -> None:  # noqa: B027
+        """Forget what was counted while rendering."""
+
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
         self.field.reset_parameters()
@@ -127,6 +130,11 @@ class RadianceModel(nn.Module):
         """Do what the levels do between steps of training."""
         for level in self._in_order():
             level.update(step, key)
+
+    def forget_measurements(self) -> None:
+        """Forget what was counted while rendering."""
+        for level in self._in_order():
+            level.forget_measurements()
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -52,6 +52,10 @@ class PackedLevel(AnyLevel):
         """Draw the field anew and empty the grid."""
         super().reset_parameters()
         self.sampler.reset()
+        self.forget_measurements()
+
+    def forget_measurements(self) -> None:
+        """Forget how many samples rays have."""
         self.tally.zero_()
         self.measured.fill_(-1.0)
         self._samples_per_ray = None
@@ -61,7 +65,7 @@ class PackedLevel(AnyLevel):
         if step % self.sampler.update_every and step != 1:
             return
         self.sampler.update(self.field.density, step, key)
-        if step:
+        if float(self.tally[1]):
             self.measured.copy_(self.tally[0] / self.tally[1].clamp(min=1.0))
             self.tally.zero_()
             self._samples_per_ray = None

@@ -1,0 +1,49 @@
+"""Train the best that a given time allows: the schedule follows the measured speed, and ends with the time."""
+
+import time
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning.errors import InputError
+
+
+class TimeBudget(Callback):
+    """Stop after so many seconds of training, and stretch the schedule to just that length.
+
+    The time that a run has used is part of its state, so a resumed run has the rest. Such a run is not repeatable to
+    the bit: how many steps fit depends on the machine.
+
+    Args:
+        seconds: training time in all, validation included.
+        every_steps: steps between two estimates of the run's length.
+    """
+
+    def __init__(self, seconds: float, every_steps: int = 10):
+        if seconds <= 0:
+            raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
+        self.seconds, self.every_steps = seconds, every_steps
+        self.used, self.since = 0.0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        """Start the clock."""
+        self.since = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Estimate the length of the run, and stop when the time is over."""
+        now = time.perf_counter()
+        self.used, self.since = self.used + now - self.since, now
+        step = pl_module.progress.step
+        if step % self.every_steps == 0:
+            pl_module.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))
+        if self.used >= self.seconds:
+            trainer.should_stop = True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Remember the time used, across a resume."""
+        return {"used": self.used}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the count up again."""
+        self.used = state_dict["used"]

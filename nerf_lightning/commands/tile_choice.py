@@ -1,0 +1,58 @@
+"""Choose the tile by a short measurement: how many points at a time suit this machine's caches and this model."""
+
+import logging
+import time
+
+import torch
+
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.types import Batch
+
+CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
+GPU_TILES = (1 << 18, 1 << 20, 1 << 22)
+# A tile must be better by so much to be preferred to a smaller one, which takes less memory.
+GAIN = 0.95
+LONGEST_SECONDS = 0.4
+FEW_RAYS = 16
+
+log = logging.getLogger(__name__)
+
+
+def measured_tile(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches) -> int:
+    """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
+    system.to(settings.device)
+    batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
+    num_rays = _rays_in_time(settings, system, batch)
+    points = num_rays * system.model.points_per_ray(training=True)
+    best, best_seconds = 0, float("inf")
+    for tile in CPU_TILES if settings.device_type == "cpu" else GPU_TILES:
+        seconds = min(_seconds(settings, system, batch, num_rays, tile) for _ in range(2))
+        if seconds < GAIN * best_seconds:
+            best, best_seconds = tile, seconds
+        if tile >= points:  # larger ones would be the same
+            break
+    system.forget_measurements()
+    log.info("tiles of %d points are the fastest of those tried here", best)
+    return best
+
+
+def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch) -> int:
+    _seconds(settings, system, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
+    system.learn_points_per_ray()
+    few = min(batch.rays.near.numel(), 4 * FEW_RAYS)
+    per_ray = _seconds(settings, system, batch, few, CPU_TILES[0]) / few
+    return max(FEW_RAYS, min(batch.rays.near.numel(), int(LONGEST_SECONDS / per_ray)))
+
+
+def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
+    system.tile_points = tile
+    some = Batch(batch.rays[:num_rays], batch.rgba[:num_rays])
+    half = settings.precision.startswith("bf16")
+    start = time.perf_counter()
+    with torch.autocast(settings.device_type, torch.bfloat16, enabled=half):
+        system.accumulate_gradients(some, lambda loss: loss.backward())
+    if settings.device_type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
