@@ -165,10 +165,12 @@ class PackedSamples(TensorStruct):
     ends: Float[Tensor, "capacity"]
     bounds: Int[Tensor, "bounds"]
     """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
+    found: Int[Tensor, ""]
+    """How many there were before what exceeds the capacity was dropped."""
 
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""
-        return PackedSamples(self.ray_index[kept], self.starts[kept], self.ends[kept], bounds)
+        return PackedSamples(self.ray_index[kept], self.starts[kept], self.ends[kept], bounds, self.found)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:

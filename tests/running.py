@@ -21,6 +21,7 @@ FAST = (
     "evaluation.max_views=2",
     "evaluation.num_pictures=1",
     "path.num_frames=2",
+    "trainer.tile_points=8192",
     "trainer.max_steps=4",
 )
 

@@ -40,6 +40,10 @@ class Monitor(Callback):
         rays, seconds = pl_module.progress.rays_seen - self.rays_seen, now - self.since
         self.since, self.rays_seen = now, pl_module.progress.rays_seen
         values = level_scalars(pl_module.model.level_names, pl_module.last_step["losses"])
+        if not pl_module.loss.every_level_is_a_picture:
+            for name in pl_module.model.level_names[:-1]:
+                del values[f"train/psnr_{name}"]
+        values |= pl_module.model.statistics()
         values["train/learning_rate"] = pl_module.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds

@@ -33,7 +33,7 @@ def march(
     total = int(bounds[-1])
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
     _pack(*(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
-    return PackedSamples(*out, bounds), following
+    return PackedSamples(*out, bounds, bounds[-1]), following
 
 
 @njit(fastmath=True)

@@ -52,6 +52,7 @@ def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) 
 
 def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:
     counts = keep.sum(dim=-1)
+    found = counts.sum()
     bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     if capacity is None:
         flat = keep.flatten().nonzero()[:, 0]
@@ -64,4 +65,4 @@ def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capaci
     ray = flat // keep.shape[1]
     number = flat - ray * keep.shape[1]
     starts, ends = edges[ray, number], edges[ray, number + 1]
-    return PackedSamples(ray, starts * filled, ends * filled, bounds)
+    return PackedSamples(ray, starts * filled, ends * filled, bounds, found)

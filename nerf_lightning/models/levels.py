@@ -40,6 +40,10 @@ class AnyLevel(nn.Module):
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training."""
+        return {}
+
     def forget_measurements(self) -> None:  # noqa: B027
         """Forget what was counted while rendering."""
 
@@ -130,6 +134,10 @@ class RadianceModel(nn.Module):
         """Do what the levels do between steps of training."""
         for level in self._in_order():
             level.update(step, key)
+
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training, of all levels."""
+        return {name: value for level in self._in_order() for name, value in level.statistics().items()}
 
     def forget_measurements(self) -> None:
         """Forget what was counted while rendering."""

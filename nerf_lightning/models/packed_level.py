@@ -30,8 +30,9 @@ class PackedLevel(AnyLevel):
         super().__init__()
         self.sampler: OccupancySampler = sampler
         self.field = field
-        # Samples and rays since the last update of the grid, and samples per ray before it; negative: unknown.
-        self.register_buffer("tally", torch.zeros(2, dtype=torch.float64))
+        # Samples and rays since the last update of the grid, and samples that exceeded the capacity, ever.
+        self.register_buffer("tally", torch.zeros(3, dtype=torch.int64))
+        # Samples per ray before the last update; negative: unknown.
         self.register_buffer("measured", torch.tensor(-1.0, dtype=torch.float64))
         self._samples_per_ray: float | None = None
 
@@ -41,7 +42,7 @@ class PackedLevel(AnyLevel):
             return float(ROUND_SAMPLES)
         if self._samples_per_ray is None:
             self._samples_per_ray = float(self.measured)
-        return max(1.0, self._samples_per_ray if self._samples_per_ray >= 0 else self.sampler.num_steps)
+        return max(1.0, self._samples_per_ray if self._samples_per_ray >= 0 else float(self.sampler.num_steps))
 
     def place(self, scene: Scene) -> None:
         """Hand the scene's box to the field, and all of it to the sampler."""
@@ -65,10 +66,18 @@ class PackedLevel(AnyLevel):
         if step % self.sampler.update_every and step != 1:
             return
         self.sampler.update(self.field.density, step, key)
-        if float(self.tally[1]):
-            self.measured.copy_(self.tally[0] / self.tally[1].clamp(min=1.0))
-            self.tally.zero_()
+        if int(self.tally[1]):
+            self.measured.copy_(self.tally[0] / self.tally[1])
+            self.tally[:2] = 0
             self._samples_per_ray = None
+
+    def statistics(self) -> dict[str, float]:
+        """Samples per ray, the share of cells that are occupied, and samples for which there was no room."""
+        return {
+            "speed/samples_per_ray": float(self.measured),
+            "train/occupied": float(self.sampler.cells.float().mean()),
+            "train/dropped_samples": float(self.tally[2]),
+        }
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
@@ -84,8 +93,10 @@ class PackedLevel(AnyLevel):
         """Render rays; without random numbers round by round, until each ray is opaque or has left the scene."""
         if random is None and not torch.is_grad_enabled():
             return self._render(rays, background)
-        candidates, samples, features = self.sampler(rays, self.field.screen, random)
-        self.tally += torch.stack([candidates, torch.full_like(candidates, rays.near.shape[0])]).double()
+        samples, features = self.sampler(rays, self.field.screen, random)
+        dropped = samples.found - samples.found.clamp(max=self.sampler.capacity) if samples.starts.is_cuda else 0
+        count = torch.full_like(samples.found, rays.near.shape[0])
+        self.tally += torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
         return composite_packed(self._ask(rays, samples, random, features), samples, rays, background)
 
     def _ask(

@@ -116,8 +116,8 @@ class OccupancySampler(AnySampler):
 
     def forward(
         self, rays: RayBundle, screen_fn: ScreenFn, random: RayRandom | None
-    ) -> tuple[Int[Tensor, ""], PackedSamples, Float[Tensor, "capacity f"] | None]:
-        """Return how many intervals are occupied, those of each ray up to where it is opaque, and their features.
+    ) -> tuple[PackedSamples, Float[Tensor, "capacity f"] | None]:
+        """Return the occupied intervals of each ray up to where it is opaque, and their features.
 
         Args:
             rays: unit directions.
@@ -127,11 +127,11 @@ class OccupancySampler(AnySampler):
         capacity = self.capacity if rays.near.is_cuda else None
         samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
         if capacity is not None:
-            return samples.bounds[-1], samples, None
+            return samples, None
         with torch.no_grad():
             density, features = screen_fn(positions_of(rays, samples))
             kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
-            return samples.bounds[-1], samples.at(*kept), None if features is None else features[kept[0]]
+            return samples.at(*kept), None if features is None else features[kept[0]]
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""

@@ -15,7 +15,7 @@ def packed(counts, dtype=torch.float32):
     index = torch.repeat_interleave(torch.arange(counts.numel()), counts)
     bounds = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
     starts = 2.0 + 0.05 * (torch.arange(total) - bounds[index]).to(dtype)
-    samples = PackedSamples(index, starts, starts + 0.05, bounds)
+    samples = PackedSamples(index, starts, starts + 0.05, bounds, bounds[-1])
     return (5 * torch.rand(total, dtype=dtype)).exp() - 1, torch.rand(total, 3, dtype=dtype), samples
 
 
@@ -28,7 +28,7 @@ def test_the_numba_twin_equals_the_reference_in_value_and_gradient(counts):
     results = []
     for fn, dtype in ((integrate, torch.float32), (integrate_torch, torch.float64)):
         leaves = [x.to(dtype, copy=True).requires_grad_() for x in (density, rgb)]
-        placed = PackedSamples(samples.ray_index, samples.starts.to(dtype), samples.ends.to(dtype), samples.bounds)
+        placed = PackedSamples(samples.ray_index, samples.starts.to(dtype), samples.ends.to(dtype), samples.bounds, samples.found)
         out = fn(*leaves, placed)
         torch.manual_seed(3)
         loss = sum((part * torch.randn(part.shape, dtype=torch.float64).to(dtype)).sum() for part in out)

@@ -1,0 +1,83 @@
+import pytest
+import torch
+from scenes import ball_scene, some_rays, tiny_field
+
+from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.packed_level import PackedLevel
+from nerf_lightning.models.pictures import render_picture
+from nerf_lightning.randomness import batch_random
+from nerf_lightning.samplers.occupancy import OccupancySampler
+from nerf_lightning.samplers.stratified import StratifiedSampler
+
+
+def a_level(**settings):
+    torch.manual_seed(1)
+    field = tiny_field(density_activation="softplus", density_bias=1.0)
+    sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
+    level = PackedLevel(sampler, field)
+    level.place(ball_scene(num_views=12))
+    level.sampler._occupy(torch.ones_like(level.sampler.possible))
+    return level
+
+
+def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
+    level, rays, background = a_level(), some_rays(60), torch.rand(60, 3)
+    inside = level.sampler.start(rays, None)
+    hit = inside.enter < inside.leave
+    near, far = inside.enter, torch.maximum(inside.leave, inside.enter + 1e-3)
+    dense = Level(StratifiedSampler(400), level.field)
+    boxed = type(rays)(rays.origins, rays.directions, near, far, rays.camera_index)
+    expected = dense(boxed, background, [], None)
+    with torch.no_grad():
+        found = level(rays, background, [], None)
+    torch.testing.assert_close(found.rgb[hit], expected.rgb[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.opacity[hit], expected.opacity[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.rgb[~hit], background[~hit])
+
+
+def test_rendering_in_rounds_equals_rendering_at_once():
+    """The same lattice, once with gradients (all samples of a ray in one go), once round by round."""
+    level, rays, background = a_level(), some_rays(80), torch.rand(80, 3)
+    whole = level(rays, background, [], None)
+    with torch.no_grad():
+        rounds = level(rays, background, [], None)
+    for name in ("rgb", "foreground", "opacity", "depth"):
+        torch.testing.assert_close(getattr(rounds, name), getattr(whole, name).detach(), atol=2e-5, rtol=1e-4)
+
+
+def test_tiles_change_nothing_but_rounding():
+    level, rays, random = a_level(), some_rays(50), batch_random(3, 50)
+    background = torch.rand(50, 3)
+    whole = level(rays, background, [], random).rgb
+    parts = [level(rays[part], background[part], [], random[part]).rgb for part in (slice(0, 20), slice(20, 50))]
+    torch.testing.assert_close(torch.cat(parts), whole)
+
+
+def test_samples_per_ray_are_measured_kept_and_loaded():
+    level = a_level()
+    model = RadianceModel({"fine": level})
+    assert model.points_per_ray(training=True) == 200  # nothing known yet: the most there can be
+    model(some_rays(50), torch.ones(50, 3), batch_random(0, 50))
+    model.update(16, 0)
+    counted = model.points_per_ray(training=True)
+    assert 5 < counted < 150
+    other = RadianceModel({"fine": a_level()})
+    other.load_state_dict(model.state_dict())
+    assert other.points_per_ray(training=True) == counted
+    assert model.statistics()["speed/samples_per_ray"] == pytest.approx(counted)
+    model.forget_measurements()
+    assert model.points_per_ray(training=True) == 200
+
+
+def test_a_picture_is_the_same_whatever_its_tiles():
+    model, scene = RadianceModel({"fine": a_level()}), ball_scene()
+    pictures = [render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", n) for n in (64, 10**6)]
+    torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
+
+
+def test_normal_noise_differs_from_sample_to_sample():
+    level = a_level()
+    level.field.density_noise = 1.0
+    rays = some_rays(1)[torch.zeros(2, dtype=torch.long)]
+    renders = level(rays, torch.ones(2, 3), [], batch_random(0, 2)).rgb
+    assert not torch.equal(renders[0], renders[1])

@@ -1,0 +1,124 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import ball_scene, some_rays
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.randomness import batch_random, fold
+from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
+
+
+def a_sampler(scene=None, **settings):
+    sampler = OccupancySampler(**({"resolution": 16, "num_steps": 64} | settings))
+    sampler.place(scene or opaque_ball())
+    return sampler
+
+
+def opaque_ball():
+    scene = ball_scene(num_views=6, size=16)
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    return replace(scene, pixels=replace(scene.pixels, rgba=rgba))
+
+
+def ball_density(radius=0.5, density=80.0):
+    return lambda positions: density * (positions.norm(dim=-1) < radius).float()
+
+
+def screened(density_fn):
+    return lambda positions: (density_fn(positions), None)
+
+
+def learn(sampler, density_fn, steps=320):
+    for step in range(16, steps + 1, 16):
+        sampler.update(density_fn, step, fold(0, 0, step))
+    return sampler
+
+
+def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
+    sampler = learn(a_sampler(), ball_density())
+    centers, _ = sampler._cell_centers(0)
+    occupied = sampler.cells.flatten().bool()
+    cell = 2.0 / 16
+    assert bool(occupied[centers.norm(dim=-1) < 0.5 - cell].all())
+    assert not bool(occupied[centers.norm(dim=-1) > 0.5 + cell].any())
+    learn(sampler, ball_density(radius=0.2), 3000)
+    occupied = sampler.cells.flatten().bool()
+    assert bool(occupied.any())
+    assert not bool(occupied[centers.norm(dim=-1) > 0.2 + cell].any())
+
+
+def test_matter_that_grows_later_is_found_again():
+    """The fault: a cell that was given up once is never asked again."""
+    sampler = learn(a_sampler(), ball_density(radius=0.2))
+    before = int(sampler.cells.sum())
+    for step in range(400, 700, 16):
+        sampler.update(ball_density(radius=0.6), step, fold(0, 0, step))
+    assert int(sampler.cells.sum()) > 5 * before
+
+
+def test_nothing_is_given_up_before_its_time():
+    """Dark content on a black background: its density grows late, and must not be pruned first."""
+    sampler = a_sampler(prune_after=100)
+    for step in (16, 32, 96):
+        sampler.update(ball_density(density=0.0), step, step)
+    assert bool(sampler.cells.all())
+    sampler.update(ball_density(), 112, 112)
+    assert not bool(sampler.cells.all())
+
+
+def test_a_density_that_is_the_same_everywhere_prunes_nothing():
+    sampler = a_sampler()
+    sampler.update(lambda positions: torch.full(positions.shape[:-1], 0.3), 16, 5)
+    assert bool(sampler.cells.all())
+
+
+def test_the_update_is_a_function_of_the_step():
+    grids = [learn(a_sampler(), ball_density()).density for _ in range(2)]
+    assert torch.equal(*grids)
+    assert not torch.equal(grids[0], learn(a_sampler(), ball_density(), 336).density)
+
+
+def test_samples_end_where_the_ray_is_opaque():
+    sampler, rays = learn(a_sampler(), ball_density()), some_rays(300)
+    samples, features = sampler(rays, screened(ball_density()), batch_random(1, 300))
+    assert features is None
+    assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
+    density = ball_density()(positions_of(rays, samples))
+    optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
+    longest = 80.0 * sampler.step_size
+    assert float(optical.max()) <= -torch.tensor(sampler.opaque_below).log() + longest + 1e-3
+
+
+def test_jitter_is_fresh_for_every_ray_and_step_and_absent_at_evaluation():
+    sampler, rays = a_sampler(), some_rays(50)
+    first = sampler.start(rays, batch_random(fold(0, 0, 0), 50)).jitter
+    second = sampler.start(rays, batch_random(fold(0, 0, 1), 50)).jitter
+    assert first.unique().numel() == 50
+    assert not torch.equal(first, second)
+    assert bool((sampler.start(rays, None).jitter == 0).all())
+
+
+def test_intervals_grow_with_the_distance_where_a_cone_is_asked_for():
+    lattice = a_sampler(num_cascades=2, cone_angle=0.02).lattice
+    step = lattice.diff()
+    assert float(step[0]) == pytest.approx(max(12**0.5 / 64, 0.02 * 2.0), rel=1e-4)
+    assert bool((step.diff() >= -1e-5).all())
+    assert float(step[-1]) > 1.5 * float(step[0])
+
+
+def test_a_box_that_no_camera_sees_is_said_by_name():
+    scene = opaque_ball()
+    with pytest.raises(InputError, match=r"box of the scene ball.*no camera sees it.*scene\.aabb_half"):
+        a_sampler(replace(scene, aabb=scene.aabb + 500.0))
+
+
+def test_state_travels_in_the_state_dict():
+    sampler = learn(a_sampler(), ball_density())
+    other = OccupancySampler(resolution=16, num_steps=64)
+    other.load_state_dict(sampler.state_dict())
+    rays = some_rays(20)
+    one, _ = sampler(rays, screened(ball_density()), batch_random(1, 20))
+    two, _ = other(rays, screened(ball_density()), batch_random(1, 20))
+    assert torch.equal(one.starts, two.starts)
