@@ -43,7 +43,7 @@ def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
     cell = 2.0 / 16
     assert bool(occupied[centers.norm(dim=-1) < 0.5 - cell].all())
     assert not bool(occupied[centers.norm(dim=-1) > 0.5 + cell].any())
-    learn(sampler, ball_density(radius=0.2), 3000)
+    learn(sampler, ball_density(radius=0.2), 6000)
     occupied = sampler.cells.flatten().bool()
     assert bool(occupied.any())
     assert not bool(occupied[centers.norm(dim=-1) > 0.2 + cell].any())
