@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types import FieldOutput, Scene
 
 
 class Field(nn.Module, ABC):

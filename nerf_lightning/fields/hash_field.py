@@ -12,9 +12,10 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, to_unit_cube
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types import FieldOutput, Scene
 
 LARGEST_EXPONENT = 15.0
+THICK, THIN = 3.0, -1.0
 
 
 class HashField(Field):
@@ -28,11 +29,14 @@ class HashField(Field):
         direction_encoder: features of unit directions.
         width: width of every hidden layer.
         feature_dim: what the density's MLP hands to the colour's, the raw density included.
-        density_bias: added to the raw density, before the exponential; negative values start from thin space.
+        density_bias: added to the raw density, before the exponential. None: thick (3) where the photographs have
+            alpha, which tells at once where nothing is, and thin (-1) where they have none: there a dense start would
+            remain as fog of the background's colour.
         contraction: map all space, contracted around the box, instead of the box alone; for unbounded captures.
     """
 
     aabb: Tensor
+    bias: Tensor
 
     def __init__(
         self,
@@ -40,7 +44,7 @@ class HashField(Field):
         direction_encoder: Encoder,
         width: int = 64,
         feature_dim: int = 16,
-        density_bias: float = -1.0,
+        density_bias: float | None = None,
         contraction: bool = False,
     ):
         super().__init__()
@@ -48,14 +52,17 @@ class HashField(Field):
         self.direction_encoder = direction_encoder
         self.density_bias = density_bias
         self.contraction = contraction
+        self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.density_mlp = _weights(position_encoder.out_dim, width, feature_dim)
         self.color_mlp = _weights(feature_dim + direction_encoder.out_dim, width, width, 3)
         self.reset_parameters()
 
-    def place(self, aabb: Float[Tensor, "2 3"]) -> None:
-        """Take note of the box that holds the scene's content."""
-        self.aabb.copy_(aabb)
+    def place(self, scene: Scene) -> None:
+        """Take note of the box that holds the scene's content, and whether the photographs have alpha."""
+        self.aabb.copy_(scene.aabb)
+        if self.density_bias is None:
+            self.bias.fill_(THICK if bool((scene.pixels.rgba[:, 3] < 255).any()) else THIN)
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
@@ -109,7 +116,7 @@ class HashField(Field):
         return unit
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
-        density = _TruncatedExponential.apply(features[..., 0].float() + self.density_bias)
+        density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
         if self.contraction:
             return density
         inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(dim=-1)

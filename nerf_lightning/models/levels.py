@@ -35,7 +35,7 @@ class AnyLevel(nn.Module):
 
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
-        self.field.place(scene.aabb)
+        self.field.place(scene)
 
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""

@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import pytest
 import torch
+from scenes import ball_scene
 
 from nerf_lightning.encoders.frequency import FrequencyEncoder
 from nerf_lightning.encoders.hash_grid import HashGridEncoder
@@ -16,10 +19,10 @@ def a_field(**settings):
 
 def test_a_box_is_only_a_change_of_units():
     """The field of a scene that is moved and scaled is the same field, moved and scaled."""
-    field, points = a_field(), 2 * torch.rand(40, 3) - 1
+    field, points = a_field(density_bias=-1.0), 2 * torch.rand(40, 3) - 1
     before = field.density(points)
     shift, scale = torch.tensor([3.0, -1.0, 7.0]), torch.tensor([2.0, 0.5, 4.0])
-    field.place(torch.stack([shift - scale, shift + scale]))
+    field.place(replace(ball_scene(), aabb=torch.stack([shift - scale, shift + scale])))
     torch.testing.assert_close(field.density(points * scale + shift), before, rtol=1e-3, atol=1e-4)
 
 
@@ -53,3 +56,19 @@ def test_screened_points_are_recalled_with_the_same_result(encoder):
     torch.testing.assert_close(density, whole.density[:, 0])
     torch.testing.assert_close(again.rgb, whole.rgb)
     torch.testing.assert_close(again.density, whole.density)
+
+
+def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothing_does():
+    """The fault: a dense start on a black background stays, as black fog."""
+    scene = ball_scene()
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    baked = replace(scene, pixels=replace(scene.pixels, rgba=rgba))
+    densities = []
+    for given in (scene, baked):
+        field = a_field()
+        torch.nn.init.zeros_(field.position_encoder.table)
+        field.place(given)
+        densities.append(float(field.density(torch.zeros(1, 3)).detach()))
+    assert densities[0] == pytest.approx(2.718281828**3, rel=1e-4)
+    assert densities[1] == pytest.approx(2.718281828**-1, rel=1e-4)
