@@ -15,8 +15,8 @@ class Field(nn.Module, ABC):
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
 
-    def place(self, aabb: Float[Tensor, "2 3"]) -> None:
-        """Take note of the box that holds the scene's content, once, before training; a checkpoint carries it."""
+    def place(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
     @abstractmethod
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
