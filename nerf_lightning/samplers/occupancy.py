@@ -64,7 +64,7 @@ class OccupancySampler(AnySampler):
         warmup_steps: int = 256,
         prune_after: int = 0,
         decay: float = 0.95,
-        min_alpha: float = 0.01,
+        min_alpha: float = 0.001,
         opaque_below: float = 1e-4,
         capacity: int = 1 << 20,
     ):

@@ -10,7 +10,7 @@ from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
 
 
 def a_sampler(scene=None, **settings):
-    sampler = OccupancySampler(**({"resolution": 16, "num_steps": 64} | settings))
+    sampler = OccupancySampler(**({"resolution": 16, "num_steps": 64, "min_alpha": 0.01} | settings))
     sampler.place(scene or opaque_ball())
     return sampler
 
