@@ -2,35 +2,41 @@
 
 Machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are compared round by
 round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32 without tiles,
-the machine's matrix product in either precision, loading a batch, and rendering.
+the machine's matrix product, loading a batch, and rendering. "Plain" is the same mathematics as one would first write
+it: float32, whole batches, torch around the same hash grid kernel, no screening of what lies behind opaque samples.
 """
 
 import json
-import statistics
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
+from rich.progress import track
 from torch.utils.flop_counter import FlopCounterMode
 
+from nerf_lightning.commands.bench_kernels import kernel_ratios
+from nerf_lightning.commands.bench_stages import seconds_to_psnr, stage_seconds
+from nerf_lightning.commands.bench_table import peak_memory, print_table, spread
 from nerf_lightning.commands.build import build, build_system
+from nerf_lightning.commands.console import stderr_console
+from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress, RayBatches
 from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.kernels.backends import without
 from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.pictures import tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types import Batch, RayBundle
 
+MOST_STEPS = 2000
 MATRIX_ROWS, MATRIX_WIDTH, MATRIX_REPEATS = 4096, 256, 20
 
 
@@ -43,11 +49,28 @@ class Bench:
     batches: RayBatches
     batch: Batch
     optimizer: torch.optim.Optimizer
+    plain_optimizer: torch.optim.Optimizer
+
+    def take_step(self) -> None:
+        """Take one step of training, loading and all."""
+        progress = self.batches.progress
+        batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
+        with torch.autocast(self.settings.device_type, torch.bfloat16, self.settings.precision.startswith("bf16")):
+            self.system.training_step(batch, 0)
 
 
 def benchmark(config: DictConfig) -> float:
     """Measure as the config says."""
     bench = _prepare(config)
+    reached = None
+    if config.target_psnr is not None:
+        reached = seconds_to_psnr(
+            bench.take_step, bench.system, bench.batches, config.target_psnr, config.warmup_steps or MOST_STEPS
+        )
+    else:
+        for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
+            bench.take_step()
+    bench.batch = bench.batches.at(0, bench.batches.crop_rays(0)).to(bench.settings.device)
     kinds: dict[str, Callable[[], None]] = {
         "matrix": _multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
@@ -57,13 +80,18 @@ def benchmark(config: DictConfig) -> float:
         "render_plain": lambda: _render(bench, config.render_rays, plain=True),
     }
     kinds["train"]()
-    peak = _peak_memory()  # before the whole batches of the plain kinds
+    peak = peak_memory()  # before the whole batches of the plain kinds
     seconds = _interleaved(kinds, config.rounds)
-    num_rays = bench.batches.batch_rays
+    num_rays = bench.batch.rays.near.numel()
     flops = _flops_per_ray(bench)
     per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
-    result: dict[str, Any] = {name: _spread([row[name] for row in per_round]) for name in per_round[0]}
+    result: dict[str, Any] = {name: spread([row[name] for row in per_round]) for name in per_round[0]}
+    result |= {name: spread(values) for name, values in _stages(bench, seconds, config).items()}
+    if config.kernels:
+        ratios = kernel_ratios(bench.settings.device, config.rounds)
+        result |= {name: spread(values) for name, values in ratios.items()}
     result |= {
+        "seconds_and_steps_to_target_psnr": reached,
         "machine": bench.settings.describe(),
         "tile_points": bench.settings.tile_points,
         "batch_rays": num_rays,
@@ -71,7 +99,7 @@ def benchmark(config: DictConfig) -> float:
         "peak_memory_gigabytes": peak,
         "rounds": config.rounds,
     }
-    _print_table(result)
+    print_table(result)
     folder = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
     with whole_file(folder / "bench.json") as part:
         part.write_text(json.dumps(result, indent=2) + "\n")
@@ -84,11 +112,18 @@ def _prepare(config: DictConfig) -> Bench:
     settings.prepare_machine()
     scene = build(config.scene).read()
     progress = Progress()
-    system = build_system(config, settings, scene, progress, 1, {}).to(settings.device)
+    num_steps = max(1, config.warmup_steps)
+    system = build_system(config, settings, scene, progress, num_steps, {}).to(settings.device)
     system.initialize()
-    batches = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=1).batches
+    batches = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps).batches
+    if settings.measures_tile:
+        settings.tile_points = system.tile_points = measured_tile(settings, system, batches)
+    optimizer, plain = system.configure_optimizers(), torch.optim.Adam(system.model.parameters(), lr=1e-6)
+    # Stand-ins for what Lightning's trainer provides.
+    setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
+    setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
-    return Bench(settings, system, batches, batch, system.configure_optimizers())
+    return Bench(settings, system, batches, batch, optimizer, plain)
 
 
 def _interleaved(kinds: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
@@ -123,14 +158,54 @@ def _round(
 
 
 def _train(bench: Bench, steps: int, plain: bool) -> None:
-    tile, half = bench.settings.tile_points, bench.settings.precision.startswith("bf16")
-    bench.system.tile_points = None if plain else tile
-    for _ in range(steps):
-        bench.optimizer.zero_grad()
-        with torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half and not plain):
-            bench.system.accumulate_gradients(bench.batch, lambda loss: loss.backward())
-        bench.optimizer.step()
-    bench.system.tile_points = tile
+    system, tile = bench.system, bench.settings.tile_points
+    optimizer = bench.plain_optimizer if plain else bench.optimizer
+    half = bench.settings.precision.startswith("bf16") and not plain
+    with _plainly(bench) if plain else nullcontext():
+        for _ in range(steps):
+            optimizer.zero_grad()
+            with torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half):
+                system.accumulate_gradients(bench.batch, lambda loss: loss.backward())
+            optimizer.step()
+    system.tile_points = tile
+
+
+@contextmanager
+def _plainly(bench: Bench) -> Iterator[None]:
+    """Compute as one would first write it; our kernel of the hash grid stays."""
+    samplers = [level.sampler for level in bench.system.model.modules() if isinstance(level, PackedLevel)]
+    former = [sampler.opaque_below for sampler in samplers]
+    bench.system.tile_points = None
+    for sampler in samplers:
+        sampler.opaque_below = 0.0
+    _release_gradients(bench)
+    with without("march_numba", "packed_numba", "mlp_tiles", "adam_numba"):
+        yield
+    for sampler, value in zip(samplers, former, strict=True):
+        sampler.opaque_below = value
+    _release_gradients(bench)
+
+
+def _release_gradients(bench: Bench) -> None:
+    for parameter in bench.system.model.parameters():
+        parameter.grad = None
+        parameter.grad_in_place = False  # type: ignore[attr-defined]
+
+
+def _stages(bench: Bench, seconds: dict[str, list[float]], config: DictConfig) -> dict[str, list[float]]:
+    """Return the share of a step's time that each stage takes, where the model has stages."""
+    result: dict[str, list[float]] = {}
+    for i in range(config.rounds):
+        step = seconds["train"][i] / config.steps
+        stages = stage_seconds(bench.system, bench.batch)
+        if stages:
+            start = time.perf_counter()
+            bench.optimizer.zero_grad()
+            bench.optimizer.step()
+            stages["optimizer"] = time.perf_counter() - start
+        for name, value in stages.items():
+            result.setdefault(f"{name}, share of a step", []).append(value / step)
+    return result
 
 
 def _load(bench: Bench) -> None:
@@ -138,7 +213,7 @@ def _load(bench: Bench) -> None:
 
 
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
-    rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batches.batch_rays]
+    rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
     size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
     half = bench.settings.precision.startswith("bf16") and not plain
     with torch.no_grad(), torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half):
@@ -165,35 +240,9 @@ def _multiplication(settings: TrainerSettings) -> Callable[[], None]:
 
 
 def _flops_per_ray(bench: Bench) -> float:
-    few = 8
+    # Where rays differ in their samples, many make the mean.
+    few = 8 if bench.system.model.points_per_ray(training=True) > 64 else min(1024, bench.batch.rays.near.numel())
     rays = Batch(bench.batch.rays[:few], bench.batch.rgba[:few])
-    with FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False) as counter, without("mlp_tiles"):  # it counts one thread's
         bench.system.accumulate_gradients(rays, lambda loss: loss.backward())
     return counter.get_total_flops() / few
-
-
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
-
-
-def _peak_memory() -> float:
-    if torch.cuda.is_available():
-        return torch.cuda.max_memory_allocated() / 1e9
-    if sys.platform == "win32":
-        return float(psutil.Process().memory_info().peak_wset) / 1e9
-    import resource
-
-    # Kilobytes on Linux, bytes on macOS.
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
-
-
-def _print_table(result: dict[str, Any]) -> None:
-    table = Table(title=f"nerf bench: {result['machine']}, tiles of {result['tile_points']} points")
-    for column in ("", "median", "min", "max"):
-        table.add_column(column, justify="left" if not column else "right")
-    for name, value in result.items():
-        if isinstance(value, dict):
-            table.add_row(name, *(f"{value[key]:,.3g}" if value[key] < 100 else f"{value[key]:,.0f}" for key in value))
-    table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
-    Console(width=100).print(table)

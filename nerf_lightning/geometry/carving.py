@@ -29,7 +29,7 @@ def possible_cells(
         unseen = (~seen).nonzero()[:, 0]
         if not unseen.numel():
             break
-        x, y, radius, _ = _footprint(scene.cameras, view, centers[unseen], half_diagonal)
+        x, y, radius = _footprint(scene.cameras, view, centers[unseen], half_diagonal)
         width, height = int(scene.cameras.width[view]), int(scene.cameras.height[view])
         seen[unseen] = (x > -radius) & (x < width + radius) & (y > -radius) & (y < height + radius) & (radius > 0)
     left = seen.nonzero()[:, 0]
@@ -43,7 +43,7 @@ def possible_cells(
 
 
 def _looked_through(scene: Scene, view: int, centers: Tensor, half_diagonal: float) -> Tensor:
-    x, y, radius, depth = _footprint(scene.cameras, view, centers, half_diagonal)
+    x, y, radius = _footprint(scene.cameras, view, centers, half_diagonal)
     width, height = int(scene.cameras.width[view]), int(scene.cameras.height[view])
     whole = (x - radius >= 0) & (x + radius <= width) & (y - radius >= 0) & (y + radius <= height) & (radius > 0)
     alpha = (scene.pixels.view(view)[..., 3] > 0).float()
@@ -58,7 +58,7 @@ def _looked_through(scene: Scene, view: int, centers: Tensor, half_diagonal: flo
 
 def _footprint(
     cameras: Cameras, view: int, centers: Tensor, half_diagonal: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     # Where a cell's sphere appears: centre and radius in pixels; radius 0 where it reaches behind the camera.
     c2w = cameras.c2w[view]
     local = (centers - c2w[:, 3]) @ c2w[:, :3]
@@ -70,4 +70,4 @@ def _footprint(
     # A sphere off the axis appears longer: by no more than its ray's length over its depth, squared.
     stretch = (local.square().sum(dim=-1) / safe.square()).clamp(max=9.0)
     radius = cameras.focal[view].max() * half_diagonal / (safe - half_diagonal).clamp(min=half_diagonal) * stretch
-    return x, y, torch.where(in_front, radius, 0.0), depth
+    return x, y, torch.where(in_front, radius, 0.0)

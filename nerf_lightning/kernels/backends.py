@@ -4,6 +4,8 @@ import functools
 import importlib
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 import torch
@@ -24,9 +26,29 @@ def twin(module: str) -> ModuleType | None:
         return None
 
 
+_switched_off: set[str] = set()
+
+
+@contextmanager
+def without(*modules: str) -> Iterator[None]:
+    """Let the torch twins of some kernels run instead, for comparisons."""
+    former = set(_switched_off)
+    _switched_off.update(modules)
+    try:
+        yield
+    finally:
+        _switched_off.clear()
+        _switched_off.update(former)
+
+
+def is_on(module: str) -> bool:
+    """Tell whether a kernel has not been switched off."""
+    return module not in _switched_off
+
+
 def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
     """Return a numba module for tensors on the CPU, with its threads set to torch's; else None."""
-    if device.type != "cpu":
+    if device.type != "cpu" or not is_on(module):
         return None
     found = twin(module)
     if found is not None:
@@ -43,7 +65,7 @@ def set_threads() -> None:
     """Give numba as many threads as torch has."""
     import numba
 
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
 def _choose_threads() -> None:
@@ -51,7 +73,7 @@ def _choose_threads() -> None:
     import numba
 
     if "NUMBA_THREADING_LAYER" not in os.environ:
-        numba.config.THREADING_LAYER = "workqueue"
+        numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
 
 
 @functools.cache

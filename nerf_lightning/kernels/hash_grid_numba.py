@@ -101,6 +101,13 @@ def _weights(x, y, z):
     return u * a, x * a, u * b, x * b, u * c, x * c, u * d, x * d
 
 
+@njit(fastmath=True)
+@no_type_check
+def _add(into, entry, weight, grad, row, column, lanes):
+    for f in range(len(lanes)):
+        into[entry, f] += weight * grad[row, column + f]
+
+
 @njit(parallel=True, fastmath=True, cache=True)
 @no_type_check
 def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):
@@ -139,22 +146,14 @@ def _add_table_gradient(into, points, grad, resolutions, offsets, hashed, mask, 
             z, fz = _cell(points[i, 2], resolution)
             e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
             w = _weights(fx, fy, fz)
-            for f in range(width):
-                into[e[0], f] += w[0] * grad[i, column + f]
-            for f in range(width):
-                into[e[1], f] += w[1] * grad[i, column + f]
-            for f in range(width):
-                into[e[2], f] += w[2] * grad[i, column + f]
-            for f in range(width):
-                into[e[3], f] += w[3] * grad[i, column + f]
-            for f in range(width):
-                into[e[4], f] += w[4] * grad[i, column + f]
-            for f in range(width):
-                into[e[5], f] += w[5] * grad[i, column + f]
-            for f in range(width):
-                into[e[6], f] += w[6] * grad[i, column + f]
-            for f in range(width):
-                into[e[7], f] += w[7] * grad[i, column + f]
+            _add(into, e[0], w[0], grad, i, column, lanes)
+            _add(into, e[1], w[1], grad, i, column, lanes)
+            _add(into, e[2], w[2], grad, i, column, lanes)
+            _add(into, e[3], w[3], grad, i, column, lanes)
+            _add(into, e[4], w[4], grad, i, column, lanes)
+            _add(into, e[5], w[5], grad, i, column, lanes)
+            _add(into, e[6], w[6], grad, i, column, lanes)
+            _add(into, e[7], w[7], grad, i, column, lanes)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

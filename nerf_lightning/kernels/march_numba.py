@@ -24,11 +24,11 @@ def march(
     # In coordinates of the box, which is the cube from -1 to 1.
     half = 0.5 * (grid.aabb[1] - grid.aabb[0])
     origins = (rays.origins - grid.aabb.mean(dim=0)) / half
-    path = (origins, rays.directions / half, state.enter, state.leave, state.jitter, lattice)
-    path = (*path, grid.cells, grid.blocks, grid.floor)
+    ray = (origins, rays.directions / half, state.enter, state.leave, state.jitter)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
-    _find(*(x.contiguous().numpy() for x in (*path, state.next, numbers, bounds, following)))
+    arrays = (*ray, lattice, grid.cells, grid.blocks, grid.floor, state.next, numbers, bounds, following)
+    _find(*(x.contiguous().numpy() for x in arrays))
     torch.cumsum(bounds, 0, out=bounds)
     total = int(bounds[-1])
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
@@ -64,65 +64,91 @@ def _first_from(lattice, jitter, k, t):
 
 @njit(fastmath=True)
 @no_type_check
-def _ahead(unit, speed, inverse):
+def _ahead(unit, speed):
     # Distance to the end of the cell, of side 1, that `unit` lies in, along one axis.
     if speed > 0:
-        return (np.floor(unit) + ONE - unit) * inverse
+        return (np.floor(unit) + ONE - unit) / speed
     if speed < 0:
-        return (np.floor(unit) - unit) * inverse
+        return (np.floor(unit) - unit) / speed
     return FAR_AWAY
+
+
+@njit(fastmath=True)
+@no_type_check
+def _cascade(x, y, z, cascades):
+    # The smallest cascade that holds a point, half its side, and whether any does.
+    reach = max(abs(x), abs(y), abs(z))
+    number, size = 0, ONE
+    while reach > size and number < cascades - 1:
+        number += 1
+        size *= TWO
+    return number, size, reach <= size
+
+
+@njit(fastmath=True)
+@no_type_check
+def _end_of_empty(x, y, z, dx, dy, dz, block_is_empty, scale):
+    # Distance to the end of the empty cell or block that a point, in units of cells, lies in; a hair short.
+    if block_is_empty:
+        shrink = ONE / np.float32(BLOCK)
+        x, y, z, scale = x * shrink, y * shrink, z * shrink, scale * shrink
+    return min(_ahead(x, dx * scale), _ahead(y, dy * scale), _ahead(z, dz * scale)) * np.float32(0.9999)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _skip(lattice, jitter, k, t, ahead):
+    # The first interval after k whose middle, at t, is so far ahead; never one too far.
+    end = lattice.shape[0] - 2
+    longest = lattice[end + 1] - lattice[end]
+    k += max(1, int(ahead / longest))
+    while k < end and _middle(lattice, jitter, k) < t + ahead:
+        k += 1
+    return k
+
+
+@njit(fastmath=True)
+@no_type_check
+def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, blocks, floor, k, numbers):
+    # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
+    end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[1])
+    last, found, optical = resolution - np.int32(1), 0, np.float32(0.0)
+    while k < end and found < numbers.shape[0]:
+        t = _middle(lattice, jitter, k)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        cascade, size, inside = _cascade(x, y, z, cells.shape[0])
+        if t > leave or optical > OPAQUE:
+            return found, end
+        if not inside:
+            k += 1
+            continue
+        scale = HALF * np.float32(resolution) / size
+        x, y, z = (x + size) * scale, (y + size) * scale, (z + size) * scale
+        a, b, c = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
+        if cells[cascade, a, b, c]:
+            optical += floor[cascade, a, b, c] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
+            numbers[found] = k
+            found += 1
+            k += 1
+        else:
+            empty = not blocks[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
+            k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, empty, scale))
+    return found, min(k, end)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 @no_type_check
 def _find(o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following):
-    end, limit = lattice.shape[0] - 2, numbers.shape[1]
-    longest = lattice[end + 1] - lattice[end]
-    cascades, resolution = cells.shape[0], np.int32(cells.shape[1])
     for r in prange(o.shape[0]):
-        jitter, ox, oy, oz, dx, dy, dz = jitters[r], o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
-        ix, iy, iz = ONE / (dx if dx != 0 else ONE), ONE / (dy if dy != 0 else ONE), ONE / (dz if dz != 0 else ONE)
-        found, k, optical = 0, end, np.float32(0.0)
+        found, k = 0, lattice.shape[0] - 2
         if enter[r] < leave[r]:
-            k = _first_from(lattice, jitter, first[r], enter[r])
-        while k < end and found < limit:
-            t = _middle(lattice, jitter, k)
-            if t > leave[r]:
-                k = end
-                break
-            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            reach = max(abs(x), abs(y), abs(z))
-            cascade, size = 0, ONE
-            while reach > size and cascade < cascades - 1:
-                cascade += 1
-                size *= TWO
-            if reach > size:
-                k += 1
-                continue
-            scale = HALF * np.float32(resolution) / size
-            ux, uy, uz = (x + size) * scale, (y + size) * scale, (z + size) * scale
-            i = min(np.int32(ux), resolution - np.int32(1))
-            j = min(np.int32(uy), resolution - np.int32(1))
-            m = min(np.int32(uz), resolution - np.int32(1))
-            if cells[cascade, i, j, m]:
-                if optical > OPAQUE:
-                    k = end
-                    break
-                optical += floor[cascade, i, j, m] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
-                numbers[r, found] = k
-                found += 1
-                k += 1
-                continue
-            if not blocks[cascade, i // BLOCK, j // BLOCK, m // BLOCK]:
-                scale /= np.float32(BLOCK)
-                ux, uy, uz = ux / np.float32(BLOCK), uy / np.float32(BLOCK), uz / np.float32(BLOCK)
-            ahead = min(_ahead(ux, dx, ix), _ahead(uy, dy, iy), _ahead(uz, dz, iz)) / scale
-            beyond = t + ahead * np.float32(0.9999)
-            k += max(1, int((beyond - t) / longest))
-            while k < end and _middle(lattice, jitter, k) < beyond:
-                k += 1
+            k = _first_from(lattice, jitters[r], first[r], enter[r])
+            found, k = _walk(
+                *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]),
+                *(leave[r], lattice, jitters[r], cells, blocks, floor, k, numbers[r]),
+            )
         bounds[r + 1] = found
-        following[r] = min(k, end)
+        following[r] = k
 
 
 @njit(parallel=True, fastmath=True, cache=True)

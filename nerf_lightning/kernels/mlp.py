@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.kernels import mlp_tiles
+from nerf_lightning.kernels.backends import is_on
 
 
 def mlp(points: Float[Tensor, "points in"], weights: list[Tensor]) -> Float[Tensor, "points out"]:
     """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in)."""
-    if points.device.type != "cpu" or points.dtype == torch.float64:
+    if points.device.type != "cpu" or points.dtype == torch.float64 or not is_on("mlp_tiles"):
         return mlp_torch(points, weights)
     dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):

@@ -1,7 +1,6 @@
 """The contract of a loss: what the levels saw against what the photograph shows."""
 
 from abc import ABC, abstractmethod
-
 from typing import Any
 
 from jaxtyping import Float

@@ -25,9 +25,7 @@ class ProposalLoss(Loss):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion
 
-    def forward(
-        self, renderings: list[DenseRendering], target: Float[Tensor, "*rays 3"]
-    ) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[DenseRendering], target: Float[Tensor, "*rays 3"]) -> list[Float[Tensor, ""]]:
         """Return one number per level."""
         last = renderings[-1]
         losses = [self.interlevel * interlevel_loss(last, proposal) for proposal in renderings[:-1]]

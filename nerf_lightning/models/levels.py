@@ -16,7 +16,6 @@ from nerf_lightning.types import DenseRendering, RayBundle, Rendering, Scene
 class AnyLevel(nn.Module):
     """The contract of a level: one round of sampling and rendering."""
 
-    sampler: nn.Module
     field: Field
 
     @abstractmethod
@@ -44,7 +43,7 @@ class AnyLevel(nn.Module):
         """Return what is worth watching while training."""
         return {}
 
-    def forget_measurements(self) -> None:  # noqa: B027
+    def forget_measurements(self) -> None:
         """Forget what was counted while rendering."""
 
     def reset_parameters(self) -> None:
@@ -54,6 +53,8 @@ class AnyLevel(nn.Module):
 
 class Level(AnyLevel):
     """A level in which every ray has the same number of samples."""
+
+    sampler: Sampler
 
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()

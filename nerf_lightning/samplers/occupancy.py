@@ -42,7 +42,7 @@ class OccupancySampler(AnySampler):
             so that dark content is not lost before it is learnt.
         decay: of the average, per update.
         min_alpha: opacity of an interval that counts.
-        opaque_below: a ray's samples end where less light than this is left.
+        opaque_below: a ray's samples end where less light than this is left; 0 keeps them all.
         capacity: size of the arrays of samples on GPUs, where no size is read on the host.
     """
 
@@ -126,7 +126,7 @@ class OccupancySampler(AnySampler):
         """
         capacity = self.capacity if rays.near.is_cuda else None
         samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
-        if capacity is not None:
+        if capacity is not None or self.opaque_below == 0:
             return samples, None
         with torch.no_grad():
             density, features = screen_fn(positions_of(rays, samples))

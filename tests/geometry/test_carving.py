@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import torch
 from scenes import BALL_RADIUS, ball_scene
 
 from nerf_lightning.geometry.carving import possible_cells

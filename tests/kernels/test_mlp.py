@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -6,7 +8,7 @@ from nerf_lightning.kernels.mlp_tiles import TILE
 
 
 def weights(*sizes):
-    return [torch.randn(b, a) / a**0.5 for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+    return [torch.randn(b, a) / a**0.5 for a, b in pairwise(sizes)]
 
 
 @pytest.mark.parametrize("rows", [0, 1, TILE, 2 * TILE + 17])

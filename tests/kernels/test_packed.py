@@ -28,7 +28,9 @@ def test_the_numba_twin_equals_the_reference_in_value_and_gradient(counts):
     results = []
     for fn, dtype in ((integrate, torch.float32), (integrate_torch, torch.float64)):
         leaves = [x.to(dtype, copy=True).requires_grad_() for x in (density, rgb)]
-        placed = PackedSamples(samples.ray_index, samples.starts.to(dtype), samples.ends.to(dtype), samples.bounds, samples.found)
+        placed = PackedSamples(
+            samples.ray_index, samples.starts.to(dtype), samples.ends.to(dtype), samples.bounds, samples.found
+        )
         out = fn(*leaves, placed)
         torch.manual_seed(3)
         loss = sum((part * torch.randn(part.shape, dtype=torch.float64).to(dtype)).sum() for part in out)

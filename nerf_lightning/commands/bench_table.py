@@ -1,0 +1,43 @@
+"""`nerf bench`: the table that a person reads, and what stands in it."""
+
+import statistics
+import sys
+from typing import Any
+
+import psutil
+import torch
+from rich.console import Console
+from rich.table import Table
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Return the median of the rounds, and their extremes."""
+    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
+
+
+def peak_memory() -> float:
+    """Return the most memory this process has held so far, in gigabytes; on a GPU the GPU's."""
+    if torch.cuda.is_available():
+        return torch.cuda.max_memory_allocated() / 1e9
+    if sys.platform == "win32":
+        return float(psutil.Process().memory_info().peak_wset) / 1e9
+    import resource
+
+    # Kilobytes on Linux, bytes on macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+def print_table(result: dict[str, Any]) -> None:
+    """Print what was measured, a row each."""
+    table = Table(title=f"nerf bench: {result['machine']}, tiles of {result['tile_points']} points")
+    for column in ("", "median", "min", "max"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, value in result.items():
+        if isinstance(value, dict):
+            table.add_row(name, *(f"{value[key]:,.3g}" if value[key] < 100 else f"{value[key]:,.0f}" for key in value))
+    if result["seconds_and_steps_to_target_psnr"] is not None:
+        seconds, steps = result["seconds_and_steps_to_target_psnr"]
+        table.add_row("seconds to the target PSNR", f"{seconds:.1f}", f"{steps} steps", "")
+    table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
+    Console(width=100).print(table)
