@@ -31,3 +31,13 @@ class Encoder(nn.Module, ABC):
     @abstractmethod
     def reset_parameters(self) -> None:
         """Draw the parameters anew from torch's generator; nothing to do where there are none."""
+
+
+def require_direction_encoder(encoder: Encoder) -> None:
+    """Refuse an encoder that means nothing to directions.
+
+    Raises:
+        ValueError: it wants points of the unit cube.
+    """
+    if encoder.needs_unit_cube:
+        raise ValueError(f"{type(encoder).__name__} cannot encode directions: directions do not lie in the unit cube")

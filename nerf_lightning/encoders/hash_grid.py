@@ -44,6 +44,8 @@ class HashGridEncoder(Encoder):
         super().__init__()
         if not 1 <= min_resolution <= max_resolution or num_levels < 1 or features_per_level < 1:
             raise ValueError("1 <= min_resolution <= max_resolution, and at least one level and feature are needed")
+        if not 1 <= log2_table_size <= 30:
+            raise ValueError(f"log2_table_size={log2_table_size}: give 1 to 30")
         self.layout = hash_grid_layout(num_levels, log2_table_size, min_resolution, max_resolution)
         self.features_per_level = features_per_level
         _require_memory(self.layout.offsets[-1] * features_per_level)

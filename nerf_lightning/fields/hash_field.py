@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, to_unit_cube
 from nerf_lightning.kernels.mlp import mlp
@@ -48,6 +48,7 @@ class HashField(Field):
         contraction: bool = False,
     ):
         super().__init__()
+        require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
         self.density_bias = density_bias

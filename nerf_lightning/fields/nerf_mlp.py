@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types import FieldOutput
@@ -51,6 +51,7 @@ class NerfMLP(Field):
             raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
         if position_encoder.needs_unit_cube:
             raise ValueError(f"{type(position_encoder).__name__} needs a field that knows the scene's box: field=hash")
+        require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
         self.skip = skip

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from nerf_lightning.encoders.frequency import FrequencyEncoder
 from nerf_lightning.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.errors import InputError
 
@@ -33,4 +34,4 @@ def test_an_mlp_that_knows_no_box_refuses_it():
     from nerf_lightning.fields.nerf_mlp import NerfMLP
 
     with pytest.raises(ValueError, match="field=hash"):
-        NerfMLP(HashGridEncoder(num_levels=1, log2_table_size=6), HashGridEncoder(num_levels=1, log2_table_size=6))
+        NerfMLP(HashGridEncoder(num_levels=1, log2_table_size=6), FrequencyEncoder(2))

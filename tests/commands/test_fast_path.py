@@ -1,0 +1,122 @@
+"""The fast path from the command line: resume, time budgets, refusals."""
+
+import signal
+import time
+
+import pytest
+import torch
+from running import FAST, start
+
+TINY = (
+    "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
+    "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
+    "data.batch_rays=256", "data.sample_budget=2000", "data.crop_steps=0",
+)  # fmt: skip
+QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *TINY)
+STEPS = 120
+
+
+def arguments(capture, folder, *extra):
+    return (
+        "train", "scene=npz", f"scene.path={capture}", *QUIET, f"trainer.max_steps={STEPS}", "trainer.num_threads=2",
+        "final.evaluate=false", "final.video=false", "resume=auto", "callbacks.checkpoints.every_steps=5",
+        "callbacks.validation_pictures.every_steps=1000", f"paths.output_dir={folder}", *extra,
+    )  # fmt: skip
+
+
+def finished(process):
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output
+
+
+def saved(folder):
+    last = folder / "checkpoints" / "last.ckpt"
+    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
+
+
+def flat(value, path=""):
+    """Every tensor and number of nested containers."""
+    if isinstance(value, dict):
+        for key, child in value.items():
+            yield from flat(child, f"{path}.{key}")
+    elif isinstance(value, (list, tuple)):
+        for key, child in enumerate(value):
+            yield from flat(child, f"{path}.{key}")
+    elif isinstance(value, (int, float, torch.Tensor)):
+        yield path, value
+
+
+@pytest.mark.slow
+def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path):
+    """Weights, moments, occupancy grid, rays per step: all of it."""
+    code, output = finished(start(*arguments(capture, tmp_path / "whole")))
+    assert code == 0, output
+    folder = tmp_path / "stopped"
+    for how, after in ((signal.SIGKILL, 20), (signal.SIGTERM, 60)):
+        process = start(*arguments(capture, folder))
+        while process.poll() is None and saved(folder)["global_step"] < after:
+            time.sleep(0.02)
+        process.send_signal(how)
+        code, output = finished(process)
+        assert code in (-how, 128 + how), output
+    code, output = finished(start(*arguments(capture, folder)))
+    assert code == 0, output
+    assert "going on from step" in output
+    ours, theirs = saved(folder), saved(tmp_path / "whole")
+    for part in ("global_step", "state_dict", "optimizer_states"):
+        mine, other = dict(flat(ours[part])), dict(flat(theirs[part]))
+        assert mine.keys() == other.keys()
+        assert all(torch.equal(torch.as_tensor(mine[key]), torch.as_tensor(other[key])) for key in mine), part
+    assert ours["nerf_lightning"]["progress"] == theirs["nerf_lightning"]["progress"]
+    assert 0 < theirs["nerf_lightning"]["progress"]["batch_rays"] < 256  # it has adapted
+
+
+@pytest.mark.slow
+def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
+    long = ("trainer.max_steps=1000000", "budget.seconds=4", "scheduler.decay_rate=0.01")
+    code, output = finished(start(*arguments(capture, tmp_path / "run", *long)))
+    assert code == 0, output
+    content = saved(tmp_path / "run")
+    assert 20 < content["global_step"] < 100_000
+    rate = content["optimizer_states"][0]["param_groups"][0]
+    assert rate["lr"] / rate["base_lr"] < 0.02  # the schedule has come to its end
+    used = [state["used"] for state in content["callbacks"].values() if "used" in state]
+    assert used
+    assert used[0] >= 3.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (
+            ("encoder.log2_table_size=30", "encoder.num_levels=16", "encoder.max_resolution=9999"),
+            ("GiB", "encoder.log2_table_size"),
+        ),
+        (("budget.seconds=0",), ("budget.seconds=0", "positive")),
+        (("data.sample_budget=100", "data.crop_steps=5"), ("data.sample_budget=100", "no crop")),
+        (("encoder.log2_table_size=34",), ("log2_table_size=34",)),
+        (("encoder@direction_encoder=hash_grid",), ("directions do not lie in the unit cube",)),
+        (("field=nerf_mlp", "~field.width"), ("field=hash",)),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overrides, parts):
+    folder = tmp_path / "run"
+    tiny = [x for x in QUIET if not (x.startswith(("field.", "encoder.")) and "field=nerf_mlp" in overrides)]
+    result = nerf("train", "scene=npz", f"scene.path={capture}", *tiny, f"paths.output_dir={folder}", *overrides)
+    assert result.code == 2, result.err
+    complaint = [line for line in result.err.splitlines() if line.startswith("nerf: ")]
+    assert len(complaint) == 1
+    assert "Traceback" not in result.err
+    assert all(part in complaint[0] for part in parts), complaint
+    assert not folder.exists()
+
+
+def test_bench_measures_a_packed_model(nerf, tmp_path):
+    result = nerf(
+        "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",
+        f"scene.cache_dir={tmp_path}/cache", *TINY, "rounds=1", "warmup_steps=20", "render_rays=64",
+        "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    for name in ("training rays/s", "times plain", "march, share of a step", "optimizer, share of a step"):
+        assert name in result.out
