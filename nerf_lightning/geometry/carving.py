@@ -56,9 +56,7 @@ def _looked_through(scene: Scene, view: int, centers: Tensor, half_diagonal: flo
     return whole & (covered[row, column] == 0)
 
 
-def _footprint(
-    cameras: Cameras, view: int, centers: Tensor, half_diagonal: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _footprint(cameras: Cameras, view: int, centers: Tensor, half_diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
     # Where a cell's sphere appears: centre and radius in pixels; radius 0 where it reaches behind the camera.
     c2w = cameras.c2w[view]
     local = (centers - c2w[:, 3]) @ c2w[:, :3]

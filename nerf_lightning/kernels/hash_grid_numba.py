@@ -101,11 +101,66 @@ def _weights(x, y, z):
     return u * a, x * a, u * b, x * b, u * c, x * c, u * d, x * d
 
 
+# Four features are kept in registers as one vector: written one by one, the compiler must fear that what it stores is
+# what it loads next, and takes a third longer.
 @njit(fastmath=True)
 @no_type_check
-def _add(into, entry, weight, grad, row, column, lanes):
+def _take(table, entry, weight, a, b, c, d):
+    return (
+        a + weight * table[entry, 0],
+        b + weight * table[entry, 1],
+        c + weight * table[entry, 2],
+        d + weight * table[entry, 3],
+    )
+
+
+@njit(fastmath=True)
+@no_type_check
+def _give(into, entry, weight, a, b, c, d):
+    p, q, r, s = into[entry, 0], into[entry, 1], into[entry, 2], into[entry, 3]
+    into[entry, 0], into[entry, 1] = p + weight * a, q + weight * b
+    into[entry, 2], into[entry, 3] = r + weight * c, s + weight * d
+
+
+@njit(fastmath=True)
+@no_type_check
+def _gather(table, e, w, out, row, column, lanes):
+    if len(lanes) == 4:
+        a = b = c = d = np.float32(0.0)
+        a, b, c, d = _take(table, e[0], w[0], a, b, c, d)
+        a, b, c, d = _take(table, e[1], w[1], a, b, c, d)
+        a, b, c, d = _take(table, e[2], w[2], a, b, c, d)
+        a, b, c, d = _take(table, e[3], w[3], a, b, c, d)
+        a, b, c, d = _take(table, e[4], w[4], a, b, c, d)
+        a, b, c, d = _take(table, e[5], w[5], a, b, c, d)
+        a, b, c, d = _take(table, e[6], w[6], a, b, c, d)
+        a, b, c, d = _take(table, e[7], w[7], a, b, c, d)
+        out[row, column], out[row, column + 1], out[row, column + 2], out[row, column + 3] = a, b, c, d
+        return
     for f in range(len(lanes)):
-        into[entry, f] += weight * grad[row, column + f]
+        total = np.float32(0.0)
+        for k in range(8):
+            total += w[k] * table[e[k], f]
+        out[row, column + f] = total
+
+
+@njit(fastmath=True)
+@no_type_check
+def _scatter(into, e, w, grad, row, column, lanes):
+    if len(lanes) == 4:
+        a, b, c, d = grad[row, column], grad[row, column + 1], grad[row, column + 2], grad[row, column + 3]
+        _give(into, e[0], w[0], a, b, c, d)
+        _give(into, e[1], w[1], a, b, c, d)
+        _give(into, e[2], w[2], a, b, c, d)
+        _give(into, e[3], w[3], a, b, c, d)
+        _give(into, e[4], w[4], a, b, c, d)
+        _give(into, e[5], w[5], a, b, c, d)
+        _give(into, e[6], w[6], a, b, c, d)
+        _give(into, e[7], w[7], a, b, c, d)
+        return
+    for k in range(8):
+        for f in range(len(lanes)):
+            into[e[k], f] += w[k] * grad[row, column + f]
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -120,18 +175,7 @@ def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):
                 y, fy = _cell(points[i, 1], resolution)
                 z, fz = _cell(points[i, 2], resolution)
                 e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-                w = _weights(fx, fy, fz)
-                for f in range(width):
-                    out[i, column + f] = (
-                        w[0] * table[e[0], f]
-                        + w[1] * table[e[1], f]
-                        + w[2] * table[e[2], f]
-                        + w[3] * table[e[3], f]
-                        + w[4] * table[e[4], f]
-                        + w[5] * table[e[5], f]
-                        + w[6] * table[e[6], f]
-                        + w[7] * table[e[7], f]
-                    )
+                _gather(table, e, _weights(fx, fy, fz), out, i, column, lanes)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -145,15 +189,7 @@ def _add_table_gradient(into, points, grad, resolutions, offsets, hashed, mask, 
             y, fy = _cell(points[i, 1], resolution)
             z, fz = _cell(points[i, 2], resolution)
             e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-            w = _weights(fx, fy, fz)
-            _add(into, e[0], w[0], grad, i, column, lanes)
-            _add(into, e[1], w[1], grad, i, column, lanes)
-            _add(into, e[2], w[2], grad, i, column, lanes)
-            _add(into, e[3], w[3], grad, i, column, lanes)
-            _add(into, e[4], w[4], grad, i, column, lanes)
-            _add(into, e[5], w[5], grad, i, column, lanes)
-            _add(into, e[6], w[6], grad, i, column, lanes)
-            _add(into, e[7], w[7], grad, i, column, lanes)
+            _scatter(into, e, _weights(fx, fy, fz), grad, i, column, lanes)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

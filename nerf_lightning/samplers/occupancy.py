@@ -1,6 +1,8 @@
 """An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989)."""
 
+import logging
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -14,6 +16,8 @@ from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.types import PackedSamples, RayBundle, Scene
+
+log = logging.getLogger(__name__)
 
 CELLS_AT_ONCE = 1 << 18
 # The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
@@ -84,7 +88,9 @@ class OccupancySampler(AnySampler):
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
         self.register_buffer("range", torch.tensor([0.0, 1.0]))
+        # Made when first needed from what the buffers hold; reading them stops a GPU, so they are kept.
         self._lattice: Tensor | None = None
+        self._numbers: Tensor | None = None
 
     def place(self, scene: Scene) -> None:
         """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
@@ -94,7 +100,7 @@ class OccupancySampler(AnySampler):
         """
         self.aabb.copy_(scene.aabb)
         self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
-        self._lattice = None
+        self._lattice = self._numbers = None
         for cascade in range(self.num_cascades):
             centers, half_diagonal = self._cell_centers(cascade)
             possible = possible_cells(scene, centers, half_diagonal)
@@ -107,6 +113,17 @@ class OccupancySampler(AnySampler):
                 "(scene.aabb_half), or the cameras' poses."
             )
         self.reset()
+        eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3]
+        inside = int(((eyes > scene.aabb[0]) & (eyes < scene.aabb[1])).all(dim=-1).sum())
+        if inside:
+            log.warning(
+                "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
+                "learnt. If the capture has no bounds, use field.contraction=true with model=fast_proposal, or with "
+                "model.levels.fine.sampler.num_cascades=4; else make the box smaller (scene.aabb_half).",
+                inside,
+                eyes.shape[0],
+                scene.name,
+            )
 
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""
@@ -174,7 +191,9 @@ class OccupancySampler(AnySampler):
         """
         if step % self.update_every or step == 0:
             return
-        number = self.possible.flatten().nonzero()[:, 0]
+        if self._numbers is None or self._numbers.device != self.possible.device:
+            self._numbers = self.possible.flatten().nonzero()[:, 0]
+        number = self._numbers
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
@@ -187,6 +206,10 @@ class OccupancySampler(AnySampler):
             mean = self.density.sum() / self.possible.sum()
             threshold = (0.5 * mean).clamp(max=self.min_alpha / self.step_size)
             self._occupy((self.density > threshold) & self.possible)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._lattice = self._numbers = None
 
     def _occupy(self, occupied: Tensor) -> None:
         self.cells.copy_(occupied)

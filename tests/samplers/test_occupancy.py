@@ -122,3 +122,12 @@ def test_state_travels_in_the_state_dict():
     one, _ = sampler(rays, screened(ball_density()), batch_random(1, 20))
     two, _ = other(rays, screened(ball_density()), batch_random(1, 20))
     assert torch.equal(one.starts, two.starts)
+
+
+def test_cameras_inside_the_box_are_said_by_name(caplog):
+    scene = opaque_ball()
+    a_sampler(replace(scene, aabb=5 * scene.aabb))
+    assert "3 of 3 training cameras stand inside the box of the scene ball" in caplog.text
+    caplog.clear()
+    a_sampler(scene)
+    assert caplog.text == ""
