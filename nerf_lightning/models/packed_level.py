@@ -16,8 +16,10 @@ from nerf_lightning.types import FieldOutput, PackedRendering, PackedSamples, Ra
 
 # A ray's random numbers are numbered by its samples: no ray has more.
 MOST_SAMPLES = 1 << 12
+# In rendering, samples less opaque than this keep their density and lose their colour.
+LEAST_ALPHA = 1e-3
 # Samples that a ray takes in one round of rendering; more where few rays are left.
-ROUND_SAMPLES, MOST_ROUND_SAMPLES = 4, 64
+ROUND_SAMPLES, MOST_ROUND_SAMPLES = 6, 64
 
 
 class PackedLevel(AnyLevel):
@@ -37,9 +39,9 @@ class PackedLevel(AnyLevel):
         self._samples_per_ray: float | None = None
 
     def points_per_ray(self, before: float, training: bool) -> float:
-        """In training, as lately measured; in rendering, those of a round."""
+        """In training, as lately measured; in rendering 1, since few rays have more than a handful at a time."""
         if not training:
-            return float(ROUND_SAMPLES)
+            return 1.0
         if self._samples_per_ray is None:
             self._samples_per_ray = float(self.measured)
         return max(1.0, self._samples_per_ray if self._samples_per_ray >= 0 else float(self.sampler.num_steps))
@@ -114,6 +116,18 @@ class PackedLevel(AnyLevel):
             output = self.field.recall(positions, directions, random, features[:, None])
         return FieldOutput(density=output.density[:, 0], rgb=output.rgb[:, 0])
 
+    def _look(self, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
+        # Most samples are all but transparent: their colour, which costs most, is not asked for.
+        density, features = self.field.screen(positions_of(rays, samples))
+        if features is None:
+            return self._ask(rays, samples, None)
+        rgb = density.new_zeros(density.shape[0], 3)
+        seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
+        if seen.numel():
+            bounds = torch.zeros_like(samples.bounds)  # not needed: nothing is composited here
+            rgb[seen] = self._ask(rays, samples.at(seen, bounds), None, features[seen]).rgb
+        return FieldOutput(density=density, rgb=rgb)
+
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         state, lattice, grid = self.sampler.start(rays, None), self.sampler.lattice, self.sampler.grid
         rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
@@ -123,7 +137,7 @@ class PackedLevel(AnyLevel):
             limit = min(MOST_ROUND_SAMPLES, ROUND_SAMPLES * rays.near.shape[0] // alive.numel())
             left = rays[alive]
             samples, following = march(left, state[alive], lattice, grid, limit)
-            part: PackedRendering = composite_packed(self._ask(left, samples, None), samples, left, None)
+            part: PackedRendering = composite_packed(self._look(left, samples), samples, left, None)
             before = light[alive]
             rgb[alive] += before[:, None] * part.foreground
             depth[alive] += before * (part.depth - (1.0 - part.opacity) * left.far)

@@ -69,7 +69,7 @@ class OccupancySampler(AnySampler):
         prune_after: int = 0,
         decay: float = 0.95,
         min_alpha: float = 0.001,
-        opaque_below: float = 1e-4,
+        opaque_below: float = 1e-3,
         capacity: int = 1 << 20,
     ):
         super().__init__()
