@@ -15,6 +15,9 @@ class Field(nn.Module, ABC):
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
 
+    needs_random: bool = False
+    """True where training draws random numbers for each sample."""
+
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 

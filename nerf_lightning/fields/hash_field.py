@@ -120,8 +120,8 @@ class HashField(Field):
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
         if self.contraction:
             return density
-        inside = ((positions >= self.aabb[0]) & (positions <= self.aabb[1])).all(dim=-1)
-        return torch.where(inside, density, 0.0)
+        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        return torch.where(((positions - center).abs() <= half).all(dim=-1), density, 0.0)
 
 
 def _weights(*sizes: int) -> nn.ParameterList:

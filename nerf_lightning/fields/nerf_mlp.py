@@ -71,6 +71,11 @@ class NerfMLP(Field):
         self.color_head = nn.Linear(width // 2, 3)
         self.reset_parameters()
 
+    @property
+    def needs_random(self) -> bool:  # type: ignore[override]
+        """Where noise is added to the density."""
+        return self.density_noise > 0
+
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
         return self._activate(self.density_head(self._trunk(positions))[..., 0], None)

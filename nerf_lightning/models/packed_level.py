@@ -105,7 +105,7 @@ class PackedLevel(AnyLevel):
         self, rays: RayBundle, samples: PackedSamples, random: RayRandom | None, features: Tensor | None = None
     ) -> FieldOutput:
         index = samples.ray_index
-        if random is not None:
+        if random is not None and self.field.needs_random:
             place = torch.arange(index.shape[0], device=index.device) - samples.bounds[index]
             random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + place)
         # To the field, each sample is a ray with one sample.
