@@ -62,14 +62,7 @@ class Bench:
 def benchmark(config: DictConfig) -> float:
     """Measure as the config says."""
     bench = _prepare(config)
-    reached = None
-    if config.target_psnr is not None:
-        reached = seconds_to_psnr(
-            bench.take_step, bench.system, bench.batches, config.target_psnr, config.warmup_steps or MOST_STEPS
-        )
-    else:
-        for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
-            bench.take_step()
+    reached = _train_first(bench, config)
     bench.batch = bench.batches.at(0, bench.batches.crop_rays(0)).to(bench.settings.device)
     kinds: dict[str, Callable[[], None]] = {
         "matrix": _multiplication(bench.settings),
@@ -105,6 +98,16 @@ def benchmark(config: DictConfig) -> float:
         part.write_text(json.dumps(result, indent=2) + "\n")
     print(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])
+
+
+def _train_first(bench: Bench, config: DictConfig) -> tuple[float, int] | None:
+    """Train until a PSNR is reached, and return seconds and steps; or for a number of steps."""
+    if config.target_psnr is not None:
+        most = config.warmup_steps or MOST_STEPS
+        return seconds_to_psnr(bench.take_step, bench.system, bench.batches, config.target_psnr, most)
+    for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
+        bench.take_step()
+    return None
 
 
 def _prepare(config: DictConfig) -> Bench:
