@@ -18,20 +18,25 @@ LOOK_EVERY = 25
 VALIDATION_RAYS = 8192
 
 
-def stage_seconds(system: RadianceFieldSystem, batch: Batch) -> dict[str, float]:
-    """Return the seconds of marching, screening, and all of forward and backward, for a packed model; else nothing."""
+def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+    """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing."""
     level = list(system.model.levels.values())[-1]
     if not isinstance(level, PackedLevel):
         return {}
     rays, sampler = batch.rays, level.sampler
     found: list[Tensor] = []
+    optimizer.zero_grad()
+    whole = _timed(lambda: system.accumulate_gradients(batch, lambda loss: loss.backward()))
+    update = _timed(optimizer.step)
 
     def walk() -> None:
         samples, _ = march(rays, sampler.start(rays, None), sampler.lattice, sampler.grid)
         found.append(positions_of(rays, samples))
 
     with torch.no_grad():
-        return {"march": _timed(walk), "screen": _timed(lambda: level.field.screen(found[0]))}
+        walking, screening = _timed(walk), _timed(lambda: level.field.screen(found[0]))
+    rest = whole - walking - screening
+    return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
 
 
 def seconds_to_psnr(

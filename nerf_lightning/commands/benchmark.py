@@ -79,7 +79,7 @@ def benchmark(config: DictConfig) -> float:
     flops = _flops_per_ray(bench)
     per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
     result: dict[str, Any] = {name: spread([row[name] for row in per_round]) for name in per_round[0]}
-    result |= {name: spread(values) for name, values in _stages(bench, seconds, config).items()}
+    result |= {name: spread(values) for name, values in _stages(bench, seconds["train"], config.steps).items()}
     if config.kernels:
         ratios = kernel_ratios(bench.settings.device, config.rounds)
         result |= {name: spread(values) for name, values in ratios.items()}
@@ -195,19 +195,12 @@ def _release_gradients(bench: Bench) -> None:
         parameter.grad_in_place = False  # type: ignore[attr-defined]
 
 
-def _stages(bench: Bench, seconds: dict[str, list[float]], config: DictConfig) -> dict[str, list[float]]:
+def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[float]]:
     """Return the share of a step's time that each stage takes, where the model has stages."""
     result: dict[str, list[float]] = {}
-    for i in range(config.rounds):
-        step = seconds["train"][i] / config.steps
-        stages = stage_seconds(bench.system, bench.batch)
-        if stages:
-            start = time.perf_counter()
-            bench.optimizer.zero_grad()
-            bench.optimizer.step()
-            stages["optimizer"] = time.perf_counter() - start
-        for name, value in stages.items():
-            result.setdefault(f"{name}, share of a step", []).append(value / step)
+    for one in seconds:
+        for name, value in stage_seconds(bench.system, bench.batch, bench.optimizer).items():
+            result.setdefault(f"{name}, share of a step", []).append(value * steps / one)
     return result
 
 
@@ -219,7 +212,8 @@ def _render(bench: Bench, num_rays: int, plain: bool) -> None:
     rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
     size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
     half = bench.settings.precision.startswith("bf16") and not plain
-    with torch.no_grad(), torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half):
+    autocast = torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half)
+    with torch.no_grad(), autocast, _plainly(bench) if plain else nullcontext():
         for part in tiles(num_rays, size):
             _render_tile(bench.system.model, rays[part], bench)
 

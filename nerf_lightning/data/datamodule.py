@@ -1,10 +1,14 @@
 """The LightningDataModule: flattens every picture of a scene into ray batches."""
 
+import logging
+
 from lightning.pytorch import LightningDataModule
 
 from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Scene
+
+log = logging.getLogger(__name__)
 
 
 class RayDataModule(LightningDataModule):
@@ -52,6 +56,13 @@ class RayDataModule(LightningDataModule):
             raise InputError(
                 f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
                 "scene.background=none would train on colours without their alpha. Use white, black or random."
+            )
+        if scene.background == "random" and bool((scene.pixels.rgba[:, 3] == 255).all()):
+            log.warning(
+                "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
+                "scene is part of them and is learnt as matter. Give the background's colour instead "
+                "(scene.background=black or white).",
+                scene.name,
             )
         for split in ("train", "val"):
             if not scene.splits.get(split):

@@ -106,3 +106,18 @@ def test_views_of_different_sizes_share_one_domain():
     assert len(domain) == 2 * 36
     assert located.view.tolist() == [1] * 36 + [4] * 36
     assert (int(located.x.min()), int(located.x.max())) == (3, 8)
+
+
+def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog):
+    from dataclasses import replace
+
+    from nerf_lightning.data.datamodule import RayDataModule
+
+    scene = ball_scene(background="random")
+    RayDataModule(scene, Progress(), seed=0, num_steps=1)
+    assert caplog.text == ""
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    RayDataModule(replace(scene, pixels=replace(scene.pixels, rgba=rgba)), Progress(), seed=0, num_steps=1)
+    assert "pictures of ball have no transparent pixels" in caplog.text
+    assert "scene.background=black" in caplog.text
