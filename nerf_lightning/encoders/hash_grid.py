@@ -68,9 +68,7 @@ class HashGridEncoder(Encoder):
         return self._interpolate(points, features.reshape(-1, self.out_dim))
 
     def _interpolate(self, points: Tensor, known: Tensor | None) -> Tensor:
-        # Half-precision tables halve the traffic on a GPU; the float32 ones stay the optimizer's.
-        table = self.table.half() if points.is_cuda else self.table
-        return interpolate(table, points.reshape(-1, 3), self.layout, known).view(*points.shape[:-1], self.out_dim)
+        return interpolate(self.table, points.reshape(-1, 3), self.layout, known).view(*points.shape[:-1], self.out_dim)
 
     def reset_parameters(self) -> None:
         """Draw the tables anew: uniform within 1e-4, as the paper has it."""
