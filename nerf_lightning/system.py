@@ -98,14 +98,12 @@ class RadianceFieldSystem(LightningModule):
 
     def configure_optimizers(self) -> Optimizer:
         """Complete the optimizer; the parameters of encoders are tables, which do not decay."""
-        tables, others = [], []
-        for level in self.model.modules():
-            if isinstance(level, Encoder):
-                tables += list(level.parameters())
-        known = {id(parameter) for parameter in tables}
-        others = [parameter for parameter in self.model.parameters() if id(parameter) not in known]
-        groups: list[dict[str, Any]] = [{"params": others}]
-        return self.build_optimizer(groups + ([{"params": tables, "weight_decay": 0.0}] if tables else []))
+        encoders = [module for module in self.model.modules() if isinstance(module, Encoder)]
+        tables = {id(table): table for encoder in encoders for table in encoder.parameters()}
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.model.parameters() if id(p) not in tables]}]
+        if tables:
+            groups.append({"params": list(tables.values()), "weight_decay": 0.0})
+        return self.build_optimizer(groups)
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """Take one step: tiles forward and backward, clip, update."""

@@ -71,6 +71,11 @@ class PixelStore:
     width: Int[Tensor, "views"]
     height: Int[Tensor, "views"]
 
+    @property
+    def has_transparency(self) -> bool:
+        """Whether the alpha of any pixel says more than that something is there."""
+        return bool((self.rgba[:, 3] < 255).any())
+
     def view(self, index: int) -> UInt8[Tensor, "height width 4"]:
         """Return one view as a picture (no copy)."""
         start, width, height = (int(x[index]) for x in (self.offset, self.width, self.height))
@@ -167,6 +172,11 @@ class PackedSamples(TensorStruct):
     """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
     found: Int[Tensor, ""]
     """How many there were before what exceeds the capacity was dropped."""
+
+    @property
+    def place(self) -> Int[Tensor, "capacity"]:
+        """Number of each sample in its ray, from 0."""
+        return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - self.bounds[self.ray_index]
 
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""

@@ -39,11 +39,9 @@ class Monitor(Callback):
         now, step = time.perf_counter(), trainer.global_step
         rays, seconds = pl_module.progress.rays_seen - self.rays_seen, now - self.since
         self.since, self.rays_seen = now, pl_module.progress.rays_seen
-        values = level_scalars(pl_module.model.level_names, pl_module.last_step["losses"])
-        if not pl_module.loss.every_level_is_a_picture:
-            for name in pl_module.model.level_names[:-1]:
-                del values[f"train/psnr_{name}"]
-        values |= pl_module.model.statistics()
+        names = pl_module.model.level_names
+        pictures = names if pl_module.loss.every_level_is_a_picture else names[-1:]
+        values = level_scalars(names, pl_module.last_step["losses"], pictures) | pl_module.model.statistics()
         values["train/learning_rate"] = pl_module.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
@@ -56,10 +54,11 @@ class Monitor(Callback):
             logger.log_metrics(values, step)
 
 
-def level_scalars(names: tuple[str, ...], losses: Tensor) -> dict[str, float]:
-    """Return loss and PSNR of each level, and the sum that is minimised."""
+def level_scalars(names: tuple[str, ...], losses: Tensor, pictures: tuple[str, ...]) -> dict[str, float]:
+    """Return the loss of each level, the PSNR of those whose loss is of a picture, and the sum that is minimised."""
     values = {"train/loss": float(losses.sum())}
     for name, loss in zip(names, losses, strict=True):
         values[f"train/loss_{name}"] = float(loss)
-        values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
+        if name in pictures:
+            values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
     return values

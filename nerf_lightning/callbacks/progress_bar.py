@@ -26,13 +26,13 @@ class TrainingProgress(ProgressBar):
         self.refresh_seconds, self.line_seconds = refresh_seconds, line_seconds
         self.bar: Progress | None = None
         self.task = TaskID(0)
-        self.started, self.first_step, self.shown, self.seen = 0.0, 0, 0.0, (0.0, 0)
+        self.started, self.first_step, self.shown, self.rays_seen = 0.0, 0, 0.0, 0
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Show the bar."""
         self.started = self.shown = time.perf_counter()
         self.first_step = trainer.global_step
-        self.seen = (self.started, pl_module.progress.rays_seen)
+        self.rays_seen = pl_module.progress.rays_seen
         console = Console(stderr=True)
         if not console.is_terminal:
             return
@@ -54,11 +54,10 @@ class TrainingProgress(ProgressBar):
         now, step = time.perf_counter(), trainer.global_step
         if now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
-        self.shown = now
         per_second = (step - self.first_step) / (now - self.started)
         # Negative after a restart, which counts anew.
-        rays_per_second = max(0.0, (pl_module.progress.rays_seen - self.seen[1]) / (now - self.seen[0]))
-        self.seen = (now, pl_module.progress.rays_seen)
+        rays_per_second = max(0.0, (pl_module.progress.rays_seen - self.rays_seen) / (now - self.shown))
+        self.shown, self.rays_seen = now, pl_module.progress.rays_seen
         loss = pl_module.last_step["losses"]
         text = (
             f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "

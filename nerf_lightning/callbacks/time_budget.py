@@ -27,16 +27,17 @@ class TimeBudget(Callback):
         self.used, self.since = 0.0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
-        """Start the clock."""
+        """Start the clock; a resumed run knows how fast it was."""
         self.since = time.perf_counter()
+        if self.used:
+            self._fit_schedule(trainer, pl_module)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
         self.used, self.since = self.used + now - self.since, now
-        step = pl_module.progress.step
-        if step % self.every_steps == 0:
-            pl_module.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))
+        if pl_module.progress.step % self.every_steps == 0:
+            self._fit_schedule(trainer, pl_module)
         if self.used >= self.seconds:
             trainer.should_stop = True
 
@@ -47,3 +48,7 @@ class TimeBudget(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the count up again."""
         self.used = state_dict["used"]
+
+    def _fit_schedule(self, trainer: Trainer, system: Any) -> None:
+        step = system.progress.step
+        system.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))

@@ -1,12 +1,12 @@
 """`nerf bench`: the compiled kernels against the same mathematics in torch, eager and compiled."""
 
 import shutil
-import time
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 from nerf_lightning.kernels.mlp import mlp, mlp_torch
@@ -18,10 +18,10 @@ def kernel_ratios(device: torch.device, rounds: int) -> dict[str, list[float]]:
     """Return seconds of our kernels, and how many times longer torch takes, round by round (forward and backward)."""
     result: dict[str, list[float]] = {}
     for name, kinds in {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device)}.items():
-        seconds = {kind: [_seconds(work, device) for _ in range(2)][1:] for kind, work in kinds.items()}
+        seconds = {kind: [seconds_of(work) for _ in range(2)][1:] for kind, work in kinds.items()}
         for _ in range(rounds):
             for kind, work in kinds.items():
-                seconds[kind].append(_seconds(work, device))
+                seconds[kind].append(seconds_of(work))
         ours = seconds["ours"][1:]
         result[f"{name}, milliseconds"] = [1e3 * value for value in ours]
         for kind in kinds:
@@ -75,11 +75,3 @@ def _kinds(
     if can_compile(grad.device):
         kinds["compiled"] = both_ways(torch.compile(reference))
     return kinds
-
-
-def _seconds(work: Callable[[], None], device: torch.device) -> float:
-    start = time.perf_counter()
-    work()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter() - start

@@ -1,12 +1,11 @@
 """`nerf bench`: where the time of a step of a packed model goes, and how long a run takes to a given PSNR."""
 
-import time
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.kernels.march import march
 from nerf_lightning.models.packed_level import PackedLevel
@@ -26,15 +25,15 @@ def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.op
     rays, sampler = batch.rays, level.sampler
     found: list[Tensor] = []
     optimizer.zero_grad()
-    whole = _timed(lambda: system.accumulate_gradients(batch, lambda loss: loss.backward()))
-    update = _timed(optimizer.step)
+    whole = seconds_of(lambda: system.accumulate_gradients(batch, lambda loss: loss.backward()))
+    update = seconds_of(optimizer.step)
 
     def walk() -> None:
         samples, _ = march(rays, sampler.start(rays, None), sampler.lattice, sampler.grid)
         found.append(positions_of(rays, samples))
 
     with torch.no_grad():
-        walking, screening = _timed(walk), _timed(lambda: level.field.screen(found[0]))
+        walking, screening = seconds_of(walk), seconds_of(lambda: level.field.screen(found[0]))
     rest = whole - walking - screening
     return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
 
@@ -46,7 +45,7 @@ def seconds_to_psnr(
     rays = FixedRays(batches.scene, "val", VALIDATION_RAYS, VALIDATION_RAYS)
     used = 0.0
     for step in range(1, most_steps + 1):
-        used += _timed(take_step)
+        used += seconds_of(take_step)
         if step % LOOK_EVERY == 0 and _psnr(system, rays) >= target:
             return used, step
     return None
@@ -59,11 +58,3 @@ def _psnr(system: RadianceFieldSystem, rays: FixedRays) -> float:
     error = torch.cat(system.squared_errors).mean()
     system.squared_errors.clear()
     return float(-10 * torch.log10(error))
-
-
-def _timed(work: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    work()
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter() - start

@@ -7,10 +7,10 @@ it: float32, whole batches, torch around the same hash grid kernel, no screening
 """
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from nerf_lightning.commands.bench_table import peak_memory, print_table, spread
 from nerf_lightning.commands.build import build, build_system
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.tile_choice import measured_tile
+from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress, RayBatches
 from nerf_lightning.export.atomic import whole_file
@@ -47,15 +48,19 @@ class Bench:
     settings: TrainerSettings
     system: RadianceFieldSystem
     batches: RayBatches
-    batch: Batch
     optimizer: torch.optim.Optimizer
     plain_optimizer: torch.optim.Optimizer
+
+    @cached_property
+    def batch(self) -> Batch:
+        """The batch that every kind gets, as large as batches are once the model has been trained."""
+        return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
 
     def take_step(self) -> None:
         """Take one step of training, loading and all."""
         progress = self.batches.progress
         batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
-        with torch.autocast(self.settings.device_type, torch.bfloat16, self.settings.precision.startswith("bf16")):
+        with self.settings.autocast():
             self.system.training_step(batch, 0)
 
 
@@ -63,7 +68,6 @@ def benchmark(config: DictConfig) -> float:
     """Measure as the config says."""
     bench = _prepare(config)
     reached = _train_first(bench, config)
-    bench.batch = bench.batches.at(0, bench.batches.crop_rays(0)).to(bench.settings.device)
     kinds: dict[str, Callable[[], None]] = {
         "matrix": _multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
@@ -125,20 +129,16 @@ def _prepare(config: DictConfig) -> Bench:
     # Stand-ins for what Lightning's trainer provides.
     setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
     setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
-    batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
-    return Bench(settings, system, batches, batch, optimizer, plain)
+    return Bench(settings, system, batches, optimizer, plain)
 
 
 def _interleaved(kinds: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
     seconds: dict[str, list[float]] = {name: [] for name in kinds}
     for number in range(rounds + 1):
         for name, work in kinds.items():
-            start = time.perf_counter()
-            work()
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
+            taken = seconds_of(work)
             if number:  # the first round warms up
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(taken)
     return seconds
 
 
@@ -163,11 +163,10 @@ def _round(
 def _train(bench: Bench, steps: int, plain: bool) -> None:
     system, tile = bench.system, bench.settings.tile_points
     optimizer = bench.plain_optimizer if plain else bench.optimizer
-    half = bench.settings.precision.startswith("bf16") and not plain
     with _plainly(bench) if plain else nullcontext():
         for _ in range(steps):
             optimizer.zero_grad()
-            with torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half):
+            with nullcontext() if plain else bench.settings.autocast():
                 system.accumulate_gradients(bench.batch, lambda loss: loss.backward())
             optimizer.step()
     system.tile_points = tile
@@ -211,9 +210,7 @@ def _load(bench: Bench) -> None:
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
     rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
     size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
-    half = bench.settings.precision.startswith("bf16") and not plain
-    autocast = torch.autocast(bench.settings.device_type, torch.bfloat16, enabled=half)
-    with torch.no_grad(), autocast, _plainly(bench) if plain else nullcontext():
+    with torch.no_grad(), _plainly(bench) if plain else bench.settings.autocast():
         for part in tiles(num_rays, size):
             _render_tile(bench.system.model, rays[part], bench)
 

@@ -1,10 +1,8 @@
 """Choose the tile by a short measurement: how many points at a time suit this machine's caches and this model."""
 
 import logging
-import time
 
-import torch
-
+from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.system import RadianceFieldSystem
@@ -49,10 +47,5 @@ def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch:
 def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
     system.tile_points = tile
     some = Batch(batch.rays[:num_rays], batch.rgba[:num_rays])
-    half = settings.precision.startswith("bf16")
-    start = time.perf_counter()
-    with torch.autocast(settings.device_type, torch.bfloat16, enabled=half):
-        system.accumulate_gradients(some, lambda loss: loss.backward())
-    if settings.device_type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter() - start
+    with settings.autocast():
+        return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))

@@ -120,9 +120,12 @@ class TrainerSettings:
     @contextmanager
     def inference(self) -> Iterator[None]:
         """Render in the precision of training, without gradients."""
-        half = self.precision.startswith("bf16")
-        with torch.no_grad(), torch.autocast(self.device_type, torch.bfloat16, enabled=half):
+        with torch.no_grad(), self.autocast():
             yield
+
+    def autocast(self) -> torch.autocast:
+        """Multiply in the precision of training, where Lightning does not see to it."""
+        return torch.autocast(self.device_type, torch.bfloat16, enabled=self.precision.startswith("bf16"))
 
     def describe(self) -> str:
         """Say device and precision, with the reason where they were chosen."""

@@ -52,12 +52,12 @@ class RayDataModule(LightningDataModule):
             )
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
-        if scene.background == "none" and bool((scene.pixels.rgba[:, 3] < 255).any()):
+        if scene.background == "none" and scene.pixels.has_transparency:
             raise InputError(
                 f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
                 "scene.background=none would train on colours without their alpha. Use white, black or random."
             )
-        if scene.background == "random" and bool((scene.pixels.rgba[:, 3] == 255).all()):
+        if scene.background == "random" and not scene.pixels.has_transparency:
             log.warning(
                 "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
                 "scene is part of them and is learnt as matter. Give the background's colour instead "

@@ -35,8 +35,8 @@ class Field(nn.Module, ABC):
         """Return density and colour along rays; `random` is None outside training."""
 
     def screen(
-        self, positions: Float[Tensor, "points 3"]
-    ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points features"] | None]:
+        self, positions: Float[Tensor, "*points 3"]
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
         """Return the density, and whatever `recall` can use instead of computing it again; None for nothing."""
         return self.density(positions), None
 

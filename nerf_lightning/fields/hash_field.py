@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
-from nerf_lightning.geometry.boxes import contract, to_unit_cube
+from nerf_lightning.geometry.boxes import center_and_half, contract, to_unit_cube
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types import FieldOutput, Scene
@@ -63,15 +63,15 @@ class HashField(Field):
         """Take note of the box that holds the scene's content, and whether the photographs have alpha."""
         self.aabb.copy_(scene.aabb)
         if self.density_bias is None:
-            self.bias.fill_(THICK if bool((scene.pixels.rgba[:, 3] < 255).any()) else THIN)
+            self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
-        return self._density(_along_rows(self.position_encoder(self._unit(positions)), self.density_mlp), positions)
+        return self.screen(positions)[0]
 
     def screen(
-        self, positions: Float[Tensor, "points 3"]
-    ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points features"]]:
+        self, positions: Float[Tensor, "*points 3"]
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density, and the encoder's features."""
         encoded = self.position_encoder(self._unit(positions))
         return self._density(_along_rows(encoded, self.density_mlp), positions), encoded
@@ -120,7 +120,7 @@ class HashField(Field):
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
         if self.contraction:
             return density
-        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        center, half = center_and_half(self.aabb)
         return torch.where(((positions - center).abs() <= half).all(dim=-1), density, 0.0)
 
 

@@ -16,6 +16,15 @@ def to_unit_cube(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3
     return (positions - aabb[0]) / (aabb[1] - aabb[0])
 
 
+def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return a box's centre and half of its sides.
+
+    >>> center_and_half(torch.tensor([[-1.0, 0, 2], [3, 1, 2]]))
+    (tensor([1.0000, 0.5000, 2.0000]), tensor([2.0000, 0.5000, 0.0000]))
+    """
+    return aabb.mean(dim=0), 0.5 * (aabb[1] - aabb[0])
+
+
 def contract(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Bring all space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
 

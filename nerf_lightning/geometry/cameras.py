@@ -82,9 +82,14 @@ def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
     return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
 
 
+def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    """Return world points in the axes of one camera: right, up, back."""
+    c2w = cameras.c2w[view]
+    return (points - c2w[:, 3]) @ c2w[:, :3]
+
+
 def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 2"]:
     """Return where world points appear in one view, in pixels from the upper left corner (x, y)."""
-    c2w = cameras.c2w[view]
-    local = (points - c2w[:, 3]) @ c2w[:, :3]
+    local = camera_coordinates(cameras, view, points)
     plane = torch.stack([local[..., 0], -local[..., 1]], dim=-1) / -local[..., 2:]
     return plane * cameras.focal[view] + cameras.center[view]

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerf_lightning.geometry.cameras import camera_coordinates
 from nerf_lightning.types import Cameras, Scene
 
 
@@ -33,7 +34,7 @@ def possible_cells(
         width, height = int(scene.cameras.width[view]), int(scene.cameras.height[view])
         seen[unseen] = (x > -radius) & (x < width + radius) & (y > -radius) & (y < height + radius) & (radius > 0)
     left = seen.nonzero()[:, 0]
-    if bool((scene.pixels.rgba[:, 3] < 255).any()):
+    if scene.pixels.has_transparency:
         count = min(most_views, len(views))
         for view in (views[i * len(views) // count] for i in range(count)):
             left = left[~_looked_through(scene, view, centers[left], half_diagonal)]
@@ -58,8 +59,7 @@ def _looked_through(scene: Scene, view: int, centers: Tensor, half_diagonal: flo
 
 def _footprint(cameras: Cameras, view: int, centers: Tensor, half_diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
     # Where a cell's sphere appears: centre and radius in pixels; radius 0 where it reaches behind the camera.
-    c2w = cameras.c2w[view]
-    local = (centers - c2w[:, 3]) @ c2w[:, :3]
+    local = camera_coordinates(cameras, view, centers)
     depth = -local[..., 2]
     in_front = depth > 2.0 * half_diagonal
     safe = torch.where(in_front, depth, 1.0)

@@ -15,9 +15,6 @@ from torch.autograd.function import FunctionCtx
 from nerf_lightning.kernels.backends import cpu_twin, cuda_twin
 from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 
-PRIMES = (1, 2654435761, 805459861)
-"""Of the spatial hash: XOR of coordinate times prime, modulo T (Eq. 4)."""
-
 
 @dataclass(frozen=True)
 class HashGridLayout:

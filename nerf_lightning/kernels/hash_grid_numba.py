@@ -11,11 +11,13 @@ from jaxtyping import Float
 from numba import njit, prange
 from torch import Tensor
 
+from nerf_lightning.kernels.hash_grid_torch import PRIME_Y, PRIME_Z
+
 if TYPE_CHECKING:
     from nerf_lightning.kernels.hash_grid import HashGridLayout
 
 CHUNK = 1024
-PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
+SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 ONE = np.float32(1.0)
 
 
@@ -74,10 +76,10 @@ def _cell(coordinate, resolution):
 def _corners(x, y, z, resolution, offset, hashed, mask):
     if hashed:
         x0, x1 = np.uint32(x), np.uint32(x + 1)
-        y0 = np.uint32(np.uint32(y) * PRIME_Y)
-        y1 = np.uint32(y0 + PRIME_Y)
-        z0 = np.uint32(np.uint32(z) * PRIME_Z)
-        z1 = np.uint32(z0 + PRIME_Z)
+        y0 = np.uint32(np.uint32(y) * SPREAD_Y)
+        y1 = np.uint32(y0 + SPREAD_Y)
+        z0 = np.uint32(np.uint32(z) * SPREAD_Z)
+        z1 = np.uint32(z0 + SPREAD_Z)
         a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
         return (
             offset + np.int64((x0 ^ a) & mask),
@@ -166,6 +168,7 @@ def _scatter(into, e, w, grad, row, column, lanes):
             into[e[k], f] += w[k] * grad[row, column + f]
 
 
+# Each loop below finds a point's cell in the same four lines: a function that returned all of it took twice the time.
 @njit(parallel=True, fastmath=True, cache=True)
 @no_type_check
 def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):

@@ -9,6 +9,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from nerf_lightning.kernels.hash_grid import HashGridLayout
 
+PRIME_Y, PRIME_Z = 2654435761, 805459861
+"""Of the spatial hash: XOR of each coordinate times its prime (1 for x), modulo the table's size (Eq. 4)."""
 CORNERS = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])
 
 
@@ -32,7 +34,7 @@ def _entries(vertex: Int[Tensor, "points 8 3"], level: int, layout: "HashGridLay
     x, y, z = vertex.unbind(-1)
     if layout.is_hashed(level):
         # Products of at most 2^32 and a few thousand stay below 2^63.
-        index = (x ^ (y * 2654435761) ^ (z * 805459861)) & (layout.table_size - 1)
+        index = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (layout.table_size - 1)
     else:
         side = layout.resolutions[level] + 1
         index = x + side * (y + side * z)

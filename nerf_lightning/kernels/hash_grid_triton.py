@@ -85,6 +85,25 @@ def _entry(x, y, z, resolution, offset, hashed, mask):
 
 @triton.jit
 @no_type_check
+def _locate(points, row, valid, resolution):
+    x, fx = _cell(points, row, 0, valid, resolution)
+    y, fy = _cell(points, row, 1, valid, resolution)
+    z, fz = _cell(points, row, 2, valid, resolution)
+    return x, y, z, fx, fy, fz
+
+
+@triton.jit
+@no_type_check
+def _corner(corner: tl.constexpr, x, y, z, fx, fy, fz, resolution, offset, hashed, mask):
+    a: tl.constexpr = corner & 1
+    b: tl.constexpr = (corner >> 1) & 1
+    c: tl.constexpr = corner >> 2
+    weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy) * (fz if c else 1.0 - fz)
+    return _entry(x + a, y + b, z + c, resolution, offset, hashed, mask), weight
+
+
+@triton.jit
+@no_type_check
 def _forward(
     table,
     points,
@@ -102,15 +121,11 @@ def _forward(
     valid = row < count
     resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
     hashed = tl.load(hashed_levels + level)
-    x, fx = _cell(points, row, 0, valid, resolution)
-    y, fy = _cell(points, row, 1, valid, resolution)
-    z, fz = _cell(points, row, 2, valid, resolution)
+    x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
     for f in tl.static_range(features):
         total = tl.zeros([block], tl.float32)
         for corner in tl.static_range(8):
-            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy) * (fz if c else 1.0 - fz)
-            entry = _entry(x + a, y + b, z + c, resolution, offset, hashed, mask)
+            entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
             total += weight * tl.load(table + entry * features + f, mask=valid, other=0.0).to(tl.float32)
         tl.store(out + row * (levels * features) + level * features + f, total, mask=valid)
 
@@ -134,13 +149,9 @@ def _backward(
     valid = row < count
     resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
     hashed = tl.load(hashed_levels + level)
-    x, fx = _cell(points, row, 0, valid, resolution)
-    y, fy = _cell(points, row, 1, valid, resolution)
-    z, fz = _cell(points, row, 2, valid, resolution)
+    x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
     for corner in tl.static_range(8):
-        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy) * (fz if c else 1.0 - fz)
-        entry = _entry(x + a, y + b, z + c, resolution, offset, hashed, mask)
+        entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
         for f in tl.static_range(features):
             flowing = tl.load(grad + row * (levels * features) + level * features + f, mask=valid, other=0.0)
             tl.atomic_add(into + entry * features + f, weight * flowing, mask=valid)

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
+from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.kernels.march import BLOCK, OPAQUE, March, OccupancyCells
 from nerf_lightning.types import PackedSamples, RayBundle
 
@@ -22,8 +23,8 @@ def march(
     count, edges = rays.near.shape[0], lattice.shape[0]
     most = min(edges, limit if limit is not None else edges)
     # In coordinates of the box, which is the cube from -1 to 1.
-    half = 0.5 * (grid.aabb[1] - grid.aabb[0])
-    origins = (rays.origins - grid.aabb.mean(dim=0)) / half
+    center, half = center_and_half(grid.aabb)
+    origins = (rays.origins - center) / half
     ray = (origins, rays.directions / half, state.enter, state.leave, state.jitter)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)

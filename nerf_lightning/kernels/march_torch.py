@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.kernels.march import OPAQUE, March, OccupancyCells
 from nerf_lightning.types import PackedSamples, RayBundle
 
@@ -37,7 +38,7 @@ def march_torch(
 def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
     """Look positions up in the smallest cascade that holds them; -1 in empty cells and outside of all."""
     cascades, resolution = grid.cells.shape[:2]
-    center, half = grid.aabb.mean(dim=0), 0.5 * (grid.aabb[1] - grid.aabb[0])
+    center, half = center_and_half(grid.aabb)
     scaled = (positions - center) / half
     reach = scaled.abs().amax(dim=-1)
     cascade = torch.zeros_like(reach, dtype=torch.long)

@@ -48,4 +48,4 @@ class _TiledMLP(torch.autograd.Function):
             grad.contiguous(), ctx.used, ctx.activations, ctx.needs_input_grad[0]
         )
         ctx.activations = None
-        return grad_points, None, *(weight.float() for weight in grad_weights)
+        return grad_points, None, *grad_weights

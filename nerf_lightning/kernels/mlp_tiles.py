@@ -37,7 +37,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
 def backward(
     grad: Tensor, weights: Sequence[Tensor], activations: list[list[Tensor]], wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:
-    """Return the gradients of the inputs and of the weights; `activations` is what `forward` kept."""
+    """Return the gradients of the inputs and, in float32, of the weights; `activations` is what `forward` kept."""
     grad_points = grad.new_empty(grad.shape[0], weights[0].shape[1]) if wants_points else None
 
     def tile(rows: slice) -> list[Tensor]:
@@ -57,7 +57,7 @@ def backward(
 
     parts = in_tiles(tile, grad.shape[0])
     if not parts:
-        return grad_points, [torch.zeros_like(weight) for weight in weights]
+        return grad_points, [torch.zeros_like(weight, dtype=torch.float32) for weight in weights]
     return grad_points, [torch.stack([part[layer].float() for part in parts]).sum(0) for layer in range(len(weights))]
 
 
@@ -65,10 +65,10 @@ def in_tiles(work: Callable[[slice], Result], rows: int) -> list[Result]:
     """Do the work on each tile of rows, on as many threads as torch has, and return the results in order."""
     slices = [slice(start, min(rows, start + TILE)) for start in range(0, rows, TILE)]
     threads = torch.get_num_threads()
-    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    inference = torch.is_inference_mode_enabled()  # like the gradient mode, a thread's own
 
     def alone(rows: slice) -> Result:
-        with torch.inference_mode(inference), torch.set_grad_enabled(grad and not inference):
+        with torch.inference_mode(inference), torch.no_grad():
             return work(rows)
 
     if threads == 1 or len(slices) < 2:

@@ -10,7 +10,7 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import DenseRendering, RayBundle, Rendering, Scene
+from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle, Rendering, Scene
 
 
 class AnyLevel(nn.Module):
@@ -75,8 +75,17 @@ class Level(AnyLevel):
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
         along = samples.midpoints[..., None] * rays.directions[..., None, :]
-        output = self.field(rays.origins[..., None, :] + along, rays.directions[..., None, :], random)
+        output = self.ask(rays.origins[..., None, :] + along, rays.directions[..., None, :], random)
         return composite(output, samples, rays, background)
+
+    def ask(
+        self,
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
+        random: RayRandom | None,
+    ) -> FieldOutput:
+        """Return what the field says of the samples."""
+        return self.field(positions, directions, random)
 
 
 class RadianceModel(nn.Module):

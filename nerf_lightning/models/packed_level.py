@@ -106,8 +106,7 @@ class PackedLevel(AnyLevel):
     ) -> FieldOutput:
         index = samples.ray_index
         if random is not None and self.field.needs_random:
-            place = torch.arange(index.shape[0], device=index.device) - samples.bounds[index]
-            random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + place)
+            random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + samples.place)
         # To the field, each sample is a ray with one sample.
         positions, directions = positions_of(rays, samples)[:, None], rays.directions[index][:, None]
         if features is None:
@@ -118,14 +117,15 @@ class PackedLevel(AnyLevel):
 
     def _look(self, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
         # Most samples are all but transparent: their colour, which costs most, is not asked for.
-        density, features = self.field.screen(positions_of(rays, samples))
+        positions = positions_of(rays, samples)
+        density, features = self.field.screen(positions)
         if features is None:
             return self._ask(rays, samples, None)
         rgb = density.new_zeros(density.shape[0], 3)
         seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
-        if seen.numel():
-            bounds = torch.zeros_like(samples.bounds)  # not needed: nothing is composited here
-            rgb[seen] = self._ask(rays, samples.at(seen, bounds), None, features[seen]).rgb
+        directions = rays.directions[samples.ray_index[seen]]
+        output = self.field.recall(positions[seen][:, None], directions[:, None], None, features[seen][:, None])
+        rgb[seen] = output.rgb[:, 0]
         return FieldOutput(density=density, rgb=rgb)
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:

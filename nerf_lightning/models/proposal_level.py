@@ -5,22 +5,18 @@ from torch import Tensor
 
 from nerf_lightning.models.levels import Level
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.rendering.quadrature import composite
-from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle
+from nerf_lightning.types import FieldOutput
 
 
 class ProposalLevel(Level):
     """Sample, ask the field for density alone, and hand the weights on; its picture is black."""
 
-    def forward(
+    def ask(
         self,
-        rays: RayBundle,
-        background: Float[Tensor, "*rays 3"] | None,
-        history: list[DenseRendering],
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
         random: RayRandom | None,
-    ) -> DenseRendering:
-        """Return weights and depth."""
-        samples = self.sampler(rays, history, random)
-        along = samples.midpoints[..., None] * rays.directions[..., None, :]
-        density = self.field.density(rays.origins[..., None, :] + along)
-        return composite(FieldOutput(density, density.new_zeros(*density.shape, 3)), samples, rays, background)
+    ) -> FieldOutput:
+        """Return the density, and black."""
+        density = self.field.density(positions)
+        return FieldOutput(density, density.new_zeros(*density.shape, 3))

@@ -42,7 +42,7 @@ class StepGuard:
             return not bool(bad)
         for parameter in parameters:
             if parameter.grad is not None:
-                parameter.grad = torch.where(bad, 0.0, parameter.grad)
+                parameter.grad.masked_fill_(bad, 0.0)
         if step % self.every_steps == 0:
             self.require_progress(step)
         return True

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.boxes import distances_in_box
+from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
 from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.packed import num_visible
@@ -152,7 +152,7 @@ class OccupancySampler(AnySampler):
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""
-        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        center, half = center_and_half(self.aabb)
         half = half * 2.0 ** (self.num_cascades - 1)
         enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
@@ -204,7 +204,8 @@ class OccupancySampler(AnySampler):
             self.floor.view(-1)[cells] = torch.minimum(found, floor + RISE * (found - floor))
         if step >= self.prune_after:
             mean = self.density.sum() / self.possible.sum()
-            threshold = (0.5 * mean).clamp(max=self.min_alpha / self.step_size)
+            shortest = (self.aabb[1] - self.aabb[0]).norm().double() / self.num_steps
+            threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
             self._occupy((self.density > threshold) & self.possible)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
@@ -219,7 +220,7 @@ class OccupancySampler(AnySampler):
         side = self.resolution
         cascade, rest = number // side**3, number % side**3
         cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
-        center, half = self.aabb.mean(dim=0), 0.5 * (self.aabb[1] - self.aabb[0])
+        center, half = center_and_half(self.aabb)
         return center + (2.0 * (cell + within) / side - 1.0) * half * (2.0**cascade)[:, None]
 
     def _cell_centers(self, cascade: int) -> tuple[Tensor, float]:
@@ -236,6 +237,5 @@ def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capa
 
 def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
     """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
-    place = torch.arange(samples.ray_index.shape[0], device=counts.device) - samples.bounds[samples.ray_index]
-    kept = (place < counts[samples.ray_index]).nonzero()[:, 0]
+    kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]
     return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])
