@@ -1,51 +1,53 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
 import struct
+import threading
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from nerf_lightning.errors import InputError
 
 # A closed list: some of PIL's other decoders start outside programs.
-FORMATS = ("PNG", "JPEG", "TIFF")
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
+KEEP_ABOVE = 127
 DECODER_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
+
+
+# Python's list of warning filters belongs to all threads at once.
+_filters = threading.Lock()
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) in pixels from the file's header; no pixel is decoded.
 
     Raises:
-        InputError: the file is absent, empty, not a PNG, JPEG or TIFF, or too large to be decoded safely.
+        InputError: the file is absent, empty, of no known format, too large to be decoded safely, holds several
+            pictures, or has a pixel mode with no plain reading as 8-bit colour.
     """
-    # PIL warns at 89 million pixels and fails at twice that; one limit is easier to explain than two.
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-        with _opened(path) as image:
-            return image.size
+    with _opened(path) as image:
+        return image.size
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
-    Palettes and grey levels are expanded. Of 16-bit colour the upper byte is kept (less than one
-    level off).
+    Palettes and grey levels are expanded. Of 16 bits the upper byte is kept (less than one level off).
 
     Raises:
-        InputError: unreadable or truncated, of a mode that has no such reading, or turned by an EXIF tag.
+        InputError: what `image_size` refuses, damaged or truncated, or turned by an EXIF tag.
     """
     with _opened(path) as image:
-        if image.mode not in MODES:
-            raise InputError(
-                f"{path} has the pixel mode {image.mode!r}, which has no plain reading as 8-bit colour. "
-                "Save it as an 8-bit RGB or RGBA PNG."
-            )
         try:
             image.load()
             turned = image.getexif().get(ORIENTATION, 1)
@@ -57,7 +59,58 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
                 "pixels do not match its camera. Turn the pixels themselves and remove the tag (for example "
                 "with `magick mogrify -auto-orient`), and estimate the cameras anew if they exist."
             )
+        if image.mode in GREY_16:
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
         return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """Return which pixels a grey picture keeps: those brighter than 127 of 255.
+
+    Raises:
+        InputError: what `read_rgba` refuses, and pictures with colour or transparency.
+    """
+    rgba = read_rgba(path)
+    grey = rgba[..., 0]
+    if (rgba[..., 1] != grey).any() or (rgba[..., 2] != grey).any() or (rgba[..., 3] < 255).any():
+        raise InputError(
+            f"The mask {path} has colours or transparent pixels, so which pixels it keeps is not clear. Save it as a "
+            "grey picture without alpha: white is kept, black is left out."
+        )
+    return grey > KEEP_ABOVE
+
+
+def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Return (width, height) of a photograph shrunk by a whole factor that need not divide its size.
+
+    What is left over at the right and at the bottom is cropped, so that focal length and principal point, which is
+    measured from the upper left corner, are divided by `factor` exactly.
+
+    >>> downscaled_size(1081, 720, 4)
+    (270, 180)
+
+    Raises:
+        InputError: nothing is left.
+    """
+    if not min(width, height) >= factor >= 1:
+        raise InputError(
+            f"scene.downscale={factor} leaves nothing of a photograph of {width} x {height} pixels. "
+            f"Choose a factor from 1 to {min(width, height)}."
+        )
+    return width // factor, height // factor
+
+
+def crop_to_multiple(picture: UInt8[np.ndarray, "height width *c"], factor: int) -> UInt8[np.ndarray, "h w *c"]:
+    """Return the picture without the rows at the bottom and columns at the right that `factor` leaves over."""
+    height, width = (side // factor * factor for side in picture.shape[:2])
+    return picture[:height, :width]
+
+
+def whole_blocks(kept: Bool[np.ndarray, "height width"], factor: int) -> Bool[np.ndarray, "h w"]:
+    """Return which blocks of `factor` x `factor` pixels are kept altogether; the rest of the picture is cropped."""
+    height, width = (side // factor for side in kept.shape)
+    blocks = kept[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return np.asarray(blocks.all(axis=(1, 3)))
 
 
 def area_downscale(
@@ -87,21 +140,59 @@ def area_downscale(
     return small
 
 
-def _opened(path: Path) -> Image.Image:
-    """Open the file and read its header."""
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open the file, read its header, and refuse what has no one plain reading."""
     try:
-        return Image.open(path, formats=FORMATS)
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        with _filters, warnings.catch_warnings():
+            # PIL warns at 89 million pixels and fails at twice that; one limit is easier to explain than two.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(path, formats=FORMATS)
+    except Image.DecompressionBombError as error:
         raise InputError(
-            f"{path} has more than {Image.MAX_IMAGE_PIXELS} pixels; more is not safe to decode. Shrink it first."
+            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels; more is not safe to decode. "
+            "Shrink it first."
         ) from error
     except (UnidentifiedImageError, *DECODER_ERRORS) as error:
+        raise InputError(_unreadable(path, error)) from error
+    with image:
+        _check_plain(image, path)
+        yield image
+
+
+def _check_plain(image: Image.Image, path: Path) -> None:
+    """Refuse several pictures in one file, and pixel modes that are no 8-bit colour."""
+    frames = _num_frames(image, path)
+    if frames > 1:
+        raise InputError(
+            f"{path} holds {frames} pictures (an animation, or pages), and which of them was meant is not known. "
+            "Save each as a file of its own, for example with ffmpeg or `magick`, and name the one that belongs here."
+        )
+    if image.mode == "CMYK":
+        raise InputError(
+            f"{path} has CMYK colours, which are for printing, and no one reading as RGB. Convert it with its colour "
+            f"profile, for example `magick {path.name} -colorspace sRGB {path.stem}.png`."
+        )
+    if image.mode not in MODES + GREY_16:
+        raise InputError(
+            f"{path} has the pixel mode {image.mode!r}, which has no plain reading as 8-bit colour. "
+            "Save it as an 8-bit RGB or RGBA PNG."
+        )
+
+
+def _num_frames(image: Image.Image, path: Path) -> int:
+    """Return how many pictures the file shows; what a JPEG carries beside its own (previews, depth) is none."""
+    if image.format in ("JPEG", "MPO"):
+        return 1
+    try:
+        return getattr(image, "n_frames", 1)
+    except DECODER_ERRORS as error:
         raise InputError(_unreadable(path, error)) from error
 
 
 def _unreadable(path: Path, error: Exception) -> str:
     """Say what is wrong with the file itself."""
-    cure = "Copy or render it again; PNG, JPEG and TIFF are read."
+    cure = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
     if path.is_file() and path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). {cure}"
     if isinstance(error, UnidentifiedImageError):

@@ -1,12 +1,16 @@
 """Fill the pixel store from picture files: one array for all of them, decoded straight into place."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+from jaxtyping import Int
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+from torch import Tensor
 
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
@@ -16,17 +20,37 @@ from nerf_lightning.types import PixelStore
 MAX_THREADS = 4
 NOTICEABLE = 50
 
+Result = TypeVar("Result")
 
-def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
-    """Return a store with room for pictures of these sizes (width, height), its pixels not yet written."""
+
+def layout(
+    sizes: Sequence[tuple[int, int]],
+) -> tuple[Int[Tensor, "views"], Int[Tensor, "views"], Int[Tensor, "views"]]:
+    """Return offset, width and height of pictures that lie one after the other; sizes are (width, height)."""
     width, height = torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2).unbind(dim=1)
     area = width * height
-    return PixelStore(
-        rgba=torch.empty((int(area.sum()), 4), dtype=torch.uint8),
-        offset=area.cumsum(dim=0) - area,
-        width=width,
-        height=height,
-    )
+    return area.cumsum(dim=0) - area, width, height
+
+
+def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
+    """Return a store with room for opaque pictures of these sizes (width, height), its pixels not yet written."""
+    num_pixels = sum(width * height for width, height in sizes)
+    return PixelStore(torch.empty((num_pixels, 4), dtype=torch.uint8), *layout(sizes), has_transparency=False)
+
+
+def in_threads(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
+    """Return work(0), work(1), ... up to `count`, done by a few threads under a progress bar.
+
+    Args:
+        work: takes the number of a picture.
+        count: how many there are.
+        label: what is done, for the bar.
+        shown: whether there is a bar at all.
+    """
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    threads = min(MAX_THREADS, os.cpu_count() or 1)
+    with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
+        return list(bar.track(pool.map(work, range(count)), total=count, description=label))
 
 
 def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:
@@ -43,12 +67,10 @@ def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downsca
     """
     store = empty_store([(width // downscale, height // downscale) for width, height in sizes])
 
-    def decode(index: int) -> None:
-        store.view(index).numpy()[...] = area_downscale(read_rgba(paths[index]), downscale)
+    def decode(index: int) -> bool:
+        picture = area_downscale(read_rgba(paths[index]), downscale)
+        store.view(index).numpy()[...] = picture
+        return bool((picture[..., 3] < 255).any())
 
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    threads = min(MAX_THREADS, os.cpu_count() or 1)
-    with progress_bar(*columns, shown=len(paths) > NOTICEABLE) as bar, ThreadPoolExecutor(threads) as pool:
-        for _ in bar.track(pool.map(decode, range(len(paths))), total=len(paths), description=label):
-            pass
-    return store
+    transparent = in_threads(decode, len(paths), label, shown=len(paths) > NOTICEABLE)
+    return replace(store, has_transparency=any(transparent))
