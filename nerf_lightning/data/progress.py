@@ -1,10 +1,39 @@
 """Progress bars on stderr, for work that a person would otherwise wait for in the dark."""
 
+from collections.abc import Mapping
+
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn
 
 
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
     """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
     console = Console(stderr=True)
     return Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal))
+
+
+class StageProgress:
+    """One bar over stages of unequal cost, with the time left; one stage at a time goes from 0 to 1.
+
+    Args:
+        costs: each stage's expected cost in any one unit, in the order of the stages.
+    """
+
+    def __init__(self, costs: Mapping[str, float]):
+        self.costs = dict(costs)
+        columns = ("{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        self.bar = progress_bar(*columns)
+        self.task = self.bar.add_task(next(iter(costs)), total=sum(costs.values()))
+
+    def __enter__(self) -> "StageProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.stop()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Say that `stage` is done to this fraction, and all before it wholly."""
+        names = list(self.costs)
+        before = sum(self.costs[name] for name in names[: names.index(stage)])
+        self.bar.update(self.task, description=stage, completed=before + min(fraction, 1.0) * self.costs[stage])

@@ -1,0 +1,196 @@
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from alignment import colmap_poses, pose_errors
+from corner import write_corner
+from data.captures import real_capture
+from PIL import Image
+
+pytest.importorskip("pycolmap")
+# imageio's reader of videos forgets its pipes.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+
+MODEL_FILES = {"cameras.bin", "images.bin", "points3D.bin"}
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """Three pictures without anything in common."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for number in range(3):
+        pixels = np.random.default_rng(number).integers(0, 255, (80, 96, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture
+def poses(nerf, tmp_path):
+    """Call `nerf poses` into tmp_path/found."""
+    return lambda *arguments: nerf("poses", f"paths.output_dir={tmp_path / 'found'}", "num_threads=1", *arguments)
+
+
+def refused(result, tmp_path, *fragments):
+    assert result.code == 2
+    assert len(result.err.strip().splitlines()) == 1
+    for fragment in fragments:
+        assert fragment in result.err
+    assert not (tmp_path / "found").exists()
+
+
+def test_help_has_examples_and_every_setting_a_comment(nerf):
+    result = nerf("poses", "--help")
+    assert "nerf poses images=DIR|video=FILE" in result.out
+    assert "camera_model: OPENCV" in result.out
+    assert "\n  poses " in nerf("--help").out
+
+
+def test_pycolmap_absent_is_said_with_the_cure(poses, photographs, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    result = poses(f"images={photographs}")
+    refused(result, tmp_path, "pycolmap", "pip install 'nerf-lightning[colmap]'")
+
+
+@pytest.mark.parametrize(
+    ("settings", "fragment"),
+    [
+        ([], "either images=DIR (a folder of photographs) or video=FILE"),
+        (["images=a", "video=b"], "one of the two"),
+        (["images=a", "matching=all"], "matching=all does not fit: it must be exhaustive, sequential, auto"),
+        (["images=a", "camera_model=FULL"], "camera_model=FULL does not fit: it must be SIMPLE_PINHOLE"),
+        (["images=a", "num_features=many"], "num_features=many does not fit: it must be a whole number"),
+        (["images=a", "num_features=0"], "num_features=0: give 1 or more"),
+        (["images=a", "num_threads=0"], "num_threads=0: give 1 or more"),
+        (["video=a", "every=0"], "every=0: give 1 or more"),
+        (["video=a", "every=2.5"], "every=2.5 does not fit"),
+        (["images=nowhere"], "images=nowhere is not a folder that can be read (No such file or directory)"),
+        (["video=nowhere.mp4"], "video=nowhere.mp4: there is no such file"),
+    ],
+)
+def test_bad_settings_are_named(poses, tmp_path, settings, fragment):
+    refused(poses(*settings), tmp_path, fragment)
+
+
+def test_folders_without_enough_photographs_are_named(poses, tmp_path):
+    folder = tmp_path / "given"
+    folder.mkdir()
+    refused(poses(f"images={folder}"), tmp_path, f"images={folder} holds no PNG, JPEG or TIFF, nothing.")
+    (folder / "photos").mkdir()
+    (folder / "a.HEIC").touch()
+    refused(poses(f"images={folder}"), tmp_path, "only other files (.HEIC)", "own (photos)", "Convert HEIC")
+    Image.new("RGB", (80, 80)).save(folder / "a.png")
+    refused(poses(f"images={folder}"), tmp_path, "holds only a.png. At least 3 photographs")
+
+
+def test_pictures_that_cannot_be_used_are_named(poses, photographs, tmp_path):
+    odd = photographs / "odd.png"
+    Image.new("RGB", (80, 20)).save(odd)
+    refused(poses(f"images={photographs}"), tmp_path, "odd.png is 80 x 20 pixels: too small")
+    odd.write_bytes((photographs / "0.png").read_bytes()[:3000])
+    refused(poses(f"images={photographs}"), tmp_path, "odd.png cannot be read", "cut short")
+    odd.unlink()
+    odd.symlink_to(odd)
+    refused(poses(f"images={photographs}"), tmp_path, "odd.png cannot be read", "Too many levels of symbolic links")
+
+
+def test_photographs_of_several_sizes_are_no_single_camera(poses, photographs, tmp_path):
+    Image.new("RGB", (80, 80)).save(photographs / "odd.png")
+    refused(poses(f"images={photographs}", "camera_mode=single"), tmp_path, "3 of 96 x 80, 1 of 80 x 80")
+
+
+def test_photographs_without_anything_in_common_say_what_to_take(poses, photographs, tmp_path):
+    result = poses(f"images={photographs}")
+    refused(result, tmp_path, "No camera could be placed: the 3 pictures", "overlap by two thirds")
+
+
+def test_poses_and_pictures_that_exist_are_not_overwritten(poses, photographs, tmp_path):
+    (tmp_path / "found" / "images").mkdir(parents=True)
+    result = poses(f"images={photographs}")
+    assert result.code == 2
+    assert "exists already, and is not what images= names" in result.err
+    (tmp_path / "found" / "sparse" / "0").mkdir(parents=True)
+    result = poses(f"images={photographs}")
+    assert result.code == 2
+    assert "has camera poses already (sparse/0). Remove them" in result.err
+
+
+@pytest.mark.slow
+def test_the_cameras_of_a_known_scene_are_found(poses, tmp_path):
+    true = write_corner(tmp_path / "found" / "images", count=6)
+    (tmp_path / "found" / ".poses.part" / "models").mkdir(parents=True)  # as a killed process leaves it
+    result = poses(f"images={tmp_path / 'found' / 'images'}", "camera_model=SIMPLE_PINHOLE", "num_features=600")
+    assert result.code == 0, result.err
+    assert result.err == ""
+    assert "registered          6 of 6 photographs (one camera, exhaustive matching)" in result.out
+    assert f"nerf train scene=colmap scene.root={tmp_path / 'found'}" in result.out
+    assert {path.name for path in (tmp_path / "found").iterdir()} == {"images", "sparse"}
+    found = colmap_poses(tmp_path / "found" / "sparse" / "0")
+    assert sorted(found) == [f"view {number}.png" for number in range(6)]
+    centres, degrees = pose_errors(np.stack([found[name] for name in sorted(found)]), true)
+    assert centres.max() < 0.01 * 3.4
+    assert degrees.max() < 0.5
+
+
+@pytest.mark.slow
+def test_photographs_left_out_are_named(poses, tmp_path):
+    """Four views of the corner, two of them cut narrower, and three pictures of nothing."""
+    folder = tmp_path / "given"
+    write_corner(folder, count=4)
+    for number in (1, 2):
+        Image.open(folder / f"view {number}.png").crop((10, 0, 310, 240)).save(folder / f"view {number}.png")
+    for number in range(3):
+        Image.new("RGB", (200, 150), (60 * number, 90, 120)).save(folder / f"wall {number}.png")
+    result = poses(f"images={folder}", "num_features=600", "matching=sequential")
+    assert result.code == 0, result.err
+    assert "registered          4 of 7 photographs (2 cameras, sequential matching)" in result.out
+    assert "left out            wall 0.png, wall 1.png, wall 2.png" in result.out
+    assert "few were registered" in result.out
+    assert "matching=exhaustive compares" in result.out
+    assert {path.name for path in (tmp_path / "found" / "sparse" / "0").iterdir()} >= MODEL_FILES
+    assert len(list((tmp_path / "found" / "images").iterdir())) == 7
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_real_photographs_are_all_registered(poses, tmp_path):
+    folder = tmp_path / "small"
+    folder.mkdir()
+    for path in sorted((real_capture("sceaux_photos") / "images").glob("*.jpg")):
+        Image.open(path).reduce(3).save(folder / path.name, quality=95)
+    result = poses(f"images={folder}", "num_features=700")
+    assert result.code == 0, result.err
+    assert "registered          11 of 11 photographs" in result.out
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_found_cameras_agree_with_those_that_came_with_a_capture(poses, tmp_path):
+    capture, folder = real_capture("fox"), tmp_path / "small"
+    folder.mkdir()
+    for path in sorted((capture / "images").glob("*.jpg")):
+        Image.open(path).reduce(2).save(folder / path.name, quality=95)
+    result = poses(f"images={folder}", "num_features=1000")
+    assert result.code == 0, result.err
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    true = {Path(frame["file_path"]).name: np.array(frame["transform_matrix"])[:3] for frame in frames}
+    found = colmap_poses(tmp_path / "found" / "sparse" / "0")
+    assert len(found) >= 48
+    centres, degrees = pose_errors(np.stack(list(found.values())), np.stack([true[name] for name in found]))
+    assert centres.max() < 0.005 * 5.15  # mean distance of the cameras from what they look at
+    # Their principal point lies 7 pixels beside the middle, and COLMAP keeps it there: 0.6 degrees.
+    assert degrees.max() < 1.0
+
+
+@pytest.mark.slow
+def test_a_film_is_read_and_reconstructed(poses, tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    write_corner(tmp_path / "frames", count=12)
+    frames = [np.asarray(Image.open(tmp_path / "frames" / f"view {n}.png").convert("RGB")) for n in range(12)]
+    imageio.imwrite(tmp_path / "film.mp4", np.stack(frames), plugin="FFMPEG", fps=10, quality=9)
+    result = poses(f"video={tmp_path / 'film.mp4'}", "every=2", "num_features=600")
+    assert result.code == 0, result.err
+    assert "registered          6 of 6 frames" in result.out
+    assert len(list((tmp_path / "found" / "images").glob("frame_*.jpg"))) == 6
