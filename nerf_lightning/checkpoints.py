@@ -9,7 +9,7 @@ import pickle
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerf_lightning import __version__
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import Background, Cameras, Scene
+from nerf_lightning.types import Background, Cameras, LensModel, Scene, Space
 
 FORMAT = 1
 KEY = "nerf_lightning"
@@ -36,6 +36,7 @@ class SceneRecord:
     view_names: tuple[str, ...]
     background: Background
     to_user: Float[Tensor, "4 4"]
+    space: Space = "bounded"
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         )
     try:
         scene = dict(record["scene"])
-        scene["cameras"] = Cameras(**scene["cameras"])
+        scene["cameras"] = _cameras(scene["cameras"])
         prefix = "model."
         state = content["state_dict"]
         return Checkpoint(
@@ -103,6 +104,15 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged: its record lacks or garbles {error}. Use another checkpoint.") from error
+
+
+def _cameras(record: dict[str, Any]) -> Cameras:
+    # The first checkpoints knew pinholes only, and name no lens.
+    lens = {"lens": record["focal"].new_zeros(*record["focal"].shape[:-1], 6), "lens_model": "pinhole"}
+    content = lens | record
+    if content["lens_model"] not in get_args(LensModel):
+        raise ValueError(f"lens_model {content['lens_model']!r}")
+    return Cameras(**content)
 
 
 def _load(path: Path) -> dict[str, Any]:

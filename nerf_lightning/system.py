@@ -122,22 +122,26 @@ class RadianceFieldSystem(LightningModule):
         """Send a batch forward and backward, tile by tile.
 
         Returns:
-            `losses` per level, and each ray's `foreground` light and `target` colour, detached.
+            `losses` per level, and each ray's `foreground` light, `target` colour and `weight`, detached.
         """
         num_rays = batch.rays.near.numel()
         key = fold(self.seed, self.progress.attempt, self.progress.step)
         random = batch_random(key, num_rays, self.device)
         background = background_colors(self.background, num_rays, self.device, random)
         target = blend(batch.rgba, background)
+        # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
+        weight = batch.weight * (num_rays / batch.weight.sum().clamp(min=1.0))
         losses, foreground = [], []
         for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
             behind = None if background is None else background[tile]
             renderings = self.model(batch.rays[tile], behind, random[tile])
-            share = torch.stack(self.loss(renderings, target[tile])) * (target[tile].shape[0] / num_rays)
+            loss = self.loss(renderings, target[tile], weight[tile])
+            share = torch.stack(loss) * (target[tile].shape[0] / num_rays)
             backward(share.sum())
             losses.append(share.detach())
             foreground.append(renderings[-1].foreground.detach())
-        return {"losses": torch.stack(losses).sum(0), "foreground": torch.cat(foreground), "target": target}
+        seen = {"foreground": torch.cat(foreground), "target": target, "weight": batch.weight}
+        return {"losses": torch.stack(losses).sum(0)} | seen
 
     def learn_points_per_ray(self) -> None:
         """Take over how many samples the rays rendered so far have had, where a level measures it."""
@@ -158,12 +162,13 @@ class RadianceFieldSystem(LightningModule):
             )
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        """Collect the squared error of fixed rays; backgrounds as at evaluation."""
+        """Collect the squared error of fixed rays that no mask leaves out; backgrounds as at evaluation."""
         background = background_colors(self.background, batch.rays.near.numel(), self.device, None)
         target = blend(batch.rgba, background)
         for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
             rendering = self._render(batch.rays[tile], None if background is None else background[tile])
-            self.squared_errors.append((rendering.rgb - target[tile]).square().mean(dim=-1))
+            error = (rendering.rgb - target[tile]).square().mean(dim=-1)
+            self.squared_errors.append(error[batch.weight[tile] > 0])
 
     def on_validation_epoch_end(self) -> None:
         """Log the PSNR of the fixed rays and its standard error (delta method).

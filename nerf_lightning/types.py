@@ -6,7 +6,7 @@ Units: world axes as the user gave them (or a recorded similarity of them); a ca
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -16,6 +16,13 @@ from torch import Tensor
 Background = Literal["white", "black", "random", "none"]
 """What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
 
+LensModel = Literal["pinhole", "radial_tangential", "fisheye"]
+"""How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`."""
+
+
+Space = Literal["bounded", "ndc", "contracted"]
+"""How much of the world is modelled: a box, all that lies in front of a near plane (normalised device coordinates), or
+everything, contracted around a box."""
 
 # Not typing.Self, which runtime type checkers do not know.
 Struct = TypeVar("Struct", bound="TensorStruct")
@@ -27,12 +34,12 @@ class TensorStruct:
     def map(self: Struct, fn: Callable[[Tensor], Tensor]) -> Struct:
         """Return a copy with `fn` applied to each tensor."""
         changed: dict[str, Any] = {}
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
             if isinstance(value, Tensor):
-                changed[field.name] = fn(value)
+                changed[each.name] = fn(value)
             elif isinstance(value, TensorStruct):
-                changed[field.name] = value.map(fn)
+                changed[each.name] = value.map(fn)
         return replace(self, **changed)  # type: ignore[type-var]
 
     def to(self: Struct, device: torch.device | str, non_blocking: bool = False) -> Struct:
@@ -46,7 +53,7 @@ class TensorStruct:
 
 @dataclass(frozen=True)
 class Cameras(TensorStruct):
-    """Pinhole cameras, one per view."""
+    """Cameras, one per view, through lenses of one kind."""
 
     c2w: Float[Tensor, "*views 3 4"]
     """Camera-to-world; the columns are right, up, back and the camera's centre."""
@@ -54,15 +61,25 @@ class Cameras(TensorStruct):
     """Focal lengths in pixels along x and y."""
     center: Float[Tensor, "*views 2"]
     """Principal point in pixels from the upper left corner of the image (x, y)."""
+    lens: Float[Tensor, "*views 6"]
+    """Distortion coefficients k1, k2, k3, k4, p1, p2 in the sense of OpenCV; zeros for a pinhole, p 0 for a fisheye."""
+    lens_model: LensModel
+    """What the coefficients mean; one for all views of a scene."""
     width: Int[Tensor, "*views"]
     """Image width in pixels."""
     height: Int[Tensor, "*views"]
     """Image height in pixels."""
+    ndc: Float[Tensor, "*views 2"] | None = None
+    """Focal length over half the image's size, where rays run through normalised device coordinates (`geometry.ndc`)
+    and the world's z axis is the captures' back; None: rays run through the world."""
 
 
 @dataclass(frozen=True)
 class PixelStore:
-    """Every pixel of every view in one flat array; views may differ in size. Row by row, row 0 on top."""
+    """Every pixel of every view in one flat array; views may differ in size. Row by row, row 0 on top.
+
+    The arrays may be a file's, mapped into memory and larger than it: index them, never go over the whole.
+    """
 
     rgba: UInt8[Tensor, "pixels 4"]
     """Straight (not premultiplied) alpha; 255 where the format has none."""
@@ -70,16 +87,22 @@ class PixelStore:
     """Index of each view's first pixel."""
     width: Int[Tensor, "views"]
     height: Int[Tensor, "views"]
-
-    @property
-    def has_transparency(self) -> bool:
-        """Whether the alpha of any pixel says more than that something is there."""
-        return bool((self.rgba[:, 3] < 255).any())
+    has_transparency: bool
+    """Whether the alpha of any pixel says more than that something is there."""
+    mask: UInt8[Tensor, "pixels"] | None = None
+    """1 where a pixel is trained on and scored, 0 where it is left out; None keeps all."""
 
     def view(self, index: int) -> UInt8[Tensor, "height width 4"]:
         """Return one view as a picture (no copy)."""
+        return self._picture(self.rgba, index)
+
+    def kept(self, index: int) -> Bool[Tensor, "height width"] | None:
+        """Tell which pixels of one view the mask keeps; None where there is no mask."""
+        return None if self.mask is None else self._picture(self.mask, index) > 0
+
+    def _picture(self, flat: Tensor, index: int) -> Tensor:
         start, width, height = (int(x[index]) for x in (self.offset, self.width, self.height))
-        return self.rgba[start : start + width * height].view(height, width, 4)
+        return flat[start : start + width * height].view(height, width, *flat.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -115,6 +138,9 @@ class Scene:
     """How the pixels were made (downscale filter and the like), stamped on every number measured on them."""
     truth: Truth | None
     """Exact depth and normals, for scenes that know them."""
+    space: Space = "bounded"
+    points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
+    """Sparse points of a reconstruction, in scene units; there may be none."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +153,9 @@ class RayBundle(TensorStruct):
     near: Float[Tensor, "*rays"]
     far: Float[Tensor, "*rays"]
     camera_index: Int[Tensor, "*rays"]
+    view_directions: Float[Tensor, "*rays 3"]
+    """Where the camera looks in the world, unit length: what colour depends on. Differs from `directions` in
+    normalised device coordinates."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +164,8 @@ class RaySamples(TensorStruct):
 
     edges: Float[Tensor, "*rays edges"]
     """Increasing distances; one more than there are samples."""
+    endless: bool = False
+    """Whether even steps are those of `geometry.spacing`, for space without bounds, and not of the distance."""
 
     @property
     def starts(self) -> Float[Tensor, "*rays samples"]:
@@ -240,6 +271,8 @@ class Batch(TensorStruct):
     rays: RayBundle
     rgba: Float[Tensor, "*rays 4"]
     """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
+    weight: Float[Tensor, "*rays"]
+    """How much each pixel counts: 0 where it is masked, else 1."""
 
 
 @dataclass(frozen=True)

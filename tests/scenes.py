@@ -1,5 +1,7 @@
 """Scenes and models small enough to be trained in a test."""
 
+from dataclasses import replace
+
 import torch
 
 from nerf_lightning.encoders.frequency import FrequencyEncoder
@@ -14,12 +16,15 @@ from nerf_lightning.types import PixelStore, RayBundle, Scene
 BALL_RADIUS = 0.8
 
 
-def ball_scene(num_views: int = 6, size: int = 12, background: str = "white") -> Scene:
+def ball_scene(
+    num_views: int = 6, size: int = 12, background: str = "white", lens=(0.0,) * 6, lens_model="pinhole"
+) -> Scene:
     """A ball whose colour is its normal, seen from a circle; half the views train, the rest validate and test."""
     angle = torch.linspace(0, 2 * torch.pi, num_views + 1)[:-1]
     eyes = 4.0 * torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.4)], dim=-1)
     c2w = look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.0, 0.0, 1.0]))
     cameras = pinhole_cameras(c2w, 1.6 * size, size, size)
+    cameras = replace(cameras, lens=torch.tensor([lens] * num_views), lens_model=lens_model)
     near, far = torch.full((num_views,), 2.0), torch.full((num_views,), 6.5)
     pictures = []
     for view in range(num_views):
@@ -37,7 +42,7 @@ def ball_scene(num_views: int = 6, size: int = 12, background: str = "white") ->
     return Scene(
         name="ball",
         cameras=cameras,
-        pixels=PixelStore(rgba=rgba, offset=torch.arange(num_views) * size * size, width=sizes, height=sizes),
+        pixels=PixelStore(rgba, torch.arange(num_views) * size * size, sizes, sizes, has_transparency=True),
         near=near,
         far=far,
         aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]),
@@ -78,4 +83,5 @@ def some_rays(count: int, generator: torch.Generator | None = None) -> RayBundle
         near=torch.full((count,), 2.0),
         far=torch.full((count,), 6.0),
         camera_index=torch.zeros(count, dtype=torch.long),
+        view_directions=directions,
     )

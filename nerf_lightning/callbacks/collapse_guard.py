@@ -85,7 +85,13 @@ class CollapseGuard(Callback):
 
 
 def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:
-    """Tell whether the light that the field itself sends is the same for all rays, unlike the photographs."""
-    target_spread = last_step["target"].std(dim=0).amax()
-    render_spread = last_step["foreground"].std(dim=0).amax()
+    """Tell whether the light that the field itself sends is the same for all rays, unlike the photographs.
+
+    Rays of masked pixels do not count: nothing has told the field what lies there.
+    """
+    kept = last_step["weight"] > 0
+    if int(kept.sum()) < 2:
+        return False
+    target_spread = last_step["target"][kept].std(dim=0).amax()
+    render_spread = last_step["foreground"][kept].std(dim=0).amax()
     return bool((target_spread > 1e-3) & (render_spread < ratio * target_spread))

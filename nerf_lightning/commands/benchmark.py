@@ -236,7 +236,7 @@ def _multiplication(settings: TrainerSettings) -> Callable[[], None]:
 def _flops_per_ray(bench: Bench) -> float:
     # Where rays differ in their samples, many make the mean.
     few = 8 if bench.system.model.points_per_ray(training=True) > 64 else min(1024, bench.batch.rays.near.numel())
-    rays = Batch(bench.batch.rays[:few], bench.batch.rgba[:few])
+    rays = bench.batch[:few]
     with FlopCounterMode(display=False) as counter, without("mlp_tiles"):  # it counts one thread's
         bench.system.accumulate_gradients(rays, lambda loss: loss.backward())
     return counter.get_total_flops() / few

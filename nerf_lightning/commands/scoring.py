@@ -14,7 +14,7 @@ from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.geometry import depth_error, normal_error, normals_from_depth, surface_depth
 from nerf_lightning.evaluation.lpips import LPIPS_HINT, load_lpips
-from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
+from nerf_lightning.evaluation.metrics import image_metrics, masked_out, mean_over_images
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.pictures import mosaic, save_png
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
@@ -98,8 +98,10 @@ class Scoring:
         return [views[i * len(views) // count] for i in range(count)]
 
     def _measure(self, picture: Picture, truth: Tensor, scene: Scene, view: int) -> dict[str, float | None]:
-        values: dict[str, float | None] = dict(image_metrics(picture.rgb, truth))
-        values["lpips"] = None if self.lpips is None else self.lpips.score(picture.rgb, truth)
+        kept = scene.pixels.kept(view)
+        values: dict[str, float | None] = dict(image_metrics(picture.rgb, truth, kept))
+        compared = masked_out(picture.rgb, truth, kept)
+        values["lpips"] = None if self.lpips is None else self.lpips.score(compared, truth)
         return values | _geometry_errors(picture, scene, view)
 
     def _protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
@@ -113,16 +115,20 @@ class Scoring:
             "pixels": "8-bit" if self.quantize else "float",
             "psnr": "mean of the pictures' own",
             "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
+            **({} if scene.pixels.mask is None else {"masks": "left out"}),
             **scene.protocol,
         }
 
 
 def split_hash(scene: Scene, views: list[int]) -> str:
-    """Return a fingerprint of names and pixels, so that numbers on different pictures are not compared."""
+    """Return a fingerprint of names, pixels and masks, so that numbers on different pictures are not compared."""
     digest = hashlib.sha256()
     for view in views:
         digest.update(scene.view_names[view].encode())
         digest.update(scene.pixels.view(view).contiguous().numpy().tobytes())
+        kept = scene.pixels.kept(view)
+        if kept is not None:
+            digest.update(kept.numpy().tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -143,6 +149,9 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
     start = int(scene.pixels.offset[view])
     part = slice(start, start + picture.depth.numel())
     alpha = (scene.pixels.rgba[part, 3].float() / 255.0).view(shape)
+    kept = scene.pixels.kept(view)
+    if kept is not None:
+        alpha = alpha * kept  # only what is wholly covered is scored
     true_depth, true_normals = scene.truth.depth[part].view(shape), scene.truth.normals[part].view(*shape, 3)
     far = scene.far[view].expand(shape)
     rays = rays_through_pixels(scene.cameras, all_pixels(scene.cameras, view), scene.near, scene.far)

@@ -46,6 +46,6 @@ def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch:
 
 def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
     system.tile_points = tile
-    some = Batch(batch.rays[:num_rays], batch.rgba[:num_rays])
+    some = batch[:num_rays]
     with settings.autocast():
         return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))

@@ -1,6 +1,5 @@
 """The `transforms_<split>.json` files of the Blender format: parsed and checked, no pixel read."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,10 +7,13 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.checks import check_present, listed, pose_from_matrix
+from nerf_lightning.data.checks import check_present, pose_from_matrix
+from nerf_lightning.data.images import ENDINGS
+from nerf_lightning.data.json_files import keys_of, read_json
 from nerf_lightning.errors import InputError
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+FORMAT = "The Blender format"
+KEYS, FRAME_KEYS = ("camera_angle_x", "frames"), ("file_path", "transform_matrix")
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,8 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
     Raises:
         InputError: not json, lacks keys, has a matrix that is no pose, or names images that do not exist.
     """
-    content = _parsed(path)
-    fov, entries = _keys(content, ("camera_angle_x", "frames"), str(path))
+    content = read_json(path)
+    fov, entries = keys_of(content, KEYS, str(path), FORMAT)
     if not isinstance(fov, int | float) or not 0.0 < fov < math.pi:
         raise InputError(
             f"{path}: camera_angle_x is {fov!r}, but it must be an angle between 0 and pi radians "
@@ -46,39 +48,10 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
     return frames
 
 
-def _parsed(path: Path) -> object:
-    """Return the json's content."""
-    cure = "Export it again, or mend it with a json checker."
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {cure}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
-
-
-def _keys(content: object, keys: tuple[str, ...], where: str) -> list[object]:
-    """Return the values of the keys, all of which must be there."""
-    if not isinstance(content, dict):
-        raise InputError(
-            f"{where} must be a json object with the keys {listed(keys)}, but it is {type(content).__name__}."
-        )
-    missing = [key for key in keys if key not in content]
-    if missing:
-        raise InputError(
-            f"{where} lacks {listed(missing)}; it has {listed(content) or 'nothing'}. "
-            f"The Blender format needs {listed(keys)}."
-        )
-    return [content[key] for key in keys]
-
-
 def _frame(path: Path, index: int, entry: object, fov: float) -> Frame:
     """Return one checked frame."""
     where = f"{path}: frames[{index}]"
-    name, matrix = _keys(entry, ("file_path", "transform_matrix"), where)
+    name, matrix = keys_of(entry, FRAME_KEYS, where, FORMAT)
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: file_path is {name!r}, but it must be the image's path as text.")
     # Only known endings count: the original files leave ".png" out, and a name may hold a dot of its own.

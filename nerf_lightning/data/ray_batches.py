@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.randomness import fold, permute
 from nerf_lightning.types import Batch, PixelIndex, Scene
@@ -85,11 +86,13 @@ class PixelDomain:
 
 
 def gather(scene: Scene, pixels: PixelIndex) -> Batch:
-    """Return rays and colours of pixels."""
+    """Return rays, colours and weights of pixels."""
     flat = scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
+    mask = scene.pixels.mask
     return Batch(
         rays=rays_through_pixels(scene.cameras, pixels, scene.near, scene.far),
         rgba=scene.pixels.rgba[flat].to(torch.float32) / 255.0,
+        weight=torch.ones(flat.shape) if mask is None else mask[flat].to(torch.float32),
     )
 
 
@@ -167,6 +170,9 @@ class FixedRays:
         split: which views.
         num_rays: size of the subset; all of the split's rays where it has fewer.
         chunk: rays per batch.
+
+    Raises:
+        InputError: the mask leaves out the whole subset.
     """
 
     def __init__(self, scene: Scene, split: str, num_rays: int, chunk: int):
@@ -175,6 +181,11 @@ class FixedRays:
         count = min(num_rays, len(domain))
         numbers = permute(torch.arange(count), len(domain), torch.full((count,), fold("validation")))
         self.chunks = [domain.locate(part) for part in numbers.split(chunk)]
+        if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
+            raise InputError(
+                f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "
+                "Raise data.val_rays, or check the masks of the validation views (white is kept)."
+            )
 
     def __len__(self) -> int:
         return len(self.chunks)

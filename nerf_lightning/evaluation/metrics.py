@@ -6,7 +6,7 @@ Papers average the PSNR of each image. Pooling the squared error over images fir
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -23,22 +23,40 @@ def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
     return -10.0 * torch.log10(mse)
 
 
+def masked_out(
+    render: Float[Tensor, "height width 3"],
+    truth: Float[Tensor, "height width 3"],
+    kept: Bool[Tensor, "height width"] | None,
+) -> Float[Tensor, "height width 3"]:
+    """Return the render with the truth's colours where a pixel is not kept, so that no difference is found there."""
+    return render if kept is None else torch.where(kept[..., None], render, truth)
+
+
 def image_metrics(
-    render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+    render: Float[Tensor, "height width 3"],
+    truth: Float[Tensor, "height width 3"],
+    kept: Bool[Tensor, "height width"] | None = None,
 ) -> dict[str, float | None]:
     """Return `psnr` (dB) and `ssim` of one image; the render is clamped to [0, 1] first.
 
     SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
     is None where the image is smaller than the window: with another window it would be another metric.
+
+    Args:
+        render: the picture to judge.
+        truth: the photograph.
+        kept: pixels that count, at least one; None: all. PSNR is that of these pixels. For SSIM, which looks at
+            neighbours, the others take the photograph's colours.
     """
-    render = render.clamp(0, 1)
+    render = masked_out(render.clamp(0, 1), truth, kept)
     ssim = None
     if min(render.shape[:2]) >= SSIM_WINDOW:
         ours, true = (picture.movedim(-1, 0)[None] for picture in (render, truth))
         similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
         assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
         ssim = float(similarity)
-    return {"psnr": float(psnr((render - truth).square().mean())), "ssim": ssim}
+    error = (render - truth).square()
+    return {"psnr": float(psnr((error if kept is None else error[kept]).mean())), "ssim": ssim}
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

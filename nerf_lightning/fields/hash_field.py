@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
-from nerf_lightning.geometry.boxes import center_and_half, contract, to_unit_cube
+from nerf_lightning.geometry.boxes import center_and_half, contract, in_unit_ball, to_unit_cube
+from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types import FieldOutput, Scene
@@ -32,7 +33,7 @@ class HashField(Field):
         density_bias: added to the raw density, before the exponential. None: thick (3) where the photographs have
             alpha, which tells at once where nothing is, and thin (-1) where they have none: there a dense start would
             remain as fog of the background's colour.
-        contraction: map all space, contracted around the box, instead of the box alone; for unbounded captures.
+        contraction: map all space, contracted around the box, instead of the box alone; None: as the scene's space.
     """
 
     aabb: Tensor
@@ -45,14 +46,14 @@ class HashField(Field):
         width: int = 64,
         feature_dim: int = 16,
         density_bias: float | None = None,
-        contraction: bool = False,
+        contraction: bool | None = None,
     ):
         super().__init__()
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
         self.density_bias = density_bias
-        self.contraction = contraction
+        self.contracted = Contracted(contraction)
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.density_mlp = _weights(position_encoder.out_dim, width, feature_dim)
@@ -62,6 +63,7 @@ class HashField(Field):
     def place(self, scene: Scene) -> None:
         """Take note of the box that holds the scene's content, and whether the photographs have alpha."""
         self.aabb.copy_(scene.aabb)
+        self.contracted.place(scene)
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
 
@@ -110,15 +112,14 @@ class HashField(Field):
         return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
 
     def _unit(self, positions: Tensor) -> Tensor:
-        unit = to_unit_cube(positions, self.aabb)
-        if self.contraction:
-            # The box becomes the cube that the unit ball just holds; the ball of radius 2 fills the unit cube.
-            unit = contract((2.0 * unit - 1.0) / 3**0.5) / 4.0 + 0.5
-        return unit
+        if self.contracted:
+            # The ball of radius 2 fills the unit cube.
+            return contract(in_unit_ball(positions, self.aabb)) / 4.0 + 0.5
+        return to_unit_cube(positions, self.aabb)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
-        if self.contraction:
+        if self.contracted:
             return density
         center, half = center_and_half(self.aabb)
         return torch.where(((positions - center).abs() <= half).all(dim=-1), density, 0.0)

@@ -1,6 +1,6 @@
 """The MLP of the original NeRF (Fig. 7, arXiv 2003.08934)."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -9,8 +9,10 @@ from torch.nn import functional
 
 from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
+from nerf_lightning.geometry.boxes import contract, in_unit_ball
+from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types import FieldOutput, Scene
 
 # Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
 MOMENTUM, EPSILON = 0.01, 1e-3
@@ -31,7 +33,11 @@ class NerfMLP(Field):
         density_noise: standard deviation of the normal noise added to the raw density while training.
         batch_norm: normalise each hidden layer over the batch, as the article does; forbids tiles.
         xavier: Glorot uniform weights and zero biases, as Keras has them; False for torch's own start.
+        contraction: see all space contracted around the scene's box into a ball of radius 2; None: as the scene's
+            space. Otherwise positions enter as they are, as in the paper.
     """
+
+    aabb: Tensor
 
     def __init__(
         self,
@@ -45,6 +51,7 @@ class NerfMLP(Field):
         density_noise: float = 0.0,
         batch_norm: bool = False,
         xavier: bool = True,
+        contraction: bool | None = None,
     ):
         super().__init__()
         if skip is not None and not 0 < skip < depth:
@@ -60,6 +67,8 @@ class NerfMLP(Field):
         self.density_noise = density_noise
         self.needs_whole_batch = batch_norm
         self.xavier = xavier
+        self.contracted = Contracted(contraction)
+        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         inputs = position_encoder.out_dim
         sizes = [inputs] + [width] * (depth - 1)
         if skip is not None:
@@ -75,6 +84,11 @@ class NerfMLP(Field):
     def needs_random(self) -> bool:  # type: ignore[override]
         """Where noise is added to the density."""
         return self.density_noise > 0
+
+    def place(self, scene: Scene) -> None:
+        """Take note of the scene's space and box."""
+        self.contracted.place(scene)
+        self.aabb.copy_(scene.aabb)
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
@@ -112,7 +126,14 @@ class NerfMLP(Field):
                     nn.init.xavier_uniform_(module.weight)
                     nn.init.zeros_(module.bias)
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        # Checkpoints from before the box was known to this field never ask for it.
+        state_dict.setdefault(f"{prefix}aabb", self.aabb)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
     def _trunk(self, positions: Tensor) -> Tensor:
+        if self.contracted:
+            positions = contract(in_unit_ball(positions, self.aabb))
         encoded = self.position_encoder(positions)
         hidden = encoded
         for index, layer in enumerate(self.trunk):

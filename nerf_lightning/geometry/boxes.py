@@ -25,6 +25,15 @@ def center_and_half(aabb: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "3"], Flo
     return aabb.mean(dim=0), 0.5 * (aabb[1] - aabb[0])
 
 
+def in_unit_ball(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3"]) -> Float[Tensor, "*points 3"]:
+    """Map a box onto the cube that the unit ball just holds: its corners come to lie on the ball.
+
+    >>> in_unit_ball(torch.tensor([3.0, 3.0, 3.0]), torch.tensor([[1.0, 1, 1], [3, 3, 3]])).norm().round(decimals=6)
+    tensor(1.)
+    """
+    return (2.0 * to_unit_cube(positions, aabb) - 1.0) / 3**0.5
+
+
 def contract(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Bring all space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
 

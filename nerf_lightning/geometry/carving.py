@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.geometry.cameras import camera_coordinates
-from nerf_lightning.types import Cameras, Scene
+from nerf_lightning.geometry.footprints import footprint
+from nerf_lightning.types import Scene
 
 
 def possible_cells(
@@ -30,7 +30,7 @@ def possible_cells(
         unseen = (~seen).nonzero()[:, 0]
         if not unseen.numel():
             break
-        x, y, radius = _footprint(scene.cameras, view, centers[unseen], half_diagonal)
+        x, y, radius = footprint(scene.cameras, view, centers[unseen], half_diagonal)
         width, height = int(scene.cameras.width[view]), int(scene.cameras.height[view])
         seen[unseen] = (x > -radius) & (x < width + radius) & (y > -radius) & (y < height + radius) & (radius > 0)
     left = seen.nonzero()[:, 0]
@@ -44,28 +44,17 @@ def possible_cells(
 
 
 def _looked_through(scene: Scene, view: int, centers: Tensor, half_diagonal: float) -> Tensor:
-    x, y, radius = _footprint(scene.cameras, view, centers, half_diagonal)
+    x, y, radius = footprint(scene.cameras, view, centers, half_diagonal)
     width, height = int(scene.cameras.width[view]), int(scene.cameras.height[view])
     whole = (x - radius >= 0) & (x + radius <= width) & (y - radius >= 0) & (y + radius <= height) & (radius > 0)
-    alpha = (scene.pixels.view(view)[..., 3] > 0).float()
+    matter = scene.pixels.view(view)[..., 3] > 0
+    kept = scene.pixels.kept(view)
+    if kept is not None:
+        matter = matter | ~kept  # what is masked may be anything
     # One window for all cells of a view: the largest footprint in pixels, and half a pixel for the rounding.
     reach = int(torch.ceil(radius[whole].max() + 0.5)) if bool(whole.any()) else 0
     if reach == 0 or 2 * reach + 1 > min(width, height):
         return torch.zeros_like(whole)
-    covered = functional.max_pool2d(alpha[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
+    covered = functional.max_pool2d(matter.float()[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
     column, row = x.long().clamp(0, width - 1), y.long().clamp(0, height - 1)
     return whole & (covered[row, column] == 0)
-
-
-def _footprint(cameras: Cameras, view: int, centers: Tensor, half_diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
-    # Where a cell's sphere appears: centre and radius in pixels; radius 0 where it reaches behind the camera.
-    local = camera_coordinates(cameras, view, centers)
-    depth = -local[..., 2]
-    in_front = depth > 2.0 * half_diagonal
-    safe = torch.where(in_front, depth, 1.0)
-    x = cameras.focal[view, 0] * local[..., 0] / safe + cameras.center[view, 0]
-    y = -cameras.focal[view, 1] * local[..., 1] / safe + cameras.center[view, 1]
-    # A sphere off the axis appears longer: by no more than its ray's length over its depth, squared.
-    stretch = (local.square().sum(dim=-1) / safe.square()).clamp(max=9.0)
-    radius = cameras.focal[view].max() * half_diagonal / (safe - half_diagonal).clamp(min=half_diagonal) * stretch
-    return x, y, torch.where(in_front, radius, 0.0)

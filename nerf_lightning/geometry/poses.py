@@ -14,6 +14,21 @@ def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[
     return finite & (off < tolerance) & (torch.linalg.det(torch.nan_to_num(rotation)) > 0)
 
 
+def rotation_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3 3"]:
+    """Return the rotation of a quaternion w, x, y, z of any length but zero.
+
+    >>> rotation_from_quaternion(torch.tensor([1.0, 0.0, 0.0, 1.0])).round().tolist()  # a quarter turn around z
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    w, x, y, z = (quaternion / quaternion.norm()).unbind()
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
 def look_at(
     eye: Float[Tensor, "*views 3"], target: Float[Tensor, "*views 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*views 3 4"]:

@@ -8,11 +8,23 @@ from torch import Tensor, nn
 
 
 class Loss(nn.Module, ABC):
-    """A loss that is a mean over rays, so that the losses of tiles add up to that of the batch."""
+    """A weighted mean over rays, so that the losses of tiles add up to that of the batch.
+
+    The weights come with a mean of 1 over the batch: a ray's number is multiplied by its weight before the plain mean.
+    Dividing by the sum of a tile's own weights would let tiles with few unmasked rays count too much.
+    """
 
     every_level_is_a_picture: bool = True
     """Whether each level's number is a squared error of colour; else only the last one's is."""
 
     @abstractmethod
-    def forward(self, renderings: list[Any], target: Float[Tensor, "*rays 3"]) -> list[Float[Tensor, ""]]:
-        """Return one number per level, first level first; training minimises their sum."""
+    def forward(
+        self, renderings: list[Any], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
+    ) -> list[Float[Tensor, ""]]:
+        """Return one number per level, first level first; training minimises their sum.
+
+        Args:
+            renderings: one per level.
+            target: what the photographs show.
+            weight: of each ray, >= 0; its mean over the whole batch is 1.
+        """

@@ -10,6 +10,8 @@ from nerf_lightning.types import Rendering
 class MeanSquaredError(Loss):
     """Mean squared error of the colour, every level alike, so that the coarse level learns where to look."""
 
-    def forward(self, renderings: list[Rendering], target: Float[Tensor, "*rays 3"]) -> list[Float[Tensor, ""]]:
-        """Return the mean over rays and channels, per level."""
-        return [(rendering.rgb - target).square().mean() for rendering in renderings]
+    def forward(
+        self, renderings: list[Rendering], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
+    ) -> list[Float[Tensor, ""]]:
+        """Return the weighted mean over rays and channels, per level."""
+        return [((rendering.rgb - target).square() * weight[..., None]).mean() for rendering in renderings]

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.types import DenseRendering
 
@@ -25,16 +26,20 @@ class ProposalLoss(Loss):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion
 
-    def forward(self, renderings: list[DenseRendering], target: Float[Tensor, "*rays 3"]) -> list[Float[Tensor, ""]]:
+    def forward(
+        self, renderings: list[DenseRendering], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
+    ) -> list[Float[Tensor, ""]]:
         """Return one number per level."""
         last = renderings[-1]
-        losses = [self.interlevel * interlevel_loss(last, proposal) for proposal in renderings[:-1]]
-        color = (last.rgb - target).square().mean()
-        return [*losses, color + self.distortion * distortion_loss(last) if self.distortion else color]
+        losses = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
+        color = ((last.rgb - target).square() * weight[..., None]).mean()
+        if not self.distortion:
+            return [*losses, color]
+        return [*losses, color + self.distortion * (distortion_loss(last) * weight).mean()]
 
 
-def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, ""]:
-    """Return sum_i max(0, w_i - bound_i)^2 / w_i, averaged over rays (Eq. 13).
+def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"]:
+    """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray (Eq. 13).
 
     bound_i is the weight of all intervals of the proposal that touch interval i (Eq. 12): a proposal may claim too
     much, but what the last level sees must lie within it. Only the proposal receives gradients.
@@ -42,7 +47,7 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
     weights = last.weights.detach()
     bound = outer_weights(last.samples.edges.detach(), proposal.samples.edges.detach(), proposal.weights)
     excess = (weights - bound).clamp(min=0.0)
-    return (excess.square() / (weights + 1e-7)).sum(dim=-1).mean()
+    return (excess.square() / (weights + 1e-7)).sum(dim=-1)
 
 
 def outer_weights(
@@ -60,16 +65,19 @@ def outer_weights(
     return total.gather(-1, last.clamp(0, bins)) - total.gather(-1, first.clamp(0, bins))
 
 
-def distortion_loss(rendering: DenseRendering) -> Float[Tensor, ""]:
-    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3, averaged over rays (Eq. 15).
+def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray (Eq. 15).
 
-    m and d are midpoints and lengths as shares of the sampled part of the ray. The double sum is taken in linear
-    time, since the midpoints are in order: 2 sum_i w_i (m_i sum_{j<i} w_j - sum_{j<i} w_j m_j).
+    m and d are midpoints and lengths as shares of the sampled part of the ray, in the spacing of its samples. The
+    double sum is taken in linear time, since the midpoints are in order:
+    2 sum_i w_i (m_i sum_{j<i} w_j - sum_{j<i} w_j m_j).
     """
     edges, w = rendering.samples.edges, rendering.weights
+    if rendering.samples.endless:
+        edges = spread(edges)
     span = (edges[..., -1:] - edges[..., :1]).clamp(min=1e-6)
-    m = (rendering.samples.midpoints - edges[..., :1]) / span
+    m = (0.5 * (edges[..., :-1] + edges[..., 1:]) - edges[..., :1]) / span
     before, moment = w.cumsum(dim=-1) - w, (w * m).cumsum(dim=-1) - w * m
     pairs = 2.0 * (w * (m * before - moment)).sum(dim=-1)
-    own = (w.square() * rendering.samples.deltas / span).sum(dim=-1) / 3.0
-    return (pairs + own).mean()
+    own = (w.square() * edges.diff(dim=-1) / span).sum(dim=-1) / 3.0
+    return pairs + own

@@ -61,6 +61,11 @@ class Level(AnyLevel):
         self.sampler = sampler
         self.field = field
 
+    def place(self, scene: Scene) -> None:
+        """Hand the scene to the field and to the sampler."""
+        super().place(scene)
+        self.sampler.place(scene)
+
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
         return float(self.sampler.num_samples_after(int(before)))
@@ -75,7 +80,7 @@ class Level(AnyLevel):
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
         along = samples.midpoints[..., None] * rays.directions[..., None, :]
-        output = self.ask(rays.origins[..., None, :] + along, rays.directions[..., None, :], random)
+        output = self.ask(rays.origins[..., None, :] + along, rays.view_directions[..., None, :], random)
         return composite(output, samples, rays, background)
 
     def ask(

@@ -108,7 +108,7 @@ class PackedLevel(AnyLevel):
         if random is not None and self.field.needs_random:
             random = RayRandom(key=random.key[index], slots=random.slots[index] * MOST_SAMPLES + samples.place)
         # To the field, each sample is a ray with one sample.
-        positions, directions = positions_of(rays, samples)[:, None], rays.directions[index][:, None]
+        positions, directions = positions_of(rays, samples)[:, None], rays.view_directions[index][:, None]
         if features is None:
             output = self.field(positions, directions, random)
         else:
@@ -123,7 +123,7 @@ class PackedLevel(AnyLevel):
             return self._ask(rays, samples, None)
         rgb = density.new_zeros(density.shape[0], 3)
         seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
-        directions = rays.directions[samples.ray_index[seen]]
+        directions = rays.view_directions[samples.ray_index[seen]]
         output = self.field.recall(positions[seen][:, None], directions[:, None], None, features[seen][:, None])
         rgb[seen] = output.rgb[:, 0]
         return FieldOutput(density=density, rgb=rgb)

@@ -1,13 +1,14 @@
 """Whole views: render every pixel of a camera, a chunk of rays at a time."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.types import Background, Cameras, RayBundle, TensorStruct
@@ -63,6 +64,9 @@ def render_picture(
         for part in tiles(rays.near.numel(), tile_rays_for(model, tile_points))
     ]
     rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
+    if cameras.ndc is not None:
+        straight = rays_through_pixels(replace(cameras, ndc=None), pixels.map(torch.flatten), near, far)
+        depth = world_distance(straight, depth / rays.far)
     return Picture(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape))
 
 

@@ -5,11 +5,14 @@ from abc import ABC, abstractmethod
 from torch import nn
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
+from nerf_lightning.types import DenseRendering, RayBundle, RaySamples, Scene
 
 
 class AnySampler(nn.Module):
     """What chooses where along rays to ask the field, in whatever layout."""
+
+    def place(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
 
 class Sampler(AnySampler, ABC):

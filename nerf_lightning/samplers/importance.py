@@ -1,5 +1,7 @@
 """Importance samples where the level before saw something (Sec. 5.2, arXiv 2003.08934)."""
 
+from dataclasses import replace
+
 import torch
 
 from nerf_lightning.randomness import RayRandom
@@ -31,7 +33,7 @@ class ImportanceSampler(Sampler):
         within = 0.5 if random is None else random.uniform("importance", self.num_samples)
         u = ((strata + within) / self.num_samples).expand(*edges.shape[:-1], -1)
         added = sample_histogram(edges[..., 1:-1], weights[..., 1:-1], u)
-        return RaySamples(edges=torch.cat([edges, added], dim=-1).sort(dim=-1).values)
+        return replace(history[-1].samples, edges=torch.cat([edges, added], dim=-1).sort(dim=-1).values)
 
     def num_samples_after(self, before: int) -> int:
         """Those of the level before, and `num_samples` more.

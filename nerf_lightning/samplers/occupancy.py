@@ -11,6 +11,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
+from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
@@ -20,6 +21,8 @@ from nerf_lightning.types import PackedSamples, RayBundle, Scene
 log = logging.getLogger(__name__)
 
 CELLS_AT_ONCE = 1 << 18
+# Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
+CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
 # The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
 # counts as thin, and only solid matter ends a march.
 RISE = 0.3
@@ -37,9 +40,11 @@ class OccupancySampler(AnySampler):
 
     Args:
         resolution: cells along a side of the box; a multiple of 4.
-        num_cascades: boxes, each twice as large as the one before, the first being the scene's; 1 for bounded scenes.
+        num_cascades: boxes, each twice as large as the one before, the first being the scene's. None: 1, and in
+            contracted scenes 6 of half the resolution.
         num_steps: intervals across the diagonal of the scene's box.
-        cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike.
+        cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike. None: 0, and in
+            contracted scenes 1/256.
         update_every: steps between two updates of the grid.
         warmup_steps: until then every cell is asked at each update, later every other one.
         prune_after: steps before which no cell is given up; larger where the background is baked into the pictures,
@@ -61,9 +66,9 @@ class OccupancySampler(AnySampler):
     def __init__(
         self,
         resolution: int = 128,
-        num_cascades: int = 1,
+        num_cascades: int | None = None,
         num_steps: int = 512,
-        cone_angle: float = 0.0,
+        cone_angle: float | None = None,
         update_every: int = 16,
         warmup_steps: int = 256,
         prune_after: int = 0,
@@ -75,19 +80,15 @@ class OccupancySampler(AnySampler):
         super().__init__()
         if resolution % BLOCK or resolution < BLOCK:
             raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
-        self.resolution, self.num_cascades = resolution, num_cascades
-        self.num_steps, self.cone_angle = num_steps, cone_angle
+        self.wanted = (resolution, num_cascades, cone_angle)
+        self.resolution, self.num_cascades, self.cone_angle = resolution, num_cascades or 1, cone_angle or 0.0
+        self.num_steps = num_steps
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
-        side = (num_cascades, resolution, resolution, resolution)
-        blocks = (num_cascades, *(resolution // BLOCK,) * 3)
+        self.contracted = Contracted()
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
-        self.register_buffer("density", torch.zeros(side))
-        self.register_buffer("floor", torch.zeros(side))
-        self.register_buffer("possible", torch.ones(side, dtype=torch.bool))
-        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8))
-        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8))
         self.register_buffer("range", torch.tensor([0.0, 1.0]))
+        self._allocate()
         # Made when first needed from what the buffers hold; reading them stops a GPU, so they are kept.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
@@ -98,13 +99,17 @@ class OccupancySampler(AnySampler):
         Raises:
             InputError: no training ray meets the box, or nothing is left in it.
         """
+        self.contracted.place(scene)
+        self._allocate()
         self.aabb.copy_(scene.aabb)
         self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
         for cascade in range(self.num_cascades):
             centers, half_diagonal = self._cell_centers(cascade)
-            possible = possible_cells(scene, centers, half_diagonal)
-            self.possible[cascade] = possible.view(self.possible.shape[1:])
+            # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
+            if scene.space != "ndc":
+                possible = possible_cells(scene, centers, half_diagonal)
+                self.possible[cascade] = possible.view(self.possible.shape[1:])
         if not bool(self.possible.any()):
             lower, upper = ([round(float(x), 3) for x in corner] for corner in scene.aabb)
             raise InputError(
@@ -113,13 +118,17 @@ class OccupancySampler(AnySampler):
                 "(scene.aabb_half), or the cameras' poses."
             )
         self.reset()
+        if scene.space == "bounded":
+            self._question_cameras_inside(scene)
+
+    def _question_cameras_inside(self, scene: Scene) -> None:
         eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3]
         inside = int(((eyes > scene.aabb[0]) & (eyes < scene.aabb[1])).all(dim=-1).sum())
         if inside:
             log.warning(
                 "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
-                "learnt. If the capture has no bounds, use field.contraction=true with model=fast_proposal, or with "
-                "model.levels.fine.sampler.num_cascades=4; else make the box smaller (scene.aabb_half).",
+                "learnt. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
+                "make the box smaller (scene.aabb_half).",
                 inside,
                 eyes.shape[0],
                 scene.name,
@@ -208,8 +217,28 @@ class OccupancySampler(AnySampler):
             threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
             self._occupy((self.density > threshold) & self.possible)
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
+    def _allocate(self) -> None:
+        """Make the grid as large as the space wants it; what it held is forgotten."""
+        resolution, cascades, cone_angle = self.wanted
+        if self.contracted:
+            resolution = resolution // 2 if cascades is None else resolution
+            cascades = CASCADES_ENDLESS if cascades is None else cascades
+            cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
+        self.resolution, self.num_cascades, self.cone_angle = resolution, cascades or 1, cone_angle or 0.0
+        side = (self.num_cascades, resolution, resolution, resolution)
+        blocks = (self.num_cascades, *(resolution // BLOCK,) * 3)
+        device = self.aabb.device
+        self.register_buffer("density", torch.zeros(side, device=device))
+        self.register_buffer("floor", torch.zeros(side, device=device))
+        self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
+        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
+        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", self.contracted.switch))
+        self.contracted.forget()
+        self._allocate()
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._lattice = self._numbers = None
 
     def _occupy(self, occupied: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 import torch
 
+from nerf_lightning.geometry.spacing import spread, unspread
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.histograms import sample_histogram
 from nerf_lightning.samplers.base import Sampler
@@ -31,7 +32,10 @@ class ProposalSampler(Sampler):
         strata = torch.arange(count, device=edges.device, dtype=edges.dtype)
         within = 0.5 if random is None else random.uniform("proposal", count)
         u = ((strata + within) / count).expand(*edges.shape[:-1], -1)
-        return RaySamples(edges=sample_histogram(edges, weights, u, floor=self.padding))
+        if not history[-1].samples.endless:
+            return RaySamples(edges=sample_histogram(edges, weights, u, floor=self.padding))
+        shares = sample_histogram(spread(edges), weights, u, floor=self.padding)
+        return RaySamples(edges=unspread(shares), endless=True)
 
     def num_samples_after(self, before: int) -> int:
         """Always `num_samples`.

@@ -2,16 +2,19 @@
 
 import torch
 
+from nerf_lightning.geometry.contracted import Contracted
+from nerf_lightning.geometry.spacing import spread, unspread
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
+from nerf_lightning.types import DenseRendering, RayBundle, RaySamples, Scene
 
 
 class StratifiedSampler(Sampler):
     """Cut each ray into equal intervals, and jitter every inner fencepost of every ray within half an interval.
 
     Each fencepost is uniform in a stratum of its own, so the midpoints at which the field is asked cover the whole
-    ray over the steps. Without random numbers the intervals are equal.
+    ray over the steps. Without random numbers the intervals are equal. In contracted scenes they are equal in the
+    spacing of `geometry.spacing`, elsewhere in distance.
 
     Args:
         num_samples: intervals per ray.
@@ -22,6 +25,11 @@ class StratifiedSampler(Sampler):
         if num_samples < 1:
             raise ValueError(f"num_samples={num_samples}: at least one sample is needed")
         self.num_samples = num_samples
+        self.contracted = Contracted()
+
+    def place(self, scene: Scene) -> None:
+        """Take note of the scene's space."""
+        self.contracted.place(scene)
 
     def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
         """Return `num_samples` intervals from near to far."""
@@ -30,7 +38,11 @@ class StratifiedSampler(Sampler):
         if random is not None:
             jitter = random.uniform("stratified", self.num_samples - 1) - 0.5
             s = torch.cat([s[..., :1], s[..., 1:-1] + jitter / self.num_samples, s[..., -1:]], dim=-1)
-        return RaySamples(edges=rays.near[..., None] + s * (rays.far - rays.near)[..., None])
+        near, far = rays.near[..., None], rays.far[..., None]
+        if self.contracted:
+            low, high = spread(near), spread(far)
+            return RaySamples(edges=unspread(low + s * (high - low)), endless=True)
+        return RaySamples(edges=near + s * (far - near))
 
     def num_samples_after(self, before: int) -> int:
         """Always `num_samples`."""

@@ -24,7 +24,8 @@ class StubSystem:
     @property
     def last_step(self):
         target = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
-        return {"target": target, "foreground": target if self.alive(self.restarts) else torch.zeros(64, 3)}
+        light = target if self.alive(self.restarts) else torch.zeros(64, 3)
+        return {"target": target, "foreground": light, "weight": torch.ones(64)}
 
     def restart(self):
         self.restarts += 1
@@ -73,12 +74,12 @@ def test_the_end_of_the_crop_is_watched_too():
 
 def test_constant_photographs_are_no_collapse():
     flat = torch.full((64, 3), 0.5)
-    assert not is_constant({"target": flat, "foreground": torch.zeros(64, 3)}, 0.02)
+    assert not is_constant({"target": flat, "foreground": torch.zeros(64, 3), "weight": torch.ones(64)}, 0.02)
 
 
 def test_a_random_background_does_not_hide_a_collapse():
     """The rendered colour varies with the background; the field's own light does not."""
-    step = {"target": torch.rand(64, 3), "foreground": torch.full((64, 3), 0.3)}
+    step = {"target": torch.rand(64, 3), "foreground": torch.full((64, 3), 0.3), "weight": torch.ones(64)}
     assert is_constant(step, 0.02)
 
 

@@ -18,6 +18,7 @@ from nerf_lightning.data.bricks.solids import NOTHING, Solids
 from nerf_lightning.data.bricks.tracer import SIDES, Pinhole, Tracer
 from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.bricks.views import DISTANCE, bricks_cameras
+from nerf_lightning.data.cache_folder import default_folder
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import all_pixels, project, rays_through_pixels
 from nerf_lightning.geometry.poses import is_rigid
@@ -302,9 +303,9 @@ def test_unwritable_cache_costs_a_warning(tmp_path: Path, caplog: pytest.LogCapt
 def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("NERF_LIGHTNING_CACHE", raising=False)
-    assert reader_module.default_folder() == tmp_path / "xdg" / "nerf_lightning" / "bricks"
+    assert default_folder("bricks") == tmp_path / "xdg" / "nerf_lightning" / "bricks"
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "own"))
-    assert reader_module.default_folder() == tmp_path / "own" / "bricks"
+    assert default_folder("bricks") == tmp_path / "own" / "bricks"
 
 
 @pytest.mark.parametrize(

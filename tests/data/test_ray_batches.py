@@ -118,6 +118,7 @@ def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog)
     assert caplog.text == ""
     rgba = scene.pixels.rgba.clone()
     rgba[:, 3] = 255
-    RayDataModule(replace(scene, pixels=replace(scene.pixels, rgba=rgba)), Progress(), seed=0, num_steps=1)
+    opaque = replace(scene.pixels, rgba=rgba, has_transparency=False)
+    RayDataModule(replace(scene, pixels=opaque), Progress(), seed=0, num_steps=1)
     assert "pictures of ball have no transparent pixels" in caplog.text
     assert "scene.background=black" in caplog.text

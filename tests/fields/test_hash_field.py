@@ -63,7 +63,7 @@ def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothi
     scene = ball_scene()
     rgba = scene.pixels.rgba.clone()
     rgba[:, 3] = 255
-    baked = replace(scene, pixels=replace(scene.pixels, rgba=rgba))
+    baked = replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
     densities = []
     for given in (scene, baked):
         field = a_field()

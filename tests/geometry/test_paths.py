@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -113,6 +114,16 @@ def test_the_frame_of_a_capture():
     assert math.isclose(around.radius, (2 + math.sqrt(26) + 3) / 3, rel_tol=1e-6)
     assert (around.focal, around.width, around.height) == (70.0, 64, 48)
     assert frame_of(cameras, torch.zeros(2, 3), up=(0.0, 1.0, 0.0)).up.tolist() == [0, 1, 0]
+
+
+def test_a_path_leaves_the_lens_behind():
+    """What is rendered anew has no reason to be bent."""
+    c2w = look_at(torch.tensor([[3.0, 0, 1]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
+    bent = replace(pinhole_cameras(c2w, 70.0, 64, 48), lens=torch.full((1, 6), 0.1), lens_model="radial_tangential")
+    cameras = Orbit(num_frames=3).cameras(frame_of(bent, torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    assert cameras.lens_model == "pinhole"
+    assert cameras.lens.tolist() == [[0.0] * 6] * 3
+    assert cameras.focal.tolist() == [[70.0, 70.0]] * 3
 
 
 def test_the_yaml_lists_the_constructors_defaults():

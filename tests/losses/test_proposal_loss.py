@@ -24,14 +24,14 @@ def test_a_proposal_that_is_the_truth_costs_nothing_and_one_that_misses_it_does(
     last, _ = rendering(edges, density)
     same, _ = rendering(edges, density)
     missing, _ = rendering(edges, torch.zeros(5, 16))
-    assert float(interlevel_loss(last, same)) == pytest.approx(0.0, abs=1e-9)
-    assert float(interlevel_loss(last, missing)) > 0.1
+    assert float(interlevel_loss(last, same).mean()) == pytest.approx(0.0, abs=1e-9)
+    assert float(interlevel_loss(last, missing).mean()) > 0.1
 
 
 def test_only_the_proposal_learns_from_the_interlevel_loss():
     last, last_density = rendering(random_edges(4, 12), torch.rand(4, 11), requires_grad=True)
     proposal, density = rendering(random_edges(4, 9), 0.1 * torch.rand(4, 8), requires_grad=True)
-    interlevel_loss(last, proposal).backward()
+    interlevel_loss(last, proposal).mean().backward()
     assert last_density.grad is None
     assert float(density.grad.abs().sum()) > 0
 
@@ -52,7 +52,7 @@ def test_distortion_is_the_double_sum():
     span = edges[:, -1:] - edges[:, :1]
     m, d = (seen.samples.midpoints - edges[:, :1]) / span, seen.samples.deltas / span
     pairs = (w[:, :, None] * w[:, None, :] * (m[:, :, None] - m[:, None, :]).abs()).sum((1, 2))
-    expected = (pairs + (w.square() * d).sum(1) / 3).mean()
+    expected = pairs + (w.square() * d).sum(1) / 3
     torch.testing.assert_close(distortion_loss(seen), expected)
 
 
@@ -60,6 +60,15 @@ def test_the_levels_losses_are_named_in_order():
     proposal, _ = rendering(random_edges(4, 9), torch.rand(4, 8))
     last, _ = rendering(random_edges(4, 12), torch.rand(4, 11))
     target = torch.rand(4, 3)
-    first, second = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], target)
-    torch.testing.assert_close(first, 2.0 * interlevel_loss(last, proposal))
-    torch.testing.assert_close(second, (last.rgb - target).square().mean() + 0.5 * distortion_loss(last))
+    first, second = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], target, torch.ones(4))
+    torch.testing.assert_close(first, 2.0 * interlevel_loss(last, proposal).mean())
+    torch.testing.assert_close(second, (last.rgb - target).square().mean() + 0.5 * distortion_loss(last).mean())
+
+
+def test_a_ray_without_weight_teaches_no_level_anything():
+    proposal, density = rendering(random_edges(4, 9), 0.1 * torch.rand(4, 8), requires_grad=True)
+    last, last_density = rendering(random_edges(4, 12), torch.rand(4, 11), requires_grad=True)
+    weight = torch.tensor([2.0, 0.0, 2.0, 0.0])
+    sum(ProposalLoss()([proposal, last], torch.rand(4, 3), weight)).backward()
+    for gradient in (density.grad, last_density.grad):
+        assert (gradient.abs().sum(dim=1) > 0).tolist() == [True, False, True, False]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from scenes import ball_scene, some_rays, tiny_field
@@ -26,7 +28,7 @@ def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
     hit = inside.enter < inside.leave
     near, far = inside.enter, torch.maximum(inside.leave, inside.enter + 1e-3)
     dense = Level(StratifiedSampler(400), level.field)
-    boxed = type(rays)(rays.origins, rays.directions, near, far, rays.camera_index)
+    boxed = replace(rays, near=near, far=far)
     expected = dense(boxed, background, [], None)
     with torch.no_grad():
         found = level(rays, background, [], None)

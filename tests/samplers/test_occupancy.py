@@ -19,7 +19,7 @@ def opaque_ball():
     scene = ball_scene(num_views=6, size=16)
     rgba = scene.pixels.rgba.clone()
     rgba[:, 3] = 255
-    return replace(scene, pixels=replace(scene.pixels, rgba=rgba))
+    return replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
 
 
 def ball_density(radius=0.5, density=80.0):

@@ -27,15 +27,6 @@ class Rendered:
     normals: Float[ndarray, "pixels 3"]
 
 
-def default_folder() -> Path:
-    """Return $NERF_LIGHTNING_CACHE/bricks, else nerf_lightning/bricks in $XDG_CACHE_HOME or ~/.cache."""
-    chosen = os.environ.get("NERF_LIGHTNING_CACHE")
-    if chosen:
-        return Path(chosen).expanduser() / "bricks"
-    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(home).expanduser() / "nerf_lightning" / "bricks"
-
-
 def cache_file(folder: Path, settings: dict[str, int]) -> Path:
     """Return the file that belongs to settings, the version of the renderer among them."""
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]

@@ -13,10 +13,11 @@ from numpy import ndarray
 from rich.progress import Progress
 
 from nerf_lightning.data.base import Reader
-from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached, default_folder
+from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
 from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.bricks.views import bricks_cameras
+from nerf_lightning.data.cache_folder import default_folder
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Background, Cameras, PixelStore, Scene, Truth
@@ -76,7 +77,7 @@ class BricksReader(Reader):
         self._check()
         views = sum(self.counts.values())
         cameras = bricks_cameras(**self.counts, resolution=self.resolution)
-        folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder()
+        folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder("bricks")
         settings = {"version": RENDER_VERSION, "resolution": self.resolution, **self.counts}
         pixels = views * self.resolution**2
         rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras))
@@ -89,6 +90,7 @@ class BricksReader(Reader):
                 offset=torch.arange(views) * self.resolution**2,
                 width=cameras.width,
                 height=cameras.height,
+                has_transparency=bool((rendered.rgba[:, 3] < 255).any()),
             ),
             near=torch.full((views,), float(self.near)),
             far=torch.full((views,), float(self.far)),

@@ -42,7 +42,8 @@ def frame_of(
 ) -> PathFrame:
     """Return the frame of a capture: the middle of its box, seen from the mean distance of its cameras.
 
-    Focal length and size are those of the first camera. The default `up` is the world's z axis.
+    Focal length and size are those of the first camera; its lens and principal point are left behind, for what is
+    rendered on a path is seen through a centred pinhole. The default `up` is the world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)
     return PathFrame(

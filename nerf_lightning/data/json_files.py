@@ -1,0 +1,50 @@
+"""Json files of captures: parsed, with their mistakes named."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.data.checks import listed
+from nerf_lightning.errors import InputError
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a json file.
+
+    Raises:
+        InputError: it cannot be read, or is not json.
+    """
+    cure = "Export it again, or mend it with a json checker."
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {cure}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+
+
+def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:
+    """Return the values of keys, all of which must be there.
+
+    Args:
+        content: what the file holds.
+        keys: which.
+        where: file and place, for messages.
+        wanted_by: the format, for messages.
+
+    Raises:
+        InputError: it is no json object, or a key is missing.
+    """
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{where} must be a json object with the keys {listed(keys)}, but it is {type(content).__name__}."
+        )
+    missing = [key for key in keys if key not in content]
+    if missing:
+        raise InputError(
+            f"{where} lacks {listed(missing)}; it has {listed(content) or 'nothing'}. {wanted_by} needs {listed(keys)}."
+        )
+    return [content[key] for key in keys]
