@@ -1,6 +1,7 @@
 """Render a model along a camera path: colour and depth, as videos or as frames."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -58,6 +59,8 @@ def render_path(
     """Render one picture per camera of the path; near and far are the widest of the photographs."""
     cameras = path.cameras(frame_of(scene.cameras, scene.aabb))
     count = cameras.c2w.shape[0]
+    if scene.cameras.ndc is not None:
+        cameras = replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
     near = scene.near.min().expand(count)
     far = scene.far.max().expand(count)
     for view in track(range(count), description="filming", transient=True, console=stderr_console()):

@@ -157,7 +157,7 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("trainer.accelerator=tpu", "trainer.accelerator=tpu does not fit: it must be auto, cpu, gpu"),
         ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
-        ("path.elevation=95.0", "path.elevation is 95"),
+        ("path.num_frames=0", "path.num_frames is 0"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("evaluation.split=all", "evaluation.split=all does not fit"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),

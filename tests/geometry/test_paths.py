@@ -1,18 +1,23 @@
+import inspect
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import pinhole_cameras, project
+from nerf_lightning.geometry.paths.auto import AutoPath, widest_gap
 from nerf_lightning.geometry.paths.base import PathFrame, frame_of
 from nerf_lightning.geometry.paths.orbit import Orbit
+from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.geometry.poses import is_rigid, look_at
 
 
-def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64):
+def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64, poses=None):
+    poses = torch.eye(4, dtype=dtype)[None, :3] if poses is None else poses
     return PathFrame(
         center=torch.tensor([1.0, 2.0, 3.0], dtype=dtype),
         up=torch.tensor(up, dtype=dtype),
@@ -20,6 +25,7 @@ def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64):
         focal=140.0,
         width=100,
         height=80,
+        poses=poses,
     )
 
 
@@ -126,10 +132,50 @@ def test_a_path_leaves_the_lens_behind():
     assert cameras.focal.tolist() == [[70.0, 70.0]] * 3
 
 
-def test_the_yaml_lists_the_constructors_defaults():
-    yaml = pytest.importorskip("yaml")
-    text = (Path(__file__).parents[2] / "conf" / "path" / "orbit.yaml").read_text()
-    listed = yaml.safe_load(text)
-    assert listed.pop("_target_") == f"{Orbit.__module__}.{Orbit.__qualname__}"
-    assert vars(Orbit(**listed)) == vars(Orbit())
-    assert set(listed) == set(vars(Orbit()))
+@pytest.mark.parametrize("path", [Orbit, Spiral, AutoPath])
+def test_the_yaml_lists_the_constructors_defaults(path):
+    name = "auto" if path is AutoPath else path.__name__.lower()
+    listed = yaml.safe_load((Path(__file__).parents[2] / "conf" / "path" / f"{name}.yaml").read_text())
+    assert listed.pop("_target_") == f"{path.__module__}.{path.__qualname__}"
+    assert listed == {name: each.default for name, each in inspect.signature(path).parameters.items()}
+
+
+def ring(degrees, elevation=40.0, radius=4.0):
+    """Cameras that look at the frame's centre from azimuths in degrees."""
+    azimuth, height = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)), math.radians(elevation)
+    level = torch.stack([azimuth.cos(), azimuth.sin()], dim=-1) * math.cos(height)
+    offsets = torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)
+    center = frame().center
+    eyes = center + radius * offsets
+    return look_at(eyes, center.expand_as(eyes), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_what_was_photographed_from_all_sides_is_filmed_from_all_sides_at_that_height():
+    cameras = AutoPath(num_frames=6).cameras(frame(poses=ring([0.0, 100.0, 190.0, 280.0])))
+    wanted = Orbit(num_frames=6, elevation=40.0).cameras(frame())
+    torch.testing.assert_close(cameras.c2w, wanted.c2w)
+
+
+def test_what_was_photographed_from_one_side_is_filmed_from_there():
+    around = frame(poses=ring([-20.0, -10.0, 0.0, 10.0, 20.0]))
+    cameras = AutoPath(num_frames=16).cameras(around)
+    assert is_rigid(cameras.c2w).all()
+    mean = around.poses[:, :, 3].mean(dim=0)
+    most = (around.poses[:, :, 3] - mean).norm(dim=-1).max()
+    assert ((cameras.c2w[:, :, 3] - mean).norm(dim=-1) < most).all()
+    seen = torch.stack([project(cameras, view, around.center) for view in range(16)])
+    torch.testing.assert_close(seen, cameras.center)
+
+
+def test_the_widest_gap_does_not_depend_on_the_world():
+    offsets = torch.randn(8, 3, dtype=torch.float64)
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    up = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    assert widest_gap(offsets, up) == pytest.approx(widest_gap(3 * offsets @ rotation.mT, rotation @ up))
+
+
+def test_a_forward_facing_capture_is_looked_at_from_in_front():
+    cameras = replace(pinhole_cameras(torch.eye(4)[None, :3], 70.0, 64, 48), ndc=torch.ones(1, 2))
+    around = frame_of(cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    assert around.center.tolist() == [0.0, 0.0, -5.0]
+    assert around.up.tolist() == [0.0, 1.0, 0.0]

@@ -7,7 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.types import Cameras
+
+# What a camera in front of a scene looks at, in units of the near plane's distance.
+NDC_FOCUS = 5.0
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,32 @@ class PathFrame:
     """Focal length in pixels, for a picture of `width` by `height`."""
     width: int
     height: int
+    poses: Float[Tensor, "views 3 4"]
+    """Where the photographs were taken, camera to world."""
+
+    def size(self, width: int | None, height: int | None) -> tuple[int, int, float]:
+        """Return a picture's width, height, and how much longer its focal length is in pixels.
+
+        Args:
+            width: in pixels; None: it follows the height, or is the frame's own.
+            height: in pixels; None: it follows the width, or is the frame's own.
+        """
+        if width is None and height is not None:
+            scale = height / self.height
+            return max(1, round(self.width * scale)), height, scale
+        width = self.width if width is None else width
+        scale = width / self.width
+        return width, (max(1, round(self.height * scale)) if height is None else height), scale
+
+
+def check_setting(name: str, value: object, good: bool, rule: str) -> None:
+    """Refuse a setting of a path.
+
+    Raises:
+        InputError: it is not good.
+    """
+    if not good:
+        raise InputError(f"path.{name} is {value}, but must be {rule}")
 
 
 class CameraPath(ABC):
@@ -42,10 +72,15 @@ def frame_of(
 ) -> PathFrame:
     """Return the frame of a capture: the middle of its box, seen from the mean distance of its cameras.
 
+    Forward-facing captures have no middle: theirs lies in front of the mean camera, a few times as far as the near
+    plane, and up is the mean camera's.
+
     Focal length and size are those of the first camera; its lens and principal point are left behind, for what is
     rendered on a path is seen through a centred pinhole. The default `up` is the world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)
+    if cameras.ndc is not None:
+        center, up = torch.tensor([0.0, 0.0, -NDC_FOCUS]).to(cameras.c2w), (0.0, 1.0, 0.0)
     return PathFrame(
         center=center,
         up=torch.tensor(up).to(cameras.c2w),
@@ -53,4 +88,5 @@ def frame_of(
         focal=float(cameras.focal[0, 0]),
         width=int(cameras.width[0]),
         height=int(cameras.height[0]),
+        poses=cameras.c2w,
     )

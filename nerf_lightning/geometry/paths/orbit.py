@@ -8,9 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import pinhole_cameras
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -44,14 +43,14 @@ class Orbit(CameraPath):
         height: int | None = None,
         fps: int = 30,
     ) -> None:
-        _check("num_frames", num_frames, num_frames >= 1, "at least 1")
-        _check("elevation", elevation, -90 < elevation < 90, "between -90 and 90 degrees, both excluded")
-        _check("radius", radius, radius is None or 0 < radius < math.inf, "a positive distance, or null")
-        _check("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        _check("start", start, math.isfinite(start), "a finite angle in degrees")
-        _check("width", width, width is None or width >= 1, "at least 1 pixel, or null")
-        _check("height", height, height is None or height >= 1, "at least 1 pixel, or null")
-        _check("fps", fps, fps >= 1, "at least 1")
+        check_setting("num_frames", num_frames, num_frames >= 1, "at least 1")
+        check_setting("elevation", elevation, -90 < elevation < 90, "between -90 and 90 degrees, both excluded")
+        check_setting("radius", radius, radius is None or 0 < radius < math.inf, "a positive distance, or null")
+        check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
+        check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
+        check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
+        check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
+        check_setting("fps", fps, fps >= 1, "at least 1")
         self.num_frames, self.elevation, self.radius = num_frames, elevation, radius
         self.turns, self.start, self.fps = turns, start, fps
         self.width, self.height = width, height
@@ -60,7 +59,7 @@ class Orbit(CameraPath):
         """Return the cameras of the circle. A picture of another size keeps the horizontal field of view."""
         radius = around.radius if self.radius is None else self.radius
         eyes = around.center + radius * self._directions(around.up)
-        width, height, scale = self._size(around)
+        width, height, scale = around.size(self.width, self.height)
         c2w = look_at(eyes, around.center.expand_as(eyes), around.up)
         return pinhole_cameras(c2w, around.focal * scale, width, height)
 
@@ -75,24 +74,9 @@ class Orbit(CameraPath):
         elevation = math.radians(self.elevation)
         return math.cos(elevation) * level + math.sin(elevation) * up
 
-    def _size(self, around: PathFrame) -> tuple[int, int, float]:
-        """Return width, height and how much larger a pixel's focal length becomes."""
-        if self.width is None and self.height is not None:
-            scale = self.height / around.height
-            return max(1, round(around.width * scale)), self.height, scale
-        width = around.width if self.width is None else self.width
-        scale = width / around.width
-        height = max(1, round(around.height * scale)) if self.height is None else self.height
-        return width, height, scale
-
 
 def _horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
     axis = torch.zeros_like(up)
     axis[0 if abs(float(up[0])) < 0.9 else 1] = 1.0
     return normalize(axis - (axis @ up) * up, dim=0)
-
-
-def _check(name: str, value: object, good: bool, rule: str) -> None:
-    if not good:
-        raise InputError(f"path.{name} is {value}, but must be {rule}")

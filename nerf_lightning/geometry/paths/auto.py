@@ -1,0 +1,60 @@
+"""The path that suits a capture: around it where it was photographed from all sides, else in front of it."""
+
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
+from nerf_lightning.geometry.paths.orbit import Orbit
+from nerf_lightning.geometry.paths.spiral import Spiral
+from nerf_lightning.types import Cameras
+
+# The widest gap between photographs, seen from above, that a circle may cross.
+WIDEST_GAP = 120.0
+LOWEST, HIGHEST = 5.0, 60.0
+
+
+@final
+class AutoPath(CameraPath):
+    """An orbit at the photographs' own height, or a spiral.
+
+    Args:
+        num_frames: how many cameras.
+        width: picture's width in pixels; None: it follows the height, or is the photographs'.
+        height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        fps: frames per second.
+    """
+
+    def __init__(
+        self, num_frames: int = 120, width: int | None = None, height: int | None = None, fps: int = 30
+    ) -> None:
+        self.spiral = Spiral(num_frames, width=width, height=height, fps=fps)
+        self.num_frames, self.width, self.height, self.fps = num_frames, width, height, fps
+
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras of the path that was chosen."""
+        from_center = around.poses[:, :, 3] - around.center
+        if widest_gap(from_center, around.up) > WIDEST_GAP:
+            return self.spiral.cameras(around)
+        height = from_center @ around.up / (from_center.norm(dim=-1) * around.up.norm())
+        elevation = float(torch.rad2deg(height.clamp(-1, 1).asin()).median())
+        elevation = min(max(elevation, LOWEST), HIGHEST)
+        return Orbit(self.num_frames, elevation, width=self.width, height=self.height, fps=self.fps).cameras(around)
+
+
+def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:
+    """Return the widest angle in degrees between neighbouring views, as seen from above.
+
+    >>> east_and_north = torch.tensor([[1.0, 0, 0], [0, 1, 0]])
+    >>> round(widest_gap(east_and_north, torch.tensor([0.0, 0, 1])))
+    270
+    """
+    up = up / up.norm()
+    axis = torch.eye(3).to(up)[int(up.abs().argmin())]
+    east = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
+    north = torch.linalg.cross(up, east)
+    angles = torch.rad2deg(torch.atan2(offsets @ north, offsets @ east)).sort().values
+    around = torch.cat([angles, angles[:1] + 360.0])
+    return float(around.diff().max())
