@@ -10,6 +10,7 @@ from nerf_lightning.callbacks.validation_view import render_validation_view
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.errors import require_positive
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
+from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.rendering.blending import photograph
 
 
@@ -33,7 +34,7 @@ class ValidationPictures(Callback):
         view, picture = render_validation_view(trainer, pl_module, self.view)
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
         truth = photograph(scene, view, scene.background)
-        panel = mosaic(truth, picture.rgb, picture.depth, picture.opacity)
+        panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
         folder = Path(trainer.default_root_dir) / "images"
         save_png(folder / "validation" / f"step_{step:07d}.png", panel)
         save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))

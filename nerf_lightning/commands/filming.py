@@ -15,6 +15,7 @@ from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.pictures import depth_picture, to_bytes
 from nerf_lightning.export.video import write_frames, write_video
+from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.geometry.paths.base import CameraPath, frame_of
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
@@ -34,19 +35,20 @@ def film(
 ) -> list[Path]:
     """Write `video.mp4` and `depth.mp4` (or folders of frames of these names) and return where they are.
 
-    Depth is in scene units along the ray, coloured over the range of what is seen on the whole path (its outer 1 % at
-    each end left out), with its scale beside it.
+    Depth is in the user's units along the ray, coloured over the range of what is seen on the whole path (its outer
+    1 % at each end left out), with its scale beside it.
     """
     if form not in FORMATS:
         raise InputError(f"format={form}: choose video (mp4) or frames (PNG files).")
     # Rendered once and kept: the scale of the depth is known at the end only.
     pictures = [picture for picture in render_path(model, scene, path, background, tile_points)]
-    seen = torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
-    near, far = float(scene.near.min()), float(scene.far.max())
+    unit = unit_of(scene.to_user)
+    seen = unit * torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
+    near, far = unit * float(scene.near.min()), unit * float(scene.far.max())
     if seen.numel():
         near, far = (float(value) for value in torch.quantile(_thinned(seen), torch.tensor([0.01, 0.99])))
     color = [to_bytes(picture.rgb) for picture in pictures]
-    depth = [depth_picture(picture.depth, near, far, picture.opacity) for picture in pictures]
+    depth = [depth_picture(unit * picture.depth, near, far, picture.opacity) for picture in pictures]
     return [
         _write(folder, "video", color, path.fps, form),
         _write(folder, "depth", depth, path.fps, form),

@@ -18,6 +18,7 @@ from nerf_lightning.evaluation.metrics import image_metrics, masked_out, mean_ov
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.pictures import mosaic, save_png
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
 from nerf_lightning.rendering.blending import photograph
@@ -75,7 +76,7 @@ class Scoring:
                 picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
             rows.append({"name": scene.view_names[view]} | self._measure(picture, truth, scene, view))
             if view in kept:
-                panel = mosaic(truth, picture.rgb, picture.depth, picture.opacity)
+                panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
                 save_png(folder / "images" / _file_name(self.split, scene.view_names[view]), panel)
         result: dict[str, Any] = mean_over_images([{m: row[m] for m in METRICS} for row in rows]) | {
             "num_images": len(rows),

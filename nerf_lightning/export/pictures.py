@@ -81,7 +81,7 @@ def depth_picture(
     far: float,
     opacity: Float[Tensor, "height width"] | None = None,
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return depth (scene units) in colours, near bright, with its scale on the right.
+    """Return depth in colours, near bright, with its scale on the right.
 
     Where `opacity` is given, what light passes through fades to pale grey.
     """

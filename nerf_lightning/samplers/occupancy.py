@@ -120,6 +120,12 @@ class OccupancySampler(AnySampler):
         self.reset()
         if scene.space == "bounded":
             self._question_cameras_inside(scene)
+        else:
+            log.warning(
+                "The photographs of %s show what lies behind the content, so little of its space is empty: "
+                "model=fast_proposal learns such captures several times faster than an occupancy grid does.",
+                scene.name,
+            )
 
     def _question_cameras_inside(self, scene: Scene) -> None:
         eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3]
