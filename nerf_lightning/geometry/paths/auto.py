@@ -12,7 +12,7 @@ from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.types import Cameras
 
 # The widest gap between photographs, seen from above, that a circle may cross.
-WIDEST_GAP = 120.0
+WIDEST_GAP = 75.0
 LOWEST, HIGHEST = 5.0, 60.0
 
 
