@@ -30,6 +30,8 @@ def test_every_component_builds(group, option):
 @pytest.mark.parametrize("option", options("experiment"))
 def test_every_experiment_composes_and_its_model_builds(option):
     config = composed("train", f"experiment={option}")
+    if OmegaConf.is_missing(config.scene, "root"):
+        config.scene.root = "somewhere"
     assert build(config.model).points_per_ray(training=True) > 0
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 

@@ -6,6 +6,7 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
+from captures import real_capture
 from running import FAST
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from videos import read_video
@@ -168,6 +169,17 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
         "train", f"experiment={experiment}", *scene, f"scene.path={capture}", *article, "trainer.max_steps=2",
         "data.batch_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
         f"paths.output_dir={tmp_path}/run",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize("experiment", ["fern", "fern_article"])
+def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
+    result = nerf(
+        "train", f"experiment={experiment}", f"scene.root={real_capture('fern')}", "trainer.max_epochs=null",
+        "trainer.max_steps=2", "data.batch_rays=64", "data.val_rays=64", "scene.downscale=14", "evaluation.max_views=1",
+        "path.num_frames=2", "path.width=8", f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err
     assert (tmp_path / "run" / "metrics.json").is_file()

@@ -151,7 +151,7 @@ def ring(degrees, elevation=40.0, radius=4.0):
 
 
 def test_what_was_photographed_from_all_sides_is_filmed_from_all_sides_at_that_height():
-    cameras = AutoPath(num_frames=6).cameras(frame(poses=ring([0.0, 100.0, 190.0, 280.0])))
+    cameras = AutoPath(num_frames=6).cameras(frame(poses=ring([0.0, 72.0, 144.0, 216.0, 288.0])))
     wanted = Orbit(num_frames=6, elevation=40.0).cameras(frame())
     torch.testing.assert_close(cameras.c2w, wanted.c2w)
 
