@@ -85,6 +85,16 @@ def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
     return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
 
 
+def border_pixels(cameras: Cameras, view: int) -> PixelIndex:
+    """Return the pixels along the border of one view, corners twice."""
+    device = cameras.c2w.device
+    right, bottom = int(cameras.width[view]) - 1, int(cameras.height[view]) - 1
+    across, down = torch.arange(right + 1, device=device), torch.arange(bottom + 1, device=device)
+    x = torch.cat([across, across, torch.zeros_like(down), torch.full_like(down, right)])
+    y = torch.cat([torch.zeros_like(across), torch.full_like(across, bottom), down, down])
+    return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
+
+
 def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Return world points in the axes of one camera: right, up, back."""
     c2w = cameras.c2w[view]
