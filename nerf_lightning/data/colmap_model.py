@@ -103,7 +103,7 @@ def _agree(a: ColmapModel, b: ColmapModel) -> bool:
 
 def _numbers_of(image: ColmapImage, cameras: dict[int, ColmapCamera]) -> list[float]:
     camera = cameras.get(image.camera)
-    intrinsics = (camera.width, camera.height, *camera.params) if camera else ()
+    intrinsics = (float(camera.width), float(camera.height), *camera.params) if camera else ()
     # A quaternion and its negative are one rotation, and have the same products.
     return [*np.outer(image.rotation, image.rotation).ravel().tolist(), *image.translation, *intrinsics]
 

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from nerf_lightning.data.capture import Capture
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.cameras import border_pixels, rays_through_pixels
+from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.types import Cameras, Space
 
 # Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees).
@@ -56,11 +56,8 @@ def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
 
 
 def least_ahead(cameras: Cameras) -> float:
-    """Return the least cosine between a pixel's ray and the cameras' mean direction, over all pictures' borders."""
+    """Return the least cosine between a pixel's ray and the cameras' mean direction, over a coarse grid of pixels."""
     cameras = replace(cameras, c2w=cameras.c2w.float())
-    ahead = -functional.normalize(cameras.c2w[:, :, 2].mean(dim=0), dim=0)
     zeros = torch.zeros(cameras.c2w.shape[0])
-    return min(
-        float((rays_through_pixels(cameras, border_pixels(cameras, view), zeros, zeros).directions @ ahead).min())
-        for view in range(cameras.c2w.shape[0])
-    )
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
+    return float((rays.directions @ -functional.normalize(cameras.c2w[:, :, 2].mean(dim=0), dim=0)).min())

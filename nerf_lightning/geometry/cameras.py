@@ -85,14 +85,13 @@ def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
     return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
 
 
-def border_pixels(cameras: Cameras, view: int) -> PixelIndex:
-    """Return the pixels along the border of one view, corners twice."""
-    device = cameras.c2w.device
-    right, bottom = int(cameras.width[view]) - 1, int(cameras.height[view]) - 1
-    across, down = torch.arange(right + 1, device=device), torch.arange(bottom + 1, device=device)
-    x = torch.cat([across, across, torch.zeros_like(down), torch.full_like(down, right)])
-    y = torch.cat([torch.zeros_like(across), torch.full_like(across, bottom), down, down])
-    return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
+def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
+    """Return a coarse grid of pixels in every view, its corners and borders included, shape (views, pixels)."""
+    share = torch.linspace(0.0, 1.0, per_side, dtype=torch.float64, device=cameras.c2w.device)
+    across, down = torch.cartesian_prod(share, share).unbind(dim=-1)
+    x, y = ((size - 1)[:, None] * part for size, part in ((cameras.width, across), (cameras.height, down)))
+    view = torch.arange(cameras.c2w.shape[0], device=x.device)[:, None].expand(x.shape)
+    return PixelIndex(view=view, x=x.round().long(), y=y.round().long())
 
 
 def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
