@@ -81,7 +81,7 @@ def test_the_scene_says_whether_there_is_something_outside_of_its_box(space, eve
     assert bool((field.density(torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])) > 0).all()) is everywhere
     stubborn = a_field(contraction=False)
     stubborn.place(replace(ball_scene(), space=space))
-    assert float(stubborn.density(torch.tensor([[1.2, 0.0, 0.0]]))) == 0
+    assert bool((stubborn.density(torch.tensor([[1.2, 0.0, 0.0]])) == 0).all())
 
 
 def test_the_space_travels_in_the_state_dict_and_old_ones_load():
@@ -92,4 +92,4 @@ def test_the_space_travels_in_the_state_dict_and_old_ones_load():
     assert torch.equal(other.density(points), field.density(points))
     old = {name: value for name, value in field.state_dict().items() if name != "contracted.switch"}
     other.load_state_dict(old)
-    assert float(other.density(torch.tensor([[9.0, 0.0, 0.0]]))) == 0
+    assert bool((other.density(torch.tensor([[9.0, 0.0, 0.0]])) == 0).all())

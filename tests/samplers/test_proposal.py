@@ -46,7 +46,7 @@ def test_without_an_end_it_spreads_its_samples_in_disparity():
     stratified = StratifiedSampler(64)
     stratified.place(replace(ball_scene(), space="contracted"))
     samples = stratified(rays, [], None)
-    seen = composite(FieldOutput(torch.zeros(30, 64), torch.zeros(30, 64, 3)), samples, rays, None)
+    seen = composite(FieldOutput(torch.zeros(30, 64), torch.zeros(30, 64, 3)), samples, rays, torch.ones(3))
     found = ProposalSampler(32)(rays, [seen], None)
     assert found.endless
     # A proposal that saw nothing asks for even steps of the spacing, of which half lie within distance 1.
