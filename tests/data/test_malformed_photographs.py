@@ -39,7 +39,7 @@ def png_header(width, height):
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-@case("colmap", r"p_3.png ")
+@case("colmap", r"p_3.png is not an image that can be read. Copy or render it again")
 def a_photograph_of_no_pixels(root):
     one_picture(root).write_bytes(png_header(0, 0))
 
