@@ -1,15 +1,16 @@
 """What all captures share: from a format's views to a scene in a working frame."""
 
 import logging
+import math
 import os
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.capture import Capture, cameras_of, check_capture, filtered
-from nerf_lightning.data.checks import check_step, known_background, listed
+from nerf_lightning.data.checks import check_step, is_there, known_background, listed
 from nerf_lightning.data.extents import extent_of
 from nerf_lightning.data.images import ENDINGS, image_size
 from nerf_lightning.data.photographs import read_photographs
@@ -19,6 +20,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.geometry.lens_checks import require_invertible
 from nerf_lightning.types import Background, Scene
+
+Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +51,7 @@ class CaptureReader(Reader):
     hold_every: int = 8
     frames: str | None = None
     masks: str | None = None
-    space: Literal["auto", "bounded", "ndc", "contracted"] = "auto"
+    space: Spaces = "auto"
     near: float | None = None
     far: float | None = None
     background: str = "black"
@@ -74,6 +77,7 @@ class CaptureReader(Reader):
         background: Background = known_background(self.background)
         capture = filtered(self.capture(), self.frames)
         check_capture(capture)
+        splits = self._splits(capture)
         files = [image_size(view.photograph.path) for view in capture.views]
         pixels = read_photographs(
             [view.photograph for view in capture.views],
@@ -99,7 +103,7 @@ class CaptureReader(Reader):
             near=extent.near,
             far=extent.far,
             aabb=extent.aabb,
-            splits=self._splits(capture),
+            splits=splits,
             view_names=names,
             background=background,
             space=space,
@@ -115,7 +119,10 @@ class CaptureReader(Reader):
         Raises:
             InputError: it does not exist.
         """
-        folder = Path(self.root).expanduser()
+        try:
+            folder = Path(self.root).expanduser()
+        except RuntimeError as error:
+            raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
         if not folder.is_dir():
             raise InputError(f"The folder {folder} does not exist. Set scene.root to the capture's folder.")
         return folder
@@ -130,7 +137,7 @@ class CaptureReader(Reader):
             return None
         beside = self.folder() / self.masks / name
         for candidate in (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png")):
-            if candidate.is_file():
+            if is_there(candidate):
                 return candidate
         raise InputError(
             f"scene.masks={self.masks} holds no mask for {name}: neither {beside} nor {beside.name}.png exists. Add it "
@@ -141,8 +148,10 @@ class CaptureReader(Reader):
         check_step("downscale", self.downscale)
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
+        if self.space not in get_args(Spaces):
+            raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
         near, far = self.near, self.far
-        if (near is not None and near < 0) or (far is not None and far <= (near or 0)):
+        if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
             raise InputError(
                 f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units."
             )

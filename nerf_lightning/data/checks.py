@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import get_args
 
 import torch
@@ -74,7 +74,7 @@ def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
     """
     try:
         pose = torch.as_tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{where} is not a 4 x 4 matrix of numbers. Export the camera poses again.") from None
     if pose.shape != (4, 4):
         shape = " x ".join(str(size) for size in pose.shape) or "a single number"
@@ -120,6 +120,23 @@ def check_divisible(width: int, height: int, downscale: int) -> None:
             f"scene.downscale={downscale} does not divide the images' size of {width} x {height} pixels. "
             f"Choose one of {listed(factors, cap=40)}."
         )
+
+
+def is_there(path: Path) -> bool:
+    """Tell whether a file can be found; one whose name no file system takes cannot."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_absolute(name: str) -> bool:
+    r"""Tell whether a name begins at a root, of Windows too.
+
+    >>> is_absolute("/home/a.jpg"), is_absolute(r"C:\a.jpg"), is_absolute("images/a.jpg")
+    (True, True, False)
+    """
+    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
 
 
 def check_present(files: Iterable[Path], named_in: Path) -> None:

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from nerf_lightning.data.capture import Capture, View
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
-from nerf_lightning.data.checks import listed
-from nerf_lightning.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_model
+from nerf_lightning.data.checks import is_absolute, is_there, listed
+from nerf_lightning.data.colmap_model import find_model, read_model
+from nerf_lightning.data.colmap_records import ColmapCamera, ColmapImage
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import rotation_from_quaternion
@@ -51,24 +52,21 @@ class ColmapReader(CaptureReader):
                 f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
                 f"their folder below {root}."
             )
-        lost = [image.name for image in model.images if not (pictures / image.name).is_file()]
+        lost = [image.name for image in model.images if not is_there(pictures / image.name)]
         if lost:
-            raise InputError(
-                f"{pictures} lacks {len(lost)} of the {len(model.images)} photographs of the model in {folder}: "
-                f"{listed(lost)}. Copy them there, or set scene.images to the folder that has them."
-            )
-        used = {model.cameras[image.camera].model for image in model.images}
+            raise InputError(_absent(lost, pictures, folder, len(model.images)))
+        lens_model = _lens_model({model.cameras[image.camera].model for image in model.images}, folder)
         registered = {image.name for image in model.images}
         return Capture(
             views=tuple(self._view(image, model.cameras[image.camera], pictures) for image in model.images),
             source=folder,
-            lens_model=_lens_model(used, folder),
+            lens_model=lens_model,
             points=torch.from_numpy(model.points),
             left_out=tuple(name for name in picture_files(pictures) if name not in registered),
         )
 
     def _view(self, image: ColmapImage, camera: ColmapCamera, pictures: Path) -> View:
-        _, pinhole, lens = LAYOUTS.get(camera.model, LAYOUTS["PINHOLE"])
+        _, pinhole, lens = LAYOUTS[camera.model]
         fx, fy, cx, cy = (camera.params[place] for place in pinhole)
         k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
         path = pictures / image.name
@@ -81,6 +79,19 @@ class ColmapReader(CaptureReader):
             size=(float(camera.width), float(camera.height)),
             lens=(k1, k2, k3, k4, p1, p2),
         )
+
+
+def _absent(lost: list[str], pictures: Path, folder: Path, count: int) -> str:
+    if any(is_absolute(name) for name in lost):
+        return (
+            f"The model in {folder} names photographs by absolute paths of another machine: {listed(lost, cap=3)}. "
+            "Make the names relative to the folder of the photographs (reconstruct with that folder as COLMAP's "
+            "image_path)."
+        )
+    return (
+        f"{pictures} lacks {len(lost)} of the {count} photographs of the model in {folder}: {listed(lost)}. Copy them "
+        "there, or set scene.images to the folder that has them."
+    )
 
 
 def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.data.capture import Capture
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import (
     average_pose,
     focus_point,
@@ -22,10 +22,16 @@ from nerf_lightning.types import Cameras, Space
 
 # The near plane lies at this share of the least depth (LLFF's bound factor).
 NEAR_SHARE = 0.75
-# Sparse points beyond these quantiles are taken for mistakes.
-QUANTILES = (0.01, 0.99)
+# Sparse points beyond these quantiles of the depths in a picture are taken for mistakes; fewer points tell nothing.
+QUANTILES, FEWEST_POINTS = (0.01, 0.99), 20
+# Of more sparse points an even part is looked at in each view.
+MOST_POINTS = 20_000
+# Of those quantiles: content may begin before the nearest point, and go on behind the farthest.
+NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
 # Without sparse points, in units of the farthest camera's distance from the middle.
 NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
+# Cameras that stand closer together than this share of their coordinates stand at one place.
+ONE_PLACE = 1e-6
 # Of the cube that the ball of the cameras just holds.
 UNIT_BALL_HALF = 3**-0.5
 
@@ -51,30 +57,55 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
         space: which one.
         near: in the user's units, where the user knows better.
         far: likewise.
+
+    Raises:
+        InputError: all cameras stand at one place, near and far leave nothing, or the space does not suit the cameras.
     """
+    _check_places(capture, cameras)
     if space == "ndc":
-        return _forward_facing(capture, cameras, near)
+        return _forward_facing(capture, cameras, near, far)
     focus = focus_point(cameras.c2w)
     # The farthest camera stands at distance 1.
-    unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max()) or 1.0
+    unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max())
     to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)
-    found_near, found_far = _from_points(capture, cameras, to_user)
-    nearest = found_near if near is None else torch.full_like(found_near, near / unit)
+    nearest, farthest = _from_points(capture, cameras, to_user)
+    half = UNIT_BALL_HALF
     if space == "bounded":
-        return _bounded(cameras, to_user, nearest, None if far is None else far / unit)
-    farthest = found_far if far is None else torch.full_like(found_far, far / unit)
-    return Extent(to_user, nearest.float(), farthest.float(), _cube(UNIT_BALL_HALF), None)
+        nearest, farthest, half = _around_box(cameras, to_user, nearest)
+    if near is not None:
+        nearest = torch.full_like(nearest, near / unit)
+    if far is not None:
+        farthest = torch.full_like(farthest, far / unit)
+    # What was found yields to what the user says.
+    nearest = nearest if near is not None else torch.minimum(nearest, 0.5 * farthest)
+    if not bool((nearest < farthest).all()):
+        raise InputError(
+            f"scene.near={near:g} lies behind all content of {capture.source}, which ends at "
+            f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."
+        )
+    return Extent(to_user, nearest.float(), farthest.float(), _cube(half), None)
 
 
 def depths_of(capture: Capture, cameras: Cameras, view: int) -> Float[Tensor, "points"]:
     """Return how far in front of a view the sparse points lie that fall into its picture, in the user's units."""
     c2w = cameras.c2w[view]
-    local = (capture.points - c2w[:, 3]) @ c2w[:, :3]
+    points = capture.points[:: 1 + len(capture.points) // MOST_POINTS]
+    local = (points - c2w[:, 3]) @ c2w[:, :3]
     depth = -local[:, 2]
     plane = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / depth[:, None]
     at = plane * cameras.focal[view] + cameras.center[view]
     size = torch.stack([cameras.width[view], cameras.height[view]])
     return depth[(depth > 0) & ((at > 0) & (at < size)).all(dim=-1)]
+
+
+def _check_places(capture: Capture, cameras: Cameras) -> None:
+    centers = cameras.c2w[:, :, 3]
+    spread = (centers - centers.mean(dim=0)).abs().max()
+    if float(spread) <= ONE_PLACE * float(centers.abs().max()):
+        raise InputError(
+            f"All {len(capture.views)} cameras of {capture.source} stand at one place, and without different places "
+            "nothing is known of depth. Photograph from several, or estimate the poses anew."
+        )
 
 
 def _cube(half: float) -> Float[Tensor, "2 3"]:
@@ -87,16 +118,17 @@ def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[T
     near = torch.full((views,), NEAR_BLIND, dtype=torch.float64)
     far = torch.full((views,), FAR_CONTRACTED, dtype=torch.float64)
     if capture.bounds is not None:
-        near = 0.5 * capture.bounds[:, 0] / unit
+        near, far = NEAR_MARGIN * capture.bounds[:, 0] / unit, FAR_MARGIN * capture.bounds[:, 1] / unit
     for view in range(views):
         depths = depths_of(capture, cameras, view)
-        if len(depths) >= 20:
-            near[view] = 0.5 * float(torch.quantile(depths, QUANTILES[0])) / unit
-    return near.clamp(min=LEAST_NEAR), far
+        if len(depths) >= FEWEST_POINTS:
+            ends = torch.quantile(depths, depths.new_tensor(QUANTILES)) / unit
+            near[view], far[view] = NEAR_MARGIN * ends[0], FAR_MARGIN * ends[1]
+    return near.clamp(min=LEAST_NEAR), far.clamp(min=FAR_CONTRACTED)
 
 
-def _bounded(cameras: Cameras, to_user: Tensor, near: Tensor, far: float | None) -> Extent:
-    # The box that every camera sees whole: a ball around the middle, inside all their frames.
+def _around_box(cameras: Cameras, to_user: Tensor, near: Tensor) -> tuple[Tensor, Tensor, float]:
+    # Near, far and half the box's side: a ball around the middle that fills the longer side of the closest picture.
     poses = poses_from_user(cameras.c2w, to_user)
     distance = poses[:, :, 3].norm(dim=-1)
     half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
@@ -104,28 +136,27 @@ def _bounded(cameras: Cameras, to_user: Tensor, near: Tensor, far: float | None)
     radius = float((distance * tangent / (1.0 + tangent.square()).sqrt()).min())
     half = min(radius, 0.95 * float(distance.min()))
     reach = 3**0.5 * half
-    far_each = distance + reach if far is None else torch.full_like(distance, far)
-    near_each = torch.maximum(near, (distance - reach).clamp(min=LEAST_NEAR))
-    return Extent(to_user, torch.minimum(near_each, 0.5 * far_each).float(), far_each.float(), _cube(half), None)
+    return torch.maximum(near, distance - reach), distance + reach, half
 
 
-def _forward_facing(capture: Capture, cameras: Cameras, near: float | None) -> Extent:
+def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far: float | None) -> Extent:
     # LLFF's frame: the average camera looks along -z; the unit is such that the near plane lies at z = -1.
-    mean = average_pose(cameras.c2w)
-    depths = [depths_of(capture, cameras, view) for view in range(len(capture.views))]
-    if near is not None:
-        nearest = near / NEAR_SHARE
-    elif capture.bounds is not None:
-        nearest = float(capture.bounds.min())
-    else:
-        nearest = min((float(torch.quantile(d, QUANTILES[0])) for d in depths if len(d) >= 20), default=0.0)
-    if nearest <= 0:
+    if far is not None:
         raise InputError(
-            f"scene.space=ndc needs the depth at which content begins, and {capture.source} has neither "
-            "bounds nor enough sparse points in its pictures. Give scene.near in the capture's units, or use "
-            "scene.space=contracted."
+            f"scene.far={far:g} cannot be kept with scene.space=ndc, which reaches to infinity. Leave it out, or use "
+            "scene.space=contracted or bounded."
         )
-    to_user = similarity(mean[:, :3], mean[:, 3], NEAR_SHARE * nearest)
+    mean = average_pose(cameras.c2w)
+    plane = near if near is not None else NEAR_SHARE * _nearest_depth(capture, cameras)
+    ahead = -(cameras.c2w[:, :, 3] - mean[:, 3]) @ mean[:, 2]
+    if float(ahead.max()) >= plane:
+        view = capture.views[int(ahead.argmax())].name
+        raise InputError(
+            f"scene.space=ndc: the view {view} of {capture.source} stands {float(ahead.max()):.4g} ahead of the "
+            f"cameras' middle, behind the near plane at {plane:.4g}, so what is in front of it would be lost. Use "
+            "scene.space=contracted, or give a larger scene.near."
+        )
+    to_user = similarity(mean[:, :3], mean[:, 3], plane)
     half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
     scale = (cameras.focal / half_size).median(dim=0).values.float()
     ndc = scale.expand(len(capture.views), 2).contiguous()
@@ -138,15 +169,22 @@ def _forward_facing(capture: Capture, cameras: Cameras, near: float | None) -> E
     return Extent(to_user, torch.zeros(views), length.expand(views).clone(), aabb, ndc)
 
 
+def _nearest_depth(capture: Capture, cameras: Cameras) -> float:
+    if capture.bounds is not None:
+        return float(capture.bounds.min())
+    depths = [depths_of(capture, cameras, view) for view in range(len(capture.views))]
+    found = [float(torch.quantile(each, QUANTILES[0])) for each in depths if len(each) >= FEWEST_POINTS]
+    if not found:
+        raise InputError(
+            f"scene.space=ndc needs the depth at which content begins, and {capture.source} has neither "
+            "bounds nor enough sparse points in its pictures. Give scene.near in the capture's units, or use "
+            "scene.space=contracted."
+        )
+    return min(found)
+
+
 def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor, ""]]:
-    # Where the rays of all pictures' edges begin and end in the cube, and the longest way between.
-    ends, longest = [], []
+    # Where the rays of all pictures begin and end in the cube, and the longest way between.
     zeros = torch.zeros(cameras.c2w.shape[0])
-    for view in range(cameras.c2w.shape[0]):
-        pixels = all_pixels(cameras, view)
-        edge = torch.ones_like(pixels.x, dtype=torch.bool)
-        edge[1:-1, 1:-1] = False
-        rays = rays_through_pixels(cameras, pixels[edge], zeros, zeros + 1.0)
-        ends += [rays.origins, rays.origins + rays.far[:, None] * rays.directions]
-        longest.append(rays.far.max())
-    return torch.cat(ends), torch.stack(longest).max()
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros + 1.0).map(lambda x: x.flatten(0, 1))
+    return torch.cat([rays.origins, rays.origins + rays.far[:, None] * rays.directions]), rays.far.max()

@@ -20,8 +20,12 @@ def read_json(path: Path) -> Any:
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path} is not valid json: {error.msg} at {place}. {cure}") from error
+    except RecursionError as error:
+        raise InputError(f"{path} nests its brackets too deeply to be a capture. {cure}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
+    except ValueError as error:  # a number of thousands of digits
+        raise InputError(f"{path} is not usable json: {error}. {cure}") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -70,17 +71,25 @@ class LlffReader(CaptureReader):
         )
 
 
+def _array(path: Path) -> ndarray:
+    try:
+        # Read by its own format: np.load would open archives too, and unpickle what is neither.
+        with path.open("rb") as file:
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
+        raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
+    except (MemoryError, OverflowError) as error:
+        raise InputError(f"{path} announces more numbers than fit into memory. It is damaged. {CURE}") from error
+
+
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
     if not path.is_file():
         present = listed(sorted(p.name for p in path.parent.iterdir())) or "nothing"
         raise InputError(
             f"{path} does not exist; the folder holds {present}. Point scene.root at the folder that has it."
         )
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
-    if rows.ndim != 2 or rows.shape[1] != COLUMNS or not np.issubdtype(rows.dtype, np.number):
+    rows = _array(path)
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":
         shape = " x ".join(map(str, rows.shape)) or "a single number"
         raise InputError(
             f"{path} is {shape} of {rows.dtype}, but each view needs one row of {COLUMNS} numbers: a 3 x 5 matrix and "

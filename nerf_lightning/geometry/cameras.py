@@ -85,6 +85,15 @@ def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
     return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
 
 
+def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
+    """Return a coarse grid of pixels in every view, its corners and borders included, shape (views, pixels)."""
+    share = torch.linspace(0.0, 1.0, per_side, dtype=torch.float64, device=cameras.c2w.device)
+    across, down = torch.cartesian_prod(share, share).unbind(dim=-1)
+    x, y = ((size - 1)[:, None] * part for size, part in ((cameras.width, across), (cameras.height, down)))
+    view = torch.arange(cameras.c2w.shape[0], device=x.device)[:, None].expand(x.shape)
+    return PixelIndex(view=view, x=x.round().long(), y=y.round().long())
+
+
 def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Return world points in the axes of one camera: right, up, back."""
     c2w = cameras.c2w[view]

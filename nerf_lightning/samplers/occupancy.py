@@ -241,7 +241,8 @@ class OccupancySampler(AnySampler):
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", self.contracted.switch))
+        # The grid must be as large as the one that is read; without a switch that one is of a bounded scene.
+        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", torch.tensor(False)))
         self.contracted.forget()
         self._allocate()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

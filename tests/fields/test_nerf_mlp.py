@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import pytest
 import torch
+from scenes import ball_scene, tiny_field
 from torch import nn
 
 from nerf_lightning.encoders.frequency import FrequencyEncoder
@@ -76,3 +79,35 @@ def test_density_noise_is_there_in_training_only_and_is_keyed():
 def test_a_skip_that_names_no_layer_is_refused(skip):
     with pytest.raises(ValueError, match=f"skip={skip} names no layer between 1 and 7"):
         paper_field(skip=skip)
+
+
+def test_contracted_space_brings_far_points_within_reach_of_the_encoding():
+    scene = replace(ball_scene(), space="contracted", aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]) * 3**-0.5)
+    torch.manual_seed(0)
+    field, plain = tiny_field(density_activation="softplus"), tiny_field(density_activation="softplus")
+    plain.load_state_dict(field.state_dict())
+    field.place(scene)
+    inside, outside = 0.5 * torch.rand(20, 3), torch.tensor([[4.0, 0.0, 0.0], [0.0, 0.0, -10.0]])
+    torch.testing.assert_close(field.density(inside), plain.density(inside))
+    contracted = torch.tensor([[1.75, 0.0, 0.0], [0.0, 0.0, -1.9]])
+    torch.testing.assert_close(field.density(outside), plain.density(contracted))
+
+
+@pytest.mark.parametrize("space", ["bounded", "ndc"])
+def test_elsewhere_positions_enter_as_they_are(space):
+    torch.manual_seed(0)
+    field, points = tiny_field(density_activation="softplus"), 5 * torch.rand(20, 3)
+    before = field.density(points)
+    field.place(replace(ball_scene(), space=space, aabb=torch.tensor([[-9.0] * 3, [3.0] * 3])))
+    assert torch.equal(field.density(points), before)
+
+
+def test_a_state_dict_from_before_there_were_spaces_loads():
+    field, other = tiny_field(), tiny_field()
+    state = field.state_dict()
+    old = {name: value for name, value in state.items() if name not in ("aabb", "contracted.switch")}
+    assert len(old) == len(state) - 2
+    other.place(replace(ball_scene(), space="contracted"))
+    other.load_state_dict(old)
+    points = 5 * torch.rand(20, 3)
+    assert torch.equal(other.density(points), field.density(points))

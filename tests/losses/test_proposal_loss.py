@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from scenes import some_rays
 
+from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.losses.proposal import ProposalLoss, distortion_loss, interlevel_loss, outer_weights
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.types import FieldOutput, RaySamples
@@ -72,3 +75,11 @@ def test_a_ray_without_weight_teaches_no_level_anything():
     sum(ProposalLoss()([proposal, last], torch.rand(4, 3), weight)).backward()
     for gradient in (density.grad, last_density.grad):
         assert (gradient.abs().sum(dim=1) > 0).tolist() == [True, False, True, False]
+
+
+def test_without_an_end_distortion_is_measured_in_the_spacing():
+    seen, _ = rendering(20.0 * random_edges(6, 9), torch.rand(6, 8))
+    endless = replace(seen, samples=RaySamples(seen.samples.edges, endless=True))
+    in_spacing = replace(seen, samples=RaySamples(spread(seen.samples.edges)))
+    torch.testing.assert_close(distortion_loss(endless), distortion_loss(in_spacing))
+    assert not torch.allclose(distortion_loss(endless), distortion_loss(seen), rtol=0.05)

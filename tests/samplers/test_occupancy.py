@@ -131,3 +131,105 @@ def test_cameras_inside_the_box_are_said_by_name(caplog):
     caplog.clear()
     a_sampler(scene)
     assert caplog.text == ""
+
+
+def contracted_ball():
+    scene = opaque_ball()
+    far = torch.full_like(scene.far, 16.0)
+    return replace(scene, space="contracted", aabb=scene.aabb * 3**-0.5, near=0.003 * far, far=far)
+
+
+def sizes(sampler):
+    return {name: tuple(getattr(sampler, name).shape) for name in ("density", "floor", "possible", "cells", "blocks")}
+
+
+@pytest.mark.parametrize(
+    ("settings", "cascades", "side", "cone_angle"),
+    [
+        ({}, 6, 8, 1 / 256),
+        ({"num_cascades": 2}, 2, 16, 1 / 256),
+        ({"cone_angle": 0.0}, 6, 8, 0.0),
+    ],
+)
+def test_contracted_space_wants_more_and_coarser_boxes_unless_told(settings, cascades, side, cone_angle):
+    sampler = a_sampler(contracted_ball(), **settings)
+    grid = (cascades, side, side, side)
+    assert sizes(sampler) == dict.fromkeys(("density", "floor", "possible", "cells"), grid) | {
+        "blocks": (cascades, side // 4, side // 4, side // 4)
+    }
+    assert sampler.cone_angle == cone_angle
+    steps = sampler.lattice.diff()
+    assert (float(steps[-1]) > 1.5 * float(steps[0])) == (cone_angle > 0)
+
+
+@pytest.mark.parametrize("space", ["bounded", "ndc"])
+def test_other_spaces_have_one_box(space):
+    sampler = a_sampler(replace(opaque_ball(), space=space))
+    assert sizes(sampler)["cells"] == (1, 16, 16, 16)
+    assert sampler.cone_angle == 0.0
+
+
+def test_a_second_scene_makes_the_grid_anew():
+    sampler = a_sampler(contracted_ball())
+    sampler.place(opaque_ball())
+    assert sizes(sampler)["cells"] == (1, 16, 16, 16)
+    learn(sampler, ball_density())
+    assert 0 < int(sampler.cells.sum()) < 16**3
+
+
+def test_in_normalised_device_coordinates_every_cell_is_possible():
+    """Cells are not where the cameras see them: a box behind all cameras must not be carved away."""
+    scene = opaque_ball()
+    sampler = a_sampler(replace(scene, space="ndc", aabb=scene.aabb + 500.0))
+    assert bool(sampler.possible.all())
+
+
+@pytest.mark.parametrize("placed", [None, opaque_ball(), contracted_ball()], ids=["new", "bounded", "contracted"])
+@pytest.mark.parametrize("saved", [opaque_ball(), contracted_ball()], ids=["from_bounded", "from_contracted"])
+def test_the_grid_takes_the_size_of_the_state_that_is_read(saved, placed):
+    one = learn(a_sampler(saved), ball_density())
+    other = OccupancySampler(resolution=16, num_steps=64)
+    if placed is not None:
+        other.place(placed)
+    other.load_state_dict(one.state_dict())
+    assert sizes(other) == sizes(one)
+    assert (other.num_cascades, other.cone_angle) == (one.num_cascades, one.cone_angle)
+    assert torch.equal(other.cells, one.cells)
+    assert torch.equal(other.lattice, one.lattice)
+    rays = some_rays(20)
+    (found, _), (expected, _) = (each(rays, screened(ball_density()), None) for each in (other, one))
+    assert torch.equal(found.starts, expected.starts)
+    learn(other, ball_density())
+
+
+def test_a_state_from_before_there_were_spaces_is_of_one_box():
+    state = learn(a_sampler(), ball_density()).state_dict()
+    old = {name: value for name, value in state.items() if name != "contracted.switch"}
+    assert len(old) == len(state) - 1
+    sampler = a_sampler(contracted_ball())
+    sampler.load_state_dict(old)
+    assert not sampler.contracted
+    assert torch.equal(sampler.cells, state["cells"])
+
+
+def test_cascades_cover_what_lies_far_out():
+    sampler = a_sampler(contracted_ball())
+    rays = some_rays(40)
+    rays = replace(rays, near=torch.full((40,), 0.05), far=torch.full((40,), 16.0))
+    samples, _ = sampler(rays, screened(lambda positions: torch.zeros(len(positions))), None)
+    assert float(samples.ends.max()) > 14.0
+    assert float(positions_of(rays, samples).abs().max()) > 8.0
+    # Intervals grow with the distance.
+    far, near = samples.starts > 10.0, samples.starts < 2.0
+    assert float(samples.deltas[far].mean()) > 1.4 * float(samples.deltas[near].min())
+
+
+def test_a_learnt_shell_beyond_the_first_box_is_kept_and_the_rest_given_up():
+    sampler = a_sampler(contracted_ball())
+    learn(sampler, lambda positions: 50.0 * ((positions.norm(dim=-1) - 5.0).abs() < 1.0).float())
+    cascade, x, y, z = sampler.cells.nonzero().unbind(dim=-1)
+    side, half = sampler.resolution, 3**-0.5 * 2.0**cascade
+    center = (2 * (torch.stack([x, y, z], dim=-1) + 0.5) / side - 1) * half[:, None]
+    reach = 3**0.5 * half / side
+    assert bool(((center.norm(dim=-1) - 5.0).abs() <= 1.0 + reach).all())
+    assert {4, 5} <= set(cascade.tolist())

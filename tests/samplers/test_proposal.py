@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from scenes import some_rays
+from scenes import ball_scene, some_rays
 
+from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.randomness import batch_random
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.proposal import ProposalSampler
@@ -36,3 +39,18 @@ def test_positions_carry_no_gradient():
 def test_it_needs_a_level_before_it():
     with pytest.raises(ValueError, match="needs a level before"):
         ProposalSampler(8).num_samples_after(0)
+
+
+def test_without_an_end_it_spreads_its_samples_in_disparity():
+    rays = replace(some_rays(30), near=torch.full((30,), 0.1), far=torch.full((30,), 100.0))
+    stratified = StratifiedSampler(64)
+    stratified.place(replace(ball_scene(), space="contracted"))
+    samples = stratified(rays, [], None)
+    seen = composite(FieldOutput(torch.zeros(30, 64), torch.zeros(30, 64, 3)), samples, rays, torch.ones(3))
+    found = ProposalSampler(32)(rays, [seen], None)
+    assert found.endless
+    # A proposal that saw nothing asks for even steps of the spacing, of which half lie within distance 1.
+    steps = spread(found.edges).diff(dim=-1)
+    torch.testing.assert_close(steps, steps.mean().expand_as(steps), rtol=0.02, atol=0)
+    assert 0.4 < float((found.edges < 1.0).float().mean()) < 0.5
+    assert bool(((found.edges >= 0.1) & (found.edges <= 100.01)).all())

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from scenes import some_rays
+from scenes import ball_scene, some_rays
 
+from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.importance import ImportanceSampler
@@ -87,3 +90,45 @@ def test_counts():
     assert StratifiedSampler(64).num_samples_after(0) == 64
     assert ImportanceSampler(128).num_samples_after(64) == 192
     assert RaySamples(torch.arange(5.0)).deltas.shape == (4,)
+
+
+def endless_rays(count):
+    rays = some_rays(count)
+    return replace(rays, near=torch.full((count,), 0.1), far=torch.full((count,), 16.0))
+
+
+@pytest.mark.parametrize("random", [None, batch_random(3, 20)])
+def test_in_contracted_scenes_samples_are_even_in_disparity(random):
+    sampler, rays = StratifiedSampler(32), endless_rays(20)
+    sampler.place(replace(ball_scene(), space="contracted"))
+    samples = sampler(rays, [], random)
+    assert samples.endless
+    torch.testing.assert_close(samples.edges[:, 0], rays.near)
+    torch.testing.assert_close(samples.edges[:, -1], rays.far)
+    even = spread(rays.near)[:, None] + torch.linspace(0, 1, 33) * (spread(rays.far) - spread(rays.near))[:, None]
+    within = 1e-6 if random is None else 0.5 * float(even[0, 1] - even[0, 0]) + 1e-6
+    assert float((spread(samples.edges) - even).abs().max()) <= within
+    assert bool((samples.deltas > 0).all())
+
+
+@pytest.mark.parametrize("space", ["bounded", "ndc"])
+def test_in_other_scenes_samples_are_even_in_distance(space):
+    sampler, rays = StratifiedSampler(8), endless_rays(2)
+    sampler.place(replace(ball_scene(), space=space))
+    samples = sampler(rays, [], None)
+    assert not samples.endless
+    torch.testing.assert_close(samples.deltas, torch.full((2, 8), 15.9 / 8))
+
+
+def test_importance_samples_remember_that_space_has_no_end():
+    sampler, rays = StratifiedSampler(16), endless_rays(4)
+    sampler.place(replace(ball_scene(), space="contracted"))
+    samples = sampler(rays, [], None)
+    seen = composite(FieldOutput(torch.rand(4, 16), torch.rand(4, 16, 3)), samples, rays, torch.ones(3))
+    assert ImportanceSampler(8)(rays, [seen], None).endless
+
+
+def test_a_stratified_sampler_of_an_old_checkpoint_loads():
+    sampler = StratifiedSampler(4)
+    sampler.load_state_dict({})
+    assert not sampler.contracted

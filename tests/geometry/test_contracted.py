@@ -1,0 +1,52 @@
+"""The switch between a box and all of space: set by the scene, or by the config, and kept in checkpoints."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import ball_scene
+
+from nerf_lightning.geometry.contracted import Contracted
+
+
+@pytest.mark.parametrize(
+    ("fixed", "space", "result"),
+    [
+        (None, "bounded", False),
+        (None, "ndc", False),
+        (None, "contracted", True),
+        (True, "bounded", True),
+        (False, "contracted", False),
+    ],
+)
+def test_the_config_overrules_the_scene(fixed, space, result):
+    switch = Contracted(fixed)
+    switch.place(replace(ball_scene(), space=space))
+    assert bool(switch) is result
+
+
+def test_a_second_scene_turns_it_again():
+    switch = Contracted()
+    for space in ("contracted", "bounded", "contracted"):
+        switch.place(replace(ball_scene(), space=space))
+        assert bool(switch) == (space == "contracted")
+
+
+@pytest.mark.parametrize("state", [True, False])
+def test_it_travels_in_the_state_dict(state):
+    one, other = Contracted(), Contracted()
+    one.switch.fill_(state)
+    assert not bool(other)
+    other.load_state_dict(one.state_dict())
+    assert bool(other) is state
+
+
+@pytest.mark.parametrize("fixed", [None, True, False])
+def test_a_state_dict_from_before_there_was_a_switch_loads(fixed):
+    switch = Contracted(fixed)
+    if fixed is None:
+        switch.place(replace(ball_scene(), space="contracted"))
+    parent = torch.nn.Module()
+    parent.child = switch
+    parent.load_state_dict({}, strict=True)
+    assert bool(switch) is bool(fixed)
