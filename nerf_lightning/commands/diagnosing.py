@@ -10,7 +10,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.padding import Padding
 from rich.text import Text
 
 from nerf_lightning.commands.build import build
@@ -54,10 +53,12 @@ def print_checks(checks: Sequence[Check]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     width = max(len(check.name) for check in checks)
     for check in checks:
-        line = Text.assemble((f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {check.message}")
+        line = Text.assemble(
+            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {check.message}"
+        )
         console.print(line)
         if check.cure:
-            console.print(Padding(Text(f"cure: {check.cure}"), (0, 0, 0, width + 9)))
+            console.print(Text(f"{'':<{width + 9}}cure: {check.cure}"))
 
 
 def _folder(config: DictConfig, name: str) -> Path:

@@ -44,7 +44,9 @@ def doctor_picture(
     _write_verdicts(figure.add_subplot(grid[1, 1]), checks)
     num_views, points = len(scene.view_names), len(content)
     what = "sparse points" if len(scene.points) else "matched details"
-    figure.suptitle(f"{scene.name}: {num_views} views, {points} {what}, space {scene.space}", fontsize=14, weight="bold")
+    figure.suptitle(
+        f"{scene.name}: {num_views} views, {points} {what}, space {scene.space}", fontsize=14, weight="bold"
+    )
     return picture_of(figure)
 
 
@@ -65,7 +67,15 @@ def _draw_cameras(
     centers = scene.cameras.c2w[:, :, 3]
     middle = middle_of(scene)
     size = float((centers - middle).norm(dim=-1).max().clamp(min=1e-6))
-    axes.scatter(*content[:, shown].T.numpy(), s=2.0, color=CONTENT, alpha=0.45, linewidths=0, zorder=1)
+    axes.scatter(
+        content[:, shown[0]].numpy(),
+        content[:, shown[1]].numpy(),
+        s=2.0,
+        color=CONTENT,
+        alpha=0.45,
+        linewidths=0,
+        zorder=1,
+    )
     if scene.space == "bounded":
         low, high = scene.aabb[:, shown].numpy()
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
@@ -74,7 +84,8 @@ def _draw_cameras(
         lines = np.concatenate([_frustum(scene, view, 0.13 * size)[:, :, shown] for view in views])
         axes.add_collection(LineCollection(list(lines), colors=COLOURS[split], linewidths=0.8, alpha=0.8, zorder=2))
         label = f"{split} ({len(views)})"
-        axes.scatter(*centers[list(views)][:, shown].T.numpy(), s=9, color=COLOURS[split], label=label, zorder=3)
+        x, y = centers[views][:, shown].unbind(dim=-1)
+        axes.scatter(x.numpy(), y.numpy(), s=9, color=COLOURS[split], label=label, zorder=3)
     everything = torch.cat([centers[:, shown], middle[None, shown]]).numpy()
     if len(content):
         inner = content[:, shown].numpy()
@@ -136,7 +147,9 @@ def _draw_coverage(axes: "Axes", scene: Scene) -> None:
         axes.scatter(azimuth[at].numpy(), elevation[at].numpy(), s=16, color=COLOURS[split], edgecolors="white", lw=0.4)
     axes.axhline(0, color="0.6", linewidth=0.7)
     axes.text(176, 3, "horizon", fontsize=7, color="0.4", ha="right")
-    axes.set_title(f"coverage: green lies within {NEAR_ENOUGH:.0f} degrees of a photograph, red is missing", fontsize=11)
+    axes.set_title(
+        f"coverage: green lies within {NEAR_ENOUGH:.0f} degrees of a photograph, red is missing", fontsize=11
+    )
     axes.set_xlabel("azimuth around the middle (degrees)", fontsize=9)
     axes.set_ylabel("elevation (degrees)", fontsize=9)
     axes.set_xticks(range(-180, 181, 45))

@@ -11,6 +11,7 @@ from nerf_lightning.data.doctor.matches import Matches
 from nerf_lightning.types import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
+SHIFT = "Shift the list of photographs against the poses by one; one end may lack a picture."
 
 
 @dataclass(frozen=True)
@@ -100,26 +101,32 @@ AXES = (
         "Negate the second and third column of every rotation, then invert every pose matrix.",
         _poses(lambda c2w: inverted(axes(c2w, FLIP_YZ))),
     ),
-    Reading("as if their rotations were transposed", "Transpose every rotation, leave the centres.", _poses(transposed)),
+    Reading(
+        "as if their rotations were transposed", "Transpose every rotation, leave the centres.", _poses(transposed)
+    ),
     Reading(
         "as if their rotations were transposed, with OpenCV's axes",
         "Transpose every rotation, then negate its second and third column.",
         _poses(lambda c2w: axes(transposed(c2w), FLIP_YZ)),
     ),
-    *(
-        Reading(
-            f"as if the axes {'xyz'[i]} and {'xyz'[j]} of the cameras had the other sign",
-            f"Negate columns {i + 1} and {j + 1} of every rotation.",
-            _poses(lambda c2w, i=i, j=j: axes(c2w, tuple(-1.0 if k in (i, j) else 1.0 for k in range(3)))),  # type: ignore[misc]
-        )
-        for i, j in ((0, 1), (0, 2))
+    Reading(
+        "as if the axes x and y of the cameras had the other sign",
+        "Negate columns 1 and 2 of every rotation.",
+        _poses(lambda c2w: axes(c2w, (-1.0, -1.0, 1.0))),
+    ),
+    Reading(
+        "as if the axes x and z of the cameras had the other sign",
+        "Negate columns 1 and 3 of every rotation.",
+        _poses(lambda c2w: axes(c2w, (-1.0, 1.0, -1.0))),
     ),
 )
 """Of the poses."""
 PHOTOGRAPHS = (
     Reading("as if the photographs were mirrored, left to right", "Mirror them back.", _pictures(-1.0, 1.0)),
     Reading(
-        "as if the photographs were mirrored, top to bottom", "Turn the rows of the photographs over.", _pictures(1.0, -1.0)
+        "as if the photographs were mirrored, top to bottom",
+        "Turn the rows of the photographs over.",
+        _pictures(1.0, -1.0),
     ),
 )
 """Of the photographs."""
@@ -129,14 +136,20 @@ ORDERS = (
         "Pair photographs and poses in numeric order (rename 1.jpg to 0001.jpg and so on).",
         _in_numeric_order,
     ),
-    *(
-        Reading(
-            f"as if each photograph had the pose of the {'next' if step < 0 else 'previous'} one",
-            "Shift the list of photographs against the poses by one; one end may lack a picture.",
-            _poses(lambda c2w, step=step: c2w.roll(step, 0)),  # type: ignore[misc]
-        )
-        for step in (-1, 1)
+    Reading(
+        "as if each photograph had the pose of the next one",
+        SHIFT,
+        _poses(lambda c2w: c2w.roll(-1, 0)),
     ),
-    Reading("as if the photographs' order were reversed", "Reverse the list of photographs.", _poses(lambda c2w: c2w.flip(0))),
+    Reading(
+        "as if each photograph had the pose of the previous one",
+        SHIFT,
+        _poses(lambda c2w: c2w.roll(1, 0)),
+    ),
+    Reading(
+        "as if the photographs' order were reversed",
+        "Reverse the list of photographs.",
+        _poses(lambda c2w: c2w.flip(0)),
+    ),
 )
 """Of which photograph has which pose."""

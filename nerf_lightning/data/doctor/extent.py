@@ -89,8 +89,13 @@ def box_in_view(evidence: Evidence) -> Check:
         "The cameras do not look at the box, or near and far miss it: check the axes of the poses, centre the capture "
         "on its content, or set near, far and the box (scene.aabb_half)."
     )
-    verdict = "wrong" if len(blind) > 0.3 * len(shares) else "look"
-    return Check(name, verdict, f"{message}; {len(blind)} views miss it, such as {evidence.named(blind[:3])}", cure)
+    many = len(blind) > 0.3 * len(shares)
+    return Check(
+        name,
+        "wrong" if many else "look",
+        f"{message}; {len(blind)} views miss it, such as {evidence.named(blind[:3])}",
+        cure,
+    )
 
 
 def scale(evidence: Evidence) -> Check:
@@ -101,7 +106,9 @@ def scale(evidence: Evidence) -> Check:
     away = float((centers - middle).norm(dim=-1).median())
     half = float((scene.aabb[1] - scene.aabb[0]).max()) / 2
     if scene.space != "bounded":
-        return Check(name, "ok", f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours")
+        return Check(
+            name, "ok", f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours"
+        )
     inside = ((centers > scene.aabb[0]) & (centers < scene.aabb[1])).all(dim=-1)
     message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
     if bool(inside.float().mean() > 0.3):
@@ -124,7 +131,7 @@ def _content_in_box(evidence: Evidence, message: str) -> Check:
     if inside > 1 - MANY:
         return Check("scale", "ok", message)
     reach = float(found.abs().quantile(0.98))
-    cure = f"Content reaches {reach:.2g} from the origin: enlarge the box (scene.aabb_half), or use scene.space=contracted."
+    cure = f"Content reaches {reach:.2g} from the origin: enlarge the box (scene.aabb_half), or scene.space=contracted."
     return Check("scale", "wrong" if inside < 0.5 else "look", message, cure)
 
 
@@ -144,10 +151,12 @@ def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
 def _units(low: float, high: float, near: float, far: float) -> str:
     # near and far in another unit than the poses.
     factor = ((near * far) / (low * high)) ** 0.5 if near > 0 else far / high
+    off = f"they are {max(factor, 1 / factor):.3g} times too {'large' if factor > 1 else 'small'}."
     for name, size in (("inches", INCHES), ("feet", FEET), ("centimetres", CENTIMETRES), ("millimetres", 1000.0)):
-        for ratio, words in ((size, f"in {name} and the poses in metres"), (1 / size, f"in metres and the poses in {name}")):
-            if abs(factor / ratio - 1) < 0.35:
-                return f" Near and far may be {words}: they are {max(factor, 1 / factor):.3g} times too {'large' if factor > 1 else 'small'}."
+        if abs(factor / size - 1) < 0.35:
+            return f" Near and far may be in {name} and the poses in metres: {off}"
+        if abs(factor * size - 1) < 0.35:
+            return f" Near and far may be in metres and the poses in {name}: {off}"
     return ""
 
 

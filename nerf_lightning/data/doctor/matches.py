@@ -60,7 +60,8 @@ def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> 
 
     parts = in_threads(matched, len(pairs), "Comparing photographs", shown)
     none = (torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, 2, 2), torch.zeros(0, 2), torch.zeros(0, 2, 3))
-    return Matches(*(torch.cat(column) for column in zip(none, *parts, strict=True)), tuple(views))
+    view, plane, focal, rgb = (torch.cat(column) for column in zip(none, *parts, strict=True))
+    return Matches(view, plane, focal, rgb, tuple(views))
 
 
 def likely_pairs(corners: Sequence[Corners]) -> list[tuple[int, int]]:

@@ -123,7 +123,9 @@ def baked_background(evidence: Evidence) -> Check:
     words = usual[0] if usual else "of the colour " + ", ".join(f"{255 * float(level):.0f}" for level in colour)
     if usual == [scene.background]:
         return Check(name, "ok", f"the photographs are opaque on {words}, and so is the scene's background")
-    cure = f"Set scene.background={usual[0]}." if usual else "Cut the content out (alpha), or set scene.background=none."
+    cure = (
+        f"Set scene.background={usual[0]}." if usual else "Cut the content out (alpha), or set scene.background=none."
+    )
     message = f"the photographs are opaque on a background that is {words}, but scene.background is {scene.background}"
     closed = scene.space == "bounded" and scene.background != "none"
     return Check(name, "wrong" if closed else "look", message, cure)

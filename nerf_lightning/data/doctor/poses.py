@@ -57,7 +57,7 @@ def poses_and_pixels(evidence: Evidence) -> Check:
 
 def focal_length(evidence: Evidence) -> Check:
     """Judge whether another focal length explains the pixels better."""
-    name, matches, c2w = "focal length", thinned(evidence.matches, 2 * ENOUGH), evidence.scene.cameras.c2w
+    name, matches, c2w = "focal length", thinned(evidence.matches, ENOUGH), evidence.scene.cameras.c2w
     shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
     if len(matches.view) < FEWEST or max(shares.values()) < HOPELESS:
         return Check(name, "ok", NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
@@ -89,7 +89,11 @@ def single_poses(evidence: Evidence) -> Check:
     bad = (enough & (shares < ODD * usual)).nonzero()[:, 0].tolist()
     if not bad:
         least = 100 * float(shares[enough].min())
-        return Check(name, "ok", f"{int(enough.sum())} views could be judged, and agree with their neighbours (least {least:.0f} %)")
+        return Check(
+            name,
+            "ok",
+            f"{int(enough.sum())} views could be judged, and agree with their neighbours (least {least:.0f} %)",
+        )
     fits = {view: fit for view in bad[:10] if (fit := fitting_pose(matches, c2w, view, 0.6 * float(usual))) is not None}
     swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items()]
     return Check(
