@@ -182,8 +182,8 @@ def test_a_hole_in_a_ring_of_views_is_noted():
     judged(gather(scene), "coverage", "ok", "seen from 33")
     kept = torch.arange(12)
     cameras = replace(scene.cameras[kept], lens_model="pinhole")
-    scene = replace(scene, cameras=cameras)
-    evidence = replace(gather(ball_scene(12, 12)), scene=scene)
+    evidence = gather(ball_scene(12, 12))
+    evidence = replace(evidence, scene=replace(evidence.scene, cameras=cameras))
     judged(evidence, "coverage", "look", "gap of 112 degrees", "Photographs are missing around")
 
 

@@ -79,22 +79,14 @@ def focal_length(evidence: Evidence) -> Check:
 def single_poses(evidence: Evidence) -> Check:
     """Judge each view's pose by the views that share most with it."""
     name, matches, c2w = "single poses", evidence.matches, evidence.scene.cameras.c2w
-    good = evidence.agrees
-    if len(good) < FEWEST or evidence.agreement < HOPELESS:
-        return Check(name, "ok", "not judged: " + ("too few details" if len(good) < FEWEST else "no poses fit"))
-    shares, counts = shares_of_views(matches, good, len(c2w))
-    # From photographs that share little, most matches are mistakes: they accuse nobody.
-    enough = counts >= CLEAR_PAIR * counts[counts > 0].median()
-    usual = shares[enough].median()
-    bad = (enough & (shares < ODD * usual)).nonzero()[:, 0].tolist()
+    if len(matches.view) < FEWEST or evidence.agreement < SOUND:
+        reason = "too few details" if len(matches.view) < FEWEST else "the poses as a whole do not fit"
+        return Check(name, "ok", f"not judged: {reason}")
+    bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
     if not bad:
-        least = 100 * float(shares[enough].min())
-        return Check(
-            name,
-            "ok",
-            f"{int(enough.sum())} views could be judged, and agree with their neighbours (least {least:.0f} %)",
-        )
-    fits = {view: fit for view in bad[:10] if (fit := fitting_pose(matches, c2w, view, 0.6 * float(usual))) is not None}
+        return Check(name, "ok", f"{judged} views could be judged, and agree with their neighbours (least {least:.0%})")
+    usual = evidence.agreement
+    fits = {view: fit for view in bad[:10] if (fit := fitting_pose(matches, c2w, view, 0.6 * usual)) is not None}
     swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items()]
     return Check(
         name,
@@ -105,6 +97,27 @@ def single_poses(evidence: Evidence) -> Check:
         if swapped
         else "Remove these views (scene.frames, or from the file), or estimate their poses anew.",
     )
+
+
+def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
+    """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
+
+    One view at a time, without its matches from then on: its neighbours must not suffer for it.
+    """
+    shares, largest = shares_of_views(matches, good, num_views)
+    # From photographs that share little, most matches are mistakes: they accuse nobody.
+    clear = CLEAR_PAIR * largest[largest > 0].median()
+    judged, least = int((largest >= clear).sum()), float(shares[largest >= clear].min())
+    usual, bad = shares[largest >= clear].median(), []
+    for _ in range(num_views):
+        worst = int(torch.where(largest >= clear, shares, 2.0).argmin())
+        if float(largest[worst]) < clear or shares[worst] >= ODD * usual:
+            break
+        bad.append(worst)
+        rows = (matches.view != worst).all(dim=1)
+        matches, good = matches.where(rows), good[rows]
+        shares, largest = shares_of_views(matches, good, num_views)
+    return bad, judged, least
 
 
 def shares_of_views(
