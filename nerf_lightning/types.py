@@ -141,6 +141,8 @@ class Scene:
     space: Space = "bounded"
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
     """Sparse points of a reconstruction, in scene units; there may be none."""
+    left_out: tuple[str, ...] = ()
+    """Photographs of the capture that have no pose, and so are no views."""
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,7 @@ class CaptureReader(Reader):
             to_user=(capture.undo @ extent.to_user).float(),
             protocol=self._protocol(),
             truth=None,
+            left_out=capture.left_out,
         )
 
     def folder(self) -> Path:

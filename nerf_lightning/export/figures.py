@@ -23,9 +23,9 @@ def loss_curve(
 
     Values that are not positive and finite have no place on that axis and leave a gap.
     """
-    figure = _figure(width, height)
+    figure = new_figure(width, height)
     _draw_curve(figure.subplots(), steps, values, label)
-    return _picture(figure)
+    return picture_of(figure)
 
 
 def epoch_figure(
@@ -38,7 +38,7 @@ def epoch_figure(
     """Return the three panels of one epoch: the render, its depth (scene units, near bright) and the loss."""
     rows, columns = depth.shape
     aspect = min(max(columns / rows, 0.5), 2.0)
-    figure = _figure(round(height * (2 * aspect + 1.7)), height)
+    figure = new_figure(round(height * (2 * aspect + 1.7)), height)
     left, middle, right = figure.subplots(1, 3, width_ratios=[aspect, 1.15 * aspect, 1.35])
     left.imshow(render.detach().float().cpu().clamp(0, 1).numpy())
     seen = middle.imshow(depth.detach().float().cpu().numpy(), cmap="magma_r")
@@ -51,10 +51,11 @@ def epoch_figure(
         axes.set_axis_off()
     right.set_title("loss", fontsize=10)
     _draw_curve(right, steps, losses, label="")
-    return _picture(figure)
+    return picture_of(figure)
 
 
-def _figure(width: int, height: int) -> "Figure":
+def new_figure(width: int, height: int) -> "Figure":
+    """Return an empty figure of so many pixels that lays itself out."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -77,7 +78,8 @@ def _draw_curve(axes: "Axes", steps: Sequence[int], values: Sequence[float], lab
     axes.spines[["bottom", "left"]].set_color("0.6")
 
 
-def _picture(figure: "Figure") -> UInt8[Tensor, "height width 3"]:
+def picture_of(figure: "Figure") -> UInt8[Tensor, "height width 3"]:
+    """Return the pixels of a drawn figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)

@@ -1,0 +1,74 @@
+"""`nerf doctor`: read a scene as training does, examine it, print, write `doctor.json` and `doctor.png`."""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.text import Text
+
+from nerf_lightning.commands.build import build
+from nerf_lightning.commands.run_folder import job_folder
+from nerf_lightning.data.doctor.check import Check
+from nerf_lightning.data.doctor.examine import examine
+from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.doctor_picture import doctor_picture
+from nerf_lightning.export.pictures import save_png
+
+STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
+
+
+def diagnose(config: DictConfig) -> int:
+    """Do what the config says; return the number of checks whose verdict is `wrong`."""
+    started = time.monotonic()
+    scene = build(config.scene).read()
+    folder = _folder(config, scene.name)
+    evidence, checks = examine(scene)
+    _write_json(folder / "doctor.json", scene.name, checks)
+    save_png(folder / "doctor.png", doctor_picture(evidence, checks))
+    print_checks(checks)
+    seconds = time.monotonic() - started
+    print(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
+    print(f"written to  {folder / 'doctor.json'} and {folder / 'doctor.png'}")
+    return sum(check.verdict == "wrong" for check in checks)
+
+
+def summary(checks: Sequence[Check]) -> str:
+    """Return one line.
+
+    >>> summary([Check("lens", "ok", "none"), Check("blur", "look", "2 of 50", "Remove them.")])
+    '1 ok, 1 to look at, 0 wrong'
+    """
+    counts = Counter(check.verdict for check in checks)
+    return f"{counts['ok']} ok, {counts['look']} to look at, {counts['wrong']} wrong"
+
+
+def print_checks(checks: Sequence[Check]) -> None:
+    """Print a line per check, what is wrong with its cure below."""
+    console = Console(highlight=False, soft_wrap=True)
+    width = max(len(check.name) for check in checks)
+    for check in checks:
+        line = Text.assemble(
+            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {check.message}"
+        )
+        console.print(line)
+        if check.cure:
+            console.print(Text(f"{'':<{width + 9}}cure: {check.cure}"))
+
+
+def _folder(config: DictConfig, name: str) -> Path:
+    chosen = job_folder() or config.paths.output_dir
+    if chosen:
+        return Path(chosen)
+    return Path(config.paths.root_dir) / name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
+
+
+def _write_json(path: Path, name: str, checks: Sequence[Check]) -> None:
+    content = {"scene": name, "checks": [asdict(check) for check in checks]}
+    with whole_file(path) as part:
+        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

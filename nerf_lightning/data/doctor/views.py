@@ -1,0 +1,114 @@
+"""Checks of the set of views: how many, from where, which are held out, which are missing."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.data.checks import listed
+from nerf_lightning.data.doctor.check import Check, Evidence
+from nerf_lightning.geometry.frames import focus_point
+from nerf_lightning.types import Scene
+
+FEW, TOO_FEW = 15, 5
+FEW_MATCHES = 30
+# Degrees between a held-out view and the nearest one that is learnt from.
+FAR_HELD_OUT = 40.0
+
+
+def number_of_views(evidence: Evidence) -> Check:
+    """Judge whether there are enough views to learn from."""
+    splits = evidence.scene.splits
+    count = len(splits["train"])
+    held = len(set(splits["val"]) | set(splits["test"]))
+    message = f"{count} to learn from, {held} held out"
+    if count >= FEW:
+        return Check("number of views", "ok", message)
+    cure = "Take more photographs: 15 or more of a scene seen from the front, 50 to 100 all around."
+    return Check("number of views", "wrong" if count < TOO_FEW else "look", message, cure)
+
+
+def splits(evidence: Evidence) -> Check:
+    """Judge whether views are held out, and not learnt from as well."""
+    parts = {split: set(views) for split, views in evidence.scene.splits.items()}
+    both = sorted(parts["train"] & (parts["val"] | parts["test"]))
+    if both:
+        cure = "Take them out of one of the two lists; else the scores say nothing of new views."
+        return Check("split", "wrong", f"{evidence.named(both)} are learnt from and held out at once", cure)
+    held = sorted(parts["val"] | parts["test"])
+    angles = _degrees_to_nearest(evidence.scene, held, sorted(parts["train"]))
+    lonely = [view for view, angle in zip(held, angles.tolist(), strict=True) if angle > FAR_HELD_OUT]
+    if lonely:
+        message = f"{evidence.named(lonely)} are seen from over {FAR_HELD_OUT:.0f} degrees away from any training view"
+        return Check("split", "look", message, "Expect low scores there; hold out other views, or add photographs.")
+    far = f"; the farthest lies {float(angles.max()):.0f} degrees from a training view" if len(held) else ""
+    return Check("split", "ok", f"no view is in training and held out at once{far}")
+
+
+def left_out(evidence: Evidence) -> Check:
+    """Report photographs without a pose."""
+    missing, name = evidence.scene.left_out, "photographs without pose"
+    if not missing:
+        return Check(name, "ok", "none")
+    total = len(missing) + len(evidence.scene.view_names)
+    message = f"{len(missing)} of {total} photographs have no pose: {listed(missing, cap=5)}"
+    cure = "Were they needed, take photographs between them and the others and estimate the poses anew (nerf poses)."
+    return Check(name, "look" if len(missing) < 0.5 * total else "wrong", message, cure)
+
+
+def overlap(evidence: Evidence) -> Check:
+    """Look for views that share next to nothing with others."""
+    matches = evidence.matches
+    total = len(evidence.scene.view_names)
+    counts = torch.bincount(matches.view.flatten(), minlength=total)[list(matches.views)]
+    if not len(matches.view) or int(counts.median()) < 2 * FEW_MATCHES:
+        return Check("overlap", "ok", "not judged: too few details could be found again")
+    lonely = [matches.views[place] for place in (counts < FEW_MATCHES).nonzero()[:, 0].tolist()]
+    if not lonely:
+        return Check("overlap", "ok", f"every view shares at least {int(counts.min())} details with others")
+    message = f"{evidence.named(lonely)} share next to nothing with other views"
+    return Check("overlap", "look", message, "Add photographs between these and the others, or leave these out.")
+
+
+def coverage(evidence: Evidence) -> Check:
+    """Report from where around the middle photographs were taken; a hole in a ring of views is noted."""
+    scene = evidence.scene
+    if scene.space == "ndc":
+        return Check("coverage", "ok", "forward-facing: new views are good between the cameras, not beside them")
+    azimuth, elevation = directions_seen(scene)
+    around = azimuth.sort().values
+    gaps = torch.cat([around[1:], around[:1] + 360]) - around
+    widest = gaps.sort(descending=True).values
+    up = f"heights of {float(elevation.min()):.0f} to {float(elevation.max()):.0f} degrees"
+    message = f"seen from {360 - float(widest[0]):.0f} degrees around, from {up}"
+    if len(gaps) > 8 and 50 < float(widest[0]) < 140:
+        at = float(around[int(gaps.argmax())] + widest[0] / 2)
+        cure = f"Photographs are missing around {(at + 180) % 360 - 180:.0f} degrees (see doctor.png); take some there."
+        return Check("coverage", "look", f"{message}, with a gap of {float(widest[0]):.0f} degrees", cure)
+    return Check("coverage", "ok", message)
+
+
+def middle_of(scene: Scene) -> Float[Tensor, "3"]:
+    """Return what the views are said to be around: the middle of the box, or where the cameras' axes meet."""
+    if scene.space == "bounded":
+        return scene.aabb.mean(dim=0)
+    if scene.space == "ndc" and len(scene.points):
+        return scene.points.median(dim=0).values
+    if scene.space == "ndc":
+        return torch.tensor([0.0, 0.0, -2.0])
+    return focus_point(scene.cameras.c2w.double()).float()
+
+
+def directions_seen(scene: Scene) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
+    """Return azimuth (from x towards y) and elevation in degrees of each camera, as seen from the middle."""
+    x, y, z = (scene.cameras.c2w[:, :, 3] - middle_of(scene)).unbind(dim=-1)
+    return torch.atan2(y, x).rad2deg(), torch.atan2(z, (x.square() + y.square()).sqrt()).rad2deg()
+
+
+def _degrees_to_nearest(scene: Scene, held: list[int], train: list[int]) -> Float[Tensor, "held"]:
+    towards = functional.normalize(scene.cameras.c2w[:, :, 3] - middle_of(scene), dim=-1)
+    cosine = (towards[held] @ towards[train].T).clamp(-1, 1)
+    return cosine.amax(dim=1).acos().rad2deg() if train else torch.zeros(len(held))
+
+
+CHECKS = (number_of_views, splits, left_out, overlap, coverage)

@@ -1,0 +1,90 @@
+import json
+
+import numpy as np
+import pytest
+from corner import FOCAL, HEIGHT, WIDTH, write_corner
+from PIL import Image
+
+
+@pytest.fixture
+def corner(tmp_path):
+    """Write the corner as a transforms.json after `change` of its (count, 4, 4) poses."""
+
+    def write(change=lambda poses: poses):
+        folder = tmp_path / "corner"
+        poses = np.tile(np.eye(4), (10, 1, 1))
+        poses[:, :3] = write_corner(folder / "images", 10)
+        frames = [
+            {"file_path": f"images/view {number}.png", "transform_matrix": pose.tolist()}
+            for number, pose in enumerate(change(poses))
+        ]
+        content = {"fl_x": FOCAL, "fl_y": FOCAL, "w": WIDTH, "h": HEIGHT, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def doctor(nerf, tmp_path):
+    """Call `nerf doctor` on a transforms.json; return what it printed and its checks by name."""
+
+    def call(folder, *arguments):
+        out = tmp_path / "examined"
+        settings = (f"scene.root={folder}", f"scene.cache_dir={tmp_path / 'cache'}", f"paths.output_dir={out}")
+        result = nerf("doctor", "scene=transforms", *settings, *arguments)
+        written = json.loads((out / "doctor.json").read_text()) if result.code == 0 else {"checks": []}
+        return result, {check["name"]: check for check in written["checks"]}
+
+    return call
+
+
+def test_a_good_capture(corner, doctor, tmp_path):
+    result, checks = doctor(corner())
+    assert result.code == 0
+    assert len(checks) > 20
+    assert all(set(check) == {"name", "verdict", "message", "cure"} for check in checks.values())
+    assert {check["verdict"] for check in checks.values()} <= {"ok", "look"}
+    assert all((check["cure"] == "") == (check["verdict"] == "ok") for check in checks.values())
+    assert json.loads((tmp_path / "examined" / "doctor.json").read_text())["scene"] == "transforms"
+    with Image.open(tmp_path / "examined" / "doctor.png") as picture:
+        assert picture.size == (1500, 1150)
+    lines = result.out.splitlines()
+    assert sum(line.startswith(("ok ", "look ", "wrong ")) for line in lines) == len(checks)
+    assert "0 wrong; 10 views examined in" in result.out
+
+
+def test_opencv_axes_are_printed_with_their_cure(corner, doctor):
+    result, checks = doctor(corner(lambda poses: poses * [1.0, -1.0, -1.0, 1.0]))
+    assert result.code == 0
+    assert checks["axes"]["verdict"] == "wrong"
+    assert "OpenCV" in checks["axes"]["message"]
+    assert "cure: Negate the second and third column of every rotation." in result.out
+    assert "wrong; 10 views examined" in result.out
+
+
+def test_world_to_camera_is_named(corner, doctor):
+    _, checks = doctor(corner(np.linalg.inv))
+    assert checks["axes"]["verdict"] == "wrong"
+    assert "world-to-camera rather than camera-to-world" in checks["axes"]["message"]
+
+
+def test_photographs_without_pose_reach_the_doctor(corner, doctor):
+    folder = corner()
+    Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / "spare.png")
+    _, checks = doctor(folder)
+    assert "1 of 11" in checks["photographs without pose"]["message"]
+    assert "spare.png" in checks["photographs without pose"]["message"]
+
+
+def test_a_capture_that_cannot_be_read_ends_with_one_paragraph(doctor, tmp_path):
+    result, _ = doctor(tmp_path / "nowhere")
+    assert result.code == 2
+    assert len(result.err.strip().splitlines()) == 1
+    assert "does not exist" in result.err
+    assert not (tmp_path / "examined").exists()
+
+
+def test_help_has_examples(nerf):
+    assert "nerf doctor scene=NAME" in nerf("doctor", "--help").out
+    assert "\n  doctor " in nerf("--help").out
