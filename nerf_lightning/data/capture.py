@@ -47,6 +47,8 @@ class Capture:
     """Sparse points of the reconstruction."""
     bounds: Float[Tensor, "views 2"] | None = None
     """Nearest and farthest depth of content, where the format has them."""
+    box: Float[Tensor, "2 3"] | None = None
+    """Lower and upper corner of the box that holds the content, where the format has one."""
     splits: dict[str, tuple[int, ...]] | None = None
     """Where the format names them."""
     undo: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))

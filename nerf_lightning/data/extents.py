@@ -8,10 +8,12 @@ from torch import Tensor
 
 from nerf_lightning.data.capture import Capture
 from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import (
     average_pose,
     focus_point,
+    points_from_user,
     poses_from_user,
     similarity,
     unit_of,
@@ -28,6 +30,8 @@ QUANTILES, FEWEST_POINTS = (0.01, 0.99), 20
 MOST_POINTS = 20_000
 # Of those quantiles: content may begin before the nearest point, and go on behind the farthest.
 NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
+# Room around the sparse points on each side of their box, as a share of it.
+BOX_MARGIN = 0.1
 # Without sparse points, in units of the farthest camera's distance from the middle.
 NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
 # Cameras that stand closer together than this share of their coordinates stand at one place.
@@ -69,9 +73,10 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max())
     to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)
     nearest, farthest = _from_points(capture, cameras, to_user)
-    half = UNIT_BALL_HALF
+    aabb = _cube(UNIT_BALL_HALF)
     if space == "bounded":
-        nearest, farthest, half = _around_box(cameras, to_user, nearest)
+        aabb = _box(capture, cameras, to_user)
+        nearest, farthest = _around_box(cameras, to_user, aabb, nearest)
     if near is not None:
         nearest = torch.full_like(nearest, near / unit)
     if far is not None:
@@ -83,7 +88,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
             f"scene.near={near:g} lies behind all content of {capture.source}, which ends at "
             f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."
         )
-    return Extent(to_user, nearest.float(), farthest.float(), _cube(half), None)
+    return Extent(to_user, nearest.float(), farthest.float(), aabb, None)
 
 
 def depths_of(capture: Capture, cameras: Cameras, view: int) -> Float[Tensor, "points"]:
@@ -127,16 +132,37 @@ def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[T
     return near.clamp(min=LEAST_NEAR), far.clamp(min=FAR_CONTRACTED)
 
 
-def _around_box(cameras: Cameras, to_user: Tensor, near: Tensor) -> tuple[Tensor, Tensor, float]:
-    # Near, far and half the box's side: a ball around the middle that fills the longer side of the closest picture.
-    poses = poses_from_user(cameras.c2w, to_user)
-    distance = poses[:, :, 3].norm(dim=-1)
+def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "2 3"]:
+    """Return the box that the format names, or that holds the sparse points, or that the cameras have in view."""
+    if capture.box is not None:
+        corners = torch.cartesian_prod(*capture.box.mT)
+        return _around(points_from_user(corners, to_user))
+    if len(capture.points) >= FEWEST_POINTS:
+        points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
+        # Alike towards all sides, so that it does not depend on where the user's x axis points.
+        level = (1.0 + BOX_MARGIN) * torch.quantile(points[:, :2].norm(dim=-1), QUANTILES[1])
+        low, high = torch.quantile(points[:, 2], points.new_tensor(QUANTILES))
+        room = BOX_MARGIN * (high - low)
+        return torch.stack(
+            [torch.stack([-level, -level, low - room]), torch.stack([level, level, high + room])]
+        ).float()
+    # A ball around the middle that fills the longer side of the closest picture.
+    distance = poses_from_user(cameras.c2w, to_user)[:, :, 3].norm(dim=-1)
     half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
     tangent = (half_size / cameras.focal).amax(dim=-1).double()
     radius = float((distance * tangent / (1.0 + tangent.square()).sqrt()).min())
-    half = min(radius, 0.95 * float(distance.min()))
-    reach = 3**0.5 * half
-    return torch.maximum(near, distance - reach), distance + reach, half
+    return _cube(min(radius, 0.95 * float(distance.min())))
+
+
+def _around(points: Float[Tensor, "points 3"]) -> Float[Tensor, "2 3"]:
+    return torch.stack([points.amin(dim=0), points.amax(dim=0)]).float()
+
+
+def _around_box(cameras: Cameras, to_user: Tensor, aabb: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    # Near and far of rays that begin before the box and end behind it.
+    center, half = center_and_half(aabb.double())
+    distance = (poses_from_user(cameras.c2w, to_user)[:, :, 3] - center).norm(dim=-1)
+    return torch.maximum(near, distance - half.norm()), distance + half.norm()
 
 
 def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far: float | None) -> Extent:

@@ -22,6 +22,7 @@ from nerf_lightning.geometry.poses import is_rigid
 from nerf_lightning.types import LensModel
 
 FORMAT = "A transforms.json of nerfstudio or instant-ngp"
+NGP_SCALE = 0.33
 SPLITS = ("train", "val", "test")
 
 
@@ -57,6 +58,7 @@ class TransformsReader(CaptureReader):
             lens_model=_one_lens(lenses, path),
             splits=_splits(content, frames, views, path),
             undo=_undo(content, path),
+            box=_ngp_box(content, path),
             left_out=tuple(name for name in self._neighbours(views) if name not in listed_names),
         )
 
@@ -89,6 +91,20 @@ class TransformsReader(CaptureReader):
             lens=lens,
         )
         return view, lens_model
+
+
+def _ngp_box(content: dict[str, Any], path: Path) -> Float[Tensor, "2 3"] | None:
+    """Return the box of instant-ngp's `aabb_scale`: in its own units it is a cube of that size around 0.5.
+
+    Its positions are 0.33 times the file's, plus 0.5.
+    """
+    if "aabb_scale" not in content:
+        return None
+    scale = number_of(content, "aabb_scale", str(path))
+    if not 0 < scale < math.inf:
+        raise InputError(f"{path}: aabb_scale is {scale}, but must be a positive size. Remove it, or export again.")
+    half = torch.full((3,), 0.5 * scale / NGP_SCALE, dtype=torch.float64)
+    return torch.stack([-half, half])
 
 
 def _absent(path: Path) -> str:

@@ -95,7 +95,7 @@ def _draw_cameras(
     axes.set_ylim(low[1], high[1])
     if shown == (0, 2) and scene.space == "ndc":
         axes.invert_yaxis()
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     names = ("x", "y", "z")
     axes.set_xlabel(f"{names[shown[0]]} (scene units)", fontsize=9)
     axes.set_ylabel(names[shown[1]], fontsize=9)
@@ -164,7 +164,7 @@ def _draw_directions(axes: "Axes", scene: Scene) -> None:
     for split, views in _splits(scene).items():
         at = list(views)
         axes.scatter(x[at].numpy(), y[at].numpy(), s=30, color=COLOURS[split], edgecolors="white", lw=0.5)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.margins(0.2)
     axes.set_title("coverage: where the cameras stood, seen from behind them", fontsize=11)
     axes.set_xlabel("x (scene units)", fontsize=9)

@@ -1,5 +1,6 @@
 """From a capture to a scene: what must not depend on the frame that the user happens to have."""
 
+import json
 import logging
 
 import numpy as np
@@ -106,6 +107,26 @@ def test_the_box_of_a_bounded_scene_is_around_the_middle_and_no_camera_is_inside
     # Rays begin before the box and end behind it.
     torch.testing.assert_close(scene.far, distance + 3**0.5 * half)
     assert bool((scene.near <= (distance - 3**0.5 * half).clamp(min=0.051)).all())
+
+
+def test_the_box_of_a_bounded_scene_holds_the_sparse_points(tmp_path):
+    points = np.random.default_rng(3).uniform(-0.6, 0.6, (400, 3)) * [1.0, 1.0, 0.3]
+    scene = read("colmap", write_colmap(tmp_path / "c", Known(points=points)), space="bounded")
+    inside = ((scene.points > scene.aabb[0]) & (scene.points < scene.aabb[1])).all(dim=-1)
+    assert float(inside.float().mean()) > 0.98
+    low, high = scene.points[:, 2].min(), scene.points[:, 2].max()
+    assert float(scene.aabb[1, 2] - scene.aabb[0, 2]) < 1.3 * float(high - low)
+
+
+def test_instant_ngps_box_is_kept_where_it_is(tmp_path):
+    root = write_transforms(tmp_path / "c", Known())
+    content = json.loads((root / "transforms.json").read_text()) | {"aabb_scale": 2}
+    (root / "transforms.json").write_text(json.dumps(content))
+    scene = read("transforms", root, space="bounded")
+    middle = scene.to_user[:3, :3] @ scene.aabb.mean(dim=0) + scene.to_user[:3, 3]
+    torch.testing.assert_close(middle, torch.zeros(3), atol=1e-4, rtol=0)
+    least = 2 / 0.33 / unit_of(scene.to_user)
+    assert bool((scene.aabb[1] - scene.aabb[0] > 0.999 * least).all())
 
 
 def test_the_near_plane_lies_before_all_content(tmp_path):
