@@ -179,3 +179,12 @@ def test_a_forward_facing_capture_is_looked_at_from_in_front():
     around = frame_of(cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
     assert around.center.tolist() == [0.0, 0.0, -5.0]
     assert around.up.tolist() == [0.0, 1.0, 0.0]
+
+
+def test_a_film_is_no_larger_than_asked():
+    large = replace(frame(), width=4000, height=3000, focal=3000.0)
+    cameras = AutoPath(num_frames=2).cameras(large)
+    assert (int(cameras.width[0]), int(cameras.height[0])) == (480, 360)
+    assert float(cameras.focal[0, 0]) == pytest.approx(360.0)
+    assert int(AutoPath(num_frames=2, width=800).cameras(large).height[0]) == 600
+    assert int(AutoPath(num_frames=2).cameras(frame()).width[0]) == 100

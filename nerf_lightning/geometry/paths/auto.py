@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.types import Cameras
@@ -22,26 +22,38 @@ class AutoPath(CameraPath):
 
     Args:
         num_frames: how many cameras.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        width: picture's width in pixels; None: it follows the height.
+        height: picture's height in pixels; None: it follows the width.
+        longest: where neither is given, the picture is as large as the photographs, but its longer side has at most so
+            many pixels: a film of photographs at full size takes hours.
         fps: frames per second.
     """
 
     def __init__(
-        self, num_frames: int = 120, width: int | None = None, height: int | None = None, fps: int = 30
+        self,
+        num_frames: int = 120,
+        width: int | None = None,
+        height: int | None = None,
+        longest: int = 480,
+        fps: int = 30,
     ) -> None:
-        self.spiral = Spiral(num_frames, width=width, height=height, fps=fps)
+        check_setting("longest", longest, longest >= 1, "at least 1 pixel")
+        Spiral(num_frames, width=width, height=height, fps=fps)  # refuses what is out of range
         self.num_frames, self.width, self.height, self.fps = num_frames, width, height, fps
+        self.longest = longest
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the path that was chosen."""
+        width = self.width
+        if width is None and self.height is None:
+            width = max(1, round(around.width * min(1.0, self.longest / max(around.width, around.height))))
         from_center = around.poses[:, :, 3] - around.center
         if widest_gap(from_center, around.up) > WIDEST_GAP:
-            return self.spiral.cameras(around)
+            return Spiral(self.num_frames, width=width, height=self.height, fps=self.fps).cameras(around)
         height = from_center @ around.up / (from_center.norm(dim=-1) * around.up.norm())
         elevation = float(torch.rad2deg(height.clamp(-1, 1).asin()).median())
         elevation = min(max(elevation, LOWEST), HIGHEST)
-        return Orbit(self.num_frames, elevation, width=self.width, height=self.height, fps=self.fps).cameras(around)
+        return Orbit(self.num_frames, elevation, width=width, height=self.height, fps=self.fps).cameras(around)
 
 
 def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:
