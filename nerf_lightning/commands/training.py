@@ -71,7 +71,7 @@ def _build_parts(config: DictConfig) -> Parts:
     num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
     num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
-    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True))
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     progress = Progress()
     system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
     if config.init_from is not None:

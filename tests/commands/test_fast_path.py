@@ -111,6 +111,21 @@ def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overri
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
+def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp_path, model):
+    """The order of the levels is part of what it keeps."""
+    small = [x for x in TINY if not x.startswith(("model", "data.sample_budget"))]
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *[x for x in QUIET if x not in TINY], *small, f"model={model}",
+        "trainer.max_steps=2", "final.evaluate=false", "final.video=false", f"paths.output_dir={tmp_path}/run",
+    )  # fmt: skip
+    assert result.code == 0, result.err
+    last = tmp_path / "run/checkpoints/last.ckpt"
+    result = nerf("render", f"ckpt={last}", "path.num_frames=2", f"paths.output_dir={tmp_path}/film")
+    assert result.code == 0, result.err
+    assert (tmp_path / "film/video.mp4").is_file()
+
+
 def test_bench_measures_a_packed_model(nerf, tmp_path):
     result = nerf(
         "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",
