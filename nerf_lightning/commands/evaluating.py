@@ -13,6 +13,7 @@ def evaluate(config: DictConfig) -> float:
     settings = build(config.trainer)
     settings.prepare_machine()
     checkpoint = read_checkpoint(config.ckpt)
+    settings.keep_tile(checkpoint.tile_points)
     model = load_model(checkpoint).to(settings.device)
     folder = output_folder(config.paths.output_dir, checkpoint.path, "evaluation")
     scene = build(config.scene).read()

@@ -14,6 +14,7 @@ def render(config: DictConfig) -> None:
     settings = build(config.trainer)
     settings.prepare_machine()
     checkpoint = read_checkpoint(config.ckpt)
+    settings.keep_tile(checkpoint.tile_points)
     model = load_model(checkpoint).to(settings.device)
     path = build(config.path)
     folder = output_folder(config.paths.output_dir, checkpoint.path, "render")

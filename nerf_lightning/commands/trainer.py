@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
+MOST_CPU_TILE_POINTS = 1 << 18
 ALL_THREADS = torch.get_num_threads()
 M_MMAP_THRESHOLD = -3
 M_TRIM_THRESHOLD = -1
@@ -106,6 +107,11 @@ class TrainerSettings:
             enable_progress_bar=any(type(callback).__name__ == "TrainingProgress" for callback in callbacks),
             log_every_n_steps=1,
         )
+
+    def keep_tile(self, measured: int | None) -> None:
+        """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
+        if self.measures_tile and measured is not None:
+            self.tile_points = min(measured, MOST_CPU_TILE_POINTS) if self.device_type == "cpu" else measured
 
     @property
     def device(self) -> torch.device:

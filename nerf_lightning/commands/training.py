@@ -94,6 +94,7 @@ def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder.path)
         parts.settings.keep_precision(former.precision)
+        parts.settings.keep_tile(former.tile_points)
     parts.system.record["precision"] = parts.settings.precision
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
         parts.system.tile_points = parts.settings.tile_points = measured_tile(
