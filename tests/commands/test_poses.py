@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alignment import colmap_poses, pose_errors
+from captures import real_capture
 from corner import write_corner
-from data.captures import real_capture
 from PIL import Image
 
 pytest.importorskip("pycolmap")

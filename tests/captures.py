@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 FOV = 0.8
-REAL = Path(os.environ.get("NERF_LIGHTNING_DATA", Path(__file__).parents[3] / "shared" / "data"))
+REAL = Path(os.environ.get("NERF_LIGHTNING_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
 def real_capture(name: str) -> Path:
