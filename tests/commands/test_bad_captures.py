@@ -1,7 +1,7 @@
 """What a person reads when a capture is broken: one paragraph, exit code 2, and no run folder."""
 
 import pytest
-from data.posed_captures import Known, write_colmap, write_llff, write_transforms
+from posed_captures import Known, write_colmap, write_llff, write_transforms
 from running import FAST
 
 BROKEN = {

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import real_capture
-from data.doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
+from doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
 from scenes import ball_scene
 
 from nerf_lightning.data.colmap import ColmapReader

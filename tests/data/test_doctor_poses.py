@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from data.doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
+from doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
 
 from nerf_lightning.data.doctor.conventions import axes, inverted, numeric_order, transposed
 from nerf_lightning.data.doctor.epipolar import agreeing, distances, parallax, places
