@@ -178,7 +178,8 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
 def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
     result = nerf(
         "train", f"experiment={experiment}", f"scene.root={real_capture('fern')}", "trainer.max_epochs=null",
-        "trainer.max_steps=2", "data.batch_rays=64", "data.val_rays=64", "scene.downscale=14", "evaluation.max_views=1",
+        "trainer.max_steps=2", "data.batch_rays=64", "data.val_rays=64", "scene.downscale=28", "evaluation.max_views=1",
+        "trainer.tile_points=8192",
         "path.num_frames=2", "path.width=8", f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err
