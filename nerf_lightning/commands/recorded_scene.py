@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.commands.overrides import quoted
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 
@@ -34,7 +35,7 @@ def scene_overrides(path: str) -> list[str]:
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
-    return [f"scene={name}", *(f"scene.{key}={_quoted(value)}" for key, value in values.items())]
+    return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
 
 
 def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -57,13 +58,3 @@ def _found(place: str, checkpoint: Path) -> str:
         return str(there) if there.exists() else place
     except (OSError, RuntimeError, ValueError, TypeError, KeyError, yaml.YAMLError):
         return place
-
-
-def _quoted(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, str):
-        # Single quotes: Hydra takes what stands in them as it is, but for quotes, backslashes and interpolations.
-        text = value.replace("\\", "\\\\").replace("'", "\\'").replace("${", "\\${")
-        return f"'{text}'"
-    return str(value).lower() if isinstance(value, bool) else str(value)
