@@ -5,6 +5,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.finish import metric_lines
+from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.commands.run_folder import output_folder
 
 
@@ -16,7 +17,7 @@ def evaluate(config: DictConfig) -> float:
     settings.keep_tile(checkpoint.tile_points)
     model = load_model(checkpoint).to(settings.device)
     folder = output_folder(config.paths.output_dir, checkpoint.path, "evaluation")
-    scene = build(config.scene).read()
+    scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
     with settings.inference():
         metrics = build(config.evaluation).score(model, scene, scene.background, settings.inference_tile_points, folder)
     print("\n".join(metric_lines(metrics, folder)))

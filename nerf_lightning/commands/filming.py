@@ -1,12 +1,13 @@
 """Render a model along a camera path: colour and depth, as videos or as frames."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from rich.progress import track
 from torch import Tensor
 
@@ -15,13 +16,17 @@ from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.pictures import depth_picture, to_bytes
 from nerf_lightning.export.video import write_frames, write_video
+from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
+from nerf_lightning.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.geometry.paths.base import CameraPath, frame_of
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
-from nerf_lightning.types import Background
+from nerf_lightning.types import Background, Cameras
 
 FORMATS = ("video", "frames")
+
+log = logging.getLogger(__name__)
 
 
 def film(
@@ -62,11 +67,27 @@ def render_path(
     cameras = path.cameras(frame_of(scene.cameras, scene.aabb))
     count = cameras.c2w.shape[0]
     if scene.cameras.ndc is not None:
+        lost = int((~in_front_of_near_plane(cameras)).sum())
+        if lost:
+            log.warning(
+                "%d of %d cameras of the path look aside or stand among the content, where the forward-facing capture "
+                "%s has nothing to show: their pictures mean nothing. Use path=spiral.",
+                lost,
+                count,
+                scene.name,
+            )
         cameras = replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
     near = scene.near.min().expand(count)
     far = scene.far.max().expand(count)
     for view in track(range(count), description="filming", transient=True, console=stderr_console()):
         yield render_picture(model, cameras, view, near, far, background, tile_points)
+
+
+def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
+    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
+    zeros = torch.zeros(len(cameras.c2w))
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
+    return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
 
 
 def _write(folder: Path, name: str, frames: list[UInt8[Tensor, "h w 3"]], fps: int, form: str) -> Path:

@@ -1,7 +1,6 @@
 """`nerf poses`: photographs or a video in, a folder that `scene=colmap` reads out."""
 
 import contextlib
-import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.run_folder import job_folder
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.data.checks import listed
@@ -180,7 +180,10 @@ def _summary(model: SparseModel, matching: str, config: DictConfig, folder: Path
         lines.append(f"left out            {listed(model.left_out)}")
     if found < ENOUGH * total:
         lines.append(_advice(matching, bool(config.video)))
-    return [*lines, f"next                nerf train scene=colmap {shlex.quote(f'scene.root={folder}')}"]
+    return [
+        *lines,
+        f"next                nerf train model=fast_proposal scene=colmap {to_type('scene.root', str(folder))}",
+    ]
 
 
 def _advice(matching: str, is_video: bool) -> str:

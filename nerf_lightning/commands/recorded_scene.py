@@ -1,17 +1,24 @@
 """The scene that a checkpoint was trained on, as overrides for our own conf/."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.commands.overrides import quoted
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+
+# Settings of scenes that say where a capture lies.
+PLACES = ("root", "path")
 
 
 def scene_overrides(path: str) -> list[str]:
     """Return `scene=NAME` and the recorded plain values that our yaml of this name knows.
+
+    A relative place that is not found from here is taken from where the run was started, if its folder still says.
 
     Raises:
         InputError: the checkpoint cannot be read, or was trained on a scene that our conf/ lacks.
@@ -26,7 +33,9 @@ def scene_overrides(path: str) -> list[str]:
         )
     recorded = yaml.safe_load(checkpoint.config).get("scene", {})
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
-    return [f"scene={name}", *(f"scene.{key}={_quoted(value)}" for key, value in _plain_values(recorded, ours))]
+    values = dict(_plain_values(recorded, ours))
+    values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
+    return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
 
 
 def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
@@ -40,11 +49,12 @@ def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = ""
             yield f"{path}{key}", value
 
 
-def _quoted(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, str):
-        # Single quotes: Hydra takes what stands in them as it is, but for quotes, backslashes and interpolations.
-        text = value.replace("\\", "\\\\").replace("'", "\\'").replace("${", "\\${")
-        return f"'{text}'"
-    return str(value).lower() if isinstance(value, bool) else str(value)
+def _found(place: str, checkpoint: Path) -> str:
+    try:
+        if Path(place).expanduser().is_absolute() or Path(place).exists():
+            return place
+        note = (checkpoint.parent.parent / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
+        there = Path(yaml.safe_load(note)["runtime"]["cwd"]) / place
+        return str(there) if there.exists() else place
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return place

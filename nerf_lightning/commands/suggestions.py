@@ -11,6 +11,7 @@ from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 
+from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.errors import InputError
 
 
@@ -28,6 +29,14 @@ def explain(error: BaseException, command: str, conf_folder: Path) -> str:
         reason = str(chain[-1]).splitlines()[0]
         return f"{where.group(1) if where else 'The config'} cannot be built: {reason}. See nerf {command} --help."
     message = " ".join(str(error).split())
+    unread = re.match(r"LexerNoViableAltException: ([^=\s]+)=(.*) \^ See https", message)
+    unread = unread or re.match(r"Error parsing override '([^=\s]+)=(.*)' HydraException while evaluating", message)
+    if unread:
+        key, value = unread.groups()
+        return (
+            f"{key}={value} cannot be read: spaces, brackets and other special characters need quotes for Hydra and "
+            f"for the shell. Type {to_type(key, value)}."
+        )
     key = _mistyped_key([str(link) for link in chain])
     close = difflib.get_close_matches(key, _known_keys(command, conf_folder), n=3, cutoff=0.6) if key else []
     hint = f" Did you mean {' or '.join(close)}?" if close else ""

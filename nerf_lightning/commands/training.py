@@ -1,7 +1,6 @@
 """The training run: build the parts, take the folder, fit, evaluate, film."""
 
 import logging
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.tile_choice import measured_tile
@@ -138,7 +138,7 @@ def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> lis
 
 
 def _resume_command(folder: Path) -> str:
-    return shlex.join(["nerf", "train", f"resume={folder}"])
+    return f"nerf train {to_type('resume', str(folder))}"
 
 
 @contextmanager

@@ -125,7 +125,8 @@ class CaptureReader(Reader):
         except RuntimeError as error:
             raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
         if not folder.is_dir():
-            raise InputError(f"The folder {folder} does not exist. Set scene.root to the capture's folder.")
+            where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
+            raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder
 
     def mask_of(self, name: str) -> Path | None:

@@ -96,15 +96,23 @@ class TransformsReader(CaptureReader):
 def _ngp_box(content: dict[str, Any], path: Path) -> Float[Tensor, "2 3"] | None:
     """Return the box of instant-ngp's `aabb_scale`: in its own units it is a cube of that size around 0.5.
 
-    Its positions are 0.33 times the file's, plus 0.5.
+    Its positions are `scale` times the file's, plus `offset`; 0.33 and 0.5 where the file does not say.
     """
     if "aabb_scale" not in content:
         return None
-    scale = number_of(content, "aabb_scale", str(path))
-    if not 0 < scale < math.inf:
-        raise InputError(f"{path}: aabb_scale is {scale}, but must be a positive size. Remove it, or export again.")
-    half = torch.full((3,), 0.5 * scale / NGP_SCALE, dtype=torch.float64)
-    return torch.stack([-half, half])
+    size, scale = number_of(content, "aabb_scale", str(path)), number_of(content, "scale", str(path), NGP_SCALE)
+    for key, value in (("aabb_scale", size), ("scale", scale)):
+        if not 0 < value < math.inf:
+            raise InputError(f"{path}: {key} is {value}, but must be a positive size. Remove it, or export again.")
+    offset = content.get("offset", [0.5, 0.5, 0.5])
+    if not isinstance(offset, list) or len(offset) != 3:
+        raise InputError(f"{path}: offset is {offset!r}, but must be three numbers. Remove it, or export again.")
+    numbers = [number_of({"offset": number}, "offset", str(path)) for number in offset]
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"{path}: offset holds NaN or infinity. Remove it, or export again.")
+    middle = (0.5 - torch.tensor(numbers, dtype=torch.float64)) / scale
+    half = 0.5 * size / scale
+    return torch.stack([middle - half, middle + half])
 
 
 def _absent(path: Path) -> str:

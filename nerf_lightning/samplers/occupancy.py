@@ -41,7 +41,7 @@ class OccupancySampler(AnySampler):
     Args:
         resolution: cells along a side of the box; a multiple of 4.
         num_cascades: boxes, each twice as large as the one before, the first being the scene's. None: 1, and in
-            contracted scenes 6 of half the resolution.
+            contracted scenes 6 of half the resolution (in whole blocks of 4 cells).
         num_steps: intervals across the diagonal of the scene's box.
         cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike. None: 0, and in
             contracted scenes 1/256.
@@ -227,7 +227,7 @@ class OccupancySampler(AnySampler):
         """Make the grid as large as the space wants it; what it held is forgotten."""
         resolution, cascades, cone_angle = self.wanted
         if self.contracted:
-            resolution = resolution // 2 if cascades is None else resolution
+            resolution = max(BLOCK, resolution // 2 // BLOCK * BLOCK) if cascades is None else resolution
             cascades = CASCADES_ENDLESS if cascades is None else cascades
             cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
         self.resolution, self.num_cascades, self.cone_angle = resolution, cascades or 1, cone_angle or 0.0

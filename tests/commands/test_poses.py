@@ -125,7 +125,7 @@ def test_the_cameras_of_a_known_scene_are_found(poses, tmp_path):
     assert result.code == 0, result.err
     assert result.err == ""
     assert "registered          6 of 6 photographs (one camera, exhaustive matching)" in result.out
-    assert f"nerf train scene=colmap scene.root={tmp_path / 'found'}" in result.out
+    assert f"nerf train model=fast_proposal scene=colmap scene.root={tmp_path / 'found'}" in result.out
     assert {path.name for path in (tmp_path / "found").iterdir()} == {"images", "sparse"}
     found = colmap_poses(tmp_path / "found" / "sparse" / "0")
     assert sorted(found) == [f"view {number}.png" for number in range(6)]

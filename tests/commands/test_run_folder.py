@@ -72,6 +72,16 @@ def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path
     assert json.loads((tmp_path / "here/run.json").read_text()) == before
 
 
+def test_where_decoded_pictures_are_kept_does_not_make_another_run(tmp_path):
+    colmap = ("scene=colmap", "scene.root=somewhere", f"paths.output_dir={tmp_path}/here")
+    begin(config(tmp_path, *colmap)).release()
+    run = open_run(
+        config(tmp_path, *colmap, "resume=auto", "scene.verify=true", f"scene.cache_dir={tmp_path}"), 100, None
+    )
+    assert run.path == tmp_path / "here"
+    run.release()
+
+
 def test_resume_of_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no run in"):
         open_run(config(tmp_path, f"resume={tmp_path}/nothing"), 100, None)

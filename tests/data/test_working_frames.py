@@ -9,6 +9,8 @@ import torch
 from PIL import Image
 from posed_captures import Known, read, ring, user_rays, wall, write_colmap, write_llff, write_transforms
 
+from nerf_lightning.data.transforms import TransformsReader
+from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import unit_of
 
 AHEAD = np.array([0.0, 5.0, 0.0])
@@ -127,6 +129,33 @@ def test_instant_ngps_box_is_kept_where_it_is(tmp_path):
     torch.testing.assert_close(middle, torch.zeros(3), atol=1e-4, rtol=0)
     least = 2 / 0.33 / unit_of(scene.to_user)
     assert bool((scene.aabb[1] - scene.aabb[0] > 0.999 * least).all())
+
+
+def test_instant_ngps_own_scale_and_offset_move_its_box(tmp_path):
+    root = write_transforms(tmp_path / "c", Known())
+    said = {"aabb_scale": 2, "scale": 0.25, "offset": [0.5, 0.25, 1.0]}
+    content = json.loads((root / "transforms.json").read_text()) | said
+    (root / "transforms.json").write_text(json.dumps(content))
+    # 0.25 x + offset = 0.5 in the middle, and 2 / 0.25 from side to side.
+    box = TransformsReader(root=str(root)).capture().box
+    assert box is not None
+    assert box.tolist() == [[-4.0, -3.0, -6.0], [4.0, 5.0, 2.0]]
+
+
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        ({"scale": 0}, "scale is 0.0, but must be a positive size"),
+        ({"offset": [0.5, 0.5]}, r"offset is \[0.5, 0.5\], but must be three numbers"),
+        ({"offset": [0.5, float("nan"), 0.5]}, "offset holds NaN"),
+    ],
+)
+def test_a_scale_or_offset_that_makes_no_box_is_refused(tmp_path, said, text):
+    root = write_transforms(tmp_path / "c", Known())
+    content = json.loads((root / "transforms.json").read_text()) | {"aabb_scale": 2} | said
+    (root / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=text):
+        read("transforms", root, space="bounded")
 
 
 def test_the_near_plane_lies_before_all_content(tmp_path):

@@ -149,6 +149,7 @@ def sizes(sampler):
         ({}, 6, 8, 1 / 256),
         ({"num_cascades": 2}, 2, 16, 1 / 256),
         ({"cone_angle": 0.0}, 6, 8, 0.0),
+        ({"resolution": 20}, 6, 8, 1 / 256),
     ],
 )
 def test_contracted_space_wants_more_and_coarser_boxes_unless_told(settings, cascades, side, cone_angle):
