@@ -15,7 +15,7 @@ from nerf_lightning.commands.run_folder import job_folder
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.image_pairs import chosen_matching
-from nerf_lightning.data.photograph_folder import Photograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.data.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.data.sfm_settings import SfmSettings, stage_costs
 from nerf_lightning.data.structure_from_motion import SparseModel, reconstruct, require_pycolmap
@@ -147,7 +147,7 @@ def _from_video(video: Path, every: int | None, folder: Path, settings: SfmSetti
     return model, chosen_matching(settings.matching, len(photographs))
 
 
-def _frames(video: Path, images: Path, stride: int, num_frames: int) -> list[Photograph]:
+def _frames(video: Path, images: Path, stride: int, num_frames: int) -> list[FoundPhotograph]:
     try:
         return find_photographs(images)
     except InputError as error:

@@ -35,8 +35,8 @@ class CaptureReader(Reader):
         downscale: whole factor by which the photographs shrink; focal lengths follow.
         hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
-        masks: a folder below root with a mask for each photograph, of the same name (or with .png added); white is
-            kept. null: no masks, or those that the format names.
+        masks: a folder below root with a mask for each photograph, of the same name below it (or with .png added, or
+            with .png for its ending); white is kept. null: no masks, or those that the format names.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content may begin, in the user's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
@@ -138,11 +138,12 @@ class CaptureReader(Reader):
         if self.masks is None:
             return None
         beside = self.folder() / self.masks / name
-        for candidate in (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png")):
+        candidates = (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png"))
+        for candidate in candidates:
             if is_there(candidate):
                 return candidate
         raise InputError(
-            f"scene.masks={self.masks} holds no mask for {name}: neither {beside} nor {beside.name}.png exists. Add it "
+            f"scene.masks={self.masks} holds no mask for {name}: neither {listed(candidates)} exists. Add it "
             "(all white keeps the whole photograph), or leave the view out with scene.frames."
         )
 

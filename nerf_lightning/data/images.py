@@ -56,8 +56,9 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
         if turned != 1:
             raise InputError(
                 f"{path} carries the EXIF orientation {turned}: it is stored turned or mirrored, so its "
-                "pixels do not match its camera. Turn the pixels themselves and remove the tag (for example "
-                "with `magick mogrify -auto-orient`), and estimate the cameras anew if they exist."
+                "camera may be that of the turned picture or of the stored one. If the cameras were estimated from "
+                "the pixels as they are stored, remove the tag alone (`exiftool -Orientation= FILE`); else turn the "
+                "pixels (`magick mogrify -auto-orient FILE`) and estimate the cameras anew."
             )
         if image.mode in GREY_16:
             image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))

@@ -19,7 +19,7 @@ JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Photograph:
+class FoundPhotograph:
     """A picture file and what its header says; sizes in pixels, upright."""
 
     path: Path
@@ -36,7 +36,7 @@ class Photograph:
         return self.width, self.height, self.lens
 
 
-def find_photographs(folder: Path) -> list[Photograph]:
+def find_photographs(folder: Path) -> list[FoundPhotograph]:
     """Return the photographs that lie in a folder, sorted by name; folders inside it are not searched.
 
     Raises:
@@ -55,7 +55,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     return [_photograph(path) for path in pictures]
 
 
-def put_upright(photograph: Photograph, folder: Path) -> None:
+def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
     """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew.
 
     Raises:
@@ -71,7 +71,7 @@ def put_upright(photograph: Photograph, folder: Path) -> None:
         shutil.copyfile(photograph.path, target)
 
 
-def check_pixels(photograph: Photograph) -> None:
+def check_pixels(photograph: FoundPhotograph) -> None:
     """Decode a photograph once, so that a damaged one is named before hours are spent on the others.
 
     Raises:
@@ -81,7 +81,7 @@ def check_pixels(photograph: Photograph) -> None:
         read_rgba(photograph.path)
 
 
-def check_one_camera(photographs: list[Photograph]) -> None:
+def check_one_camera(photographs: list[FoundPhotograph]) -> None:
     """Refuse to describe photographs of different sizes by one camera.
 
     Raises:
@@ -96,7 +96,7 @@ def check_one_camera(photographs: list[Photograph]) -> None:
         )
 
 
-def _photograph(path: Path) -> Photograph:
+def _photograph(path: Path) -> FoundPhotograph:
     width, height = image_size(path)
     if min(width, height) < SMALLEST_SIDE:
         raise InputError(
@@ -113,7 +113,7 @@ def _photograph(path: Path) -> Photograph:
     tags = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
     lens = (str(exif.get(ExifTags.Base.Model, "")), *(str(details.get(tag, "")) for tag in tags))
     # Orientations 5 to 8 are quarter turns.
-    return Photograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
+    return FoundPhotograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
 
 
 def _exif(path: Path) -> Image.Exif:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nerf_lightning.data.image_pairs import Matching, image_pairs
-from nerf_lightning.data.photograph_folder import Photograph
+from nerf_lightning.data.photograph_folder import FoundPhotograph
 from nerf_lightning.errors import require_positive
 
 CameraMode = Literal["single", "per_image", "auto"]
@@ -49,7 +49,7 @@ class SfmSettings:
         return self.num_threads or os.cpu_count() or 1
 
 
-def stage_costs(photographs: list[Photograph], settings: SfmSettings) -> dict[str, float]:
+def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings) -> dict[str, float]:
     """Return the seconds that each stage would take on one thread of an ordinary machine, roughly."""
     num_pairs = len(image_pairs(settings.matching, len(photographs)))
     shrunk = [(p, min(1.0, settings.max_image_size / max(p.width, p.height))) for p in photographs]

@@ -15,7 +15,7 @@ from typing import Any
 
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.image_pairs import image_pairs, tiles_of
-from nerf_lightning.data.photograph_folder import Photograph, check_one_camera
+from nerf_lightning.data.photograph_folder import FoundPhotograph, check_one_camera
 from nerf_lightning.data.sfm_settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings
 from nerf_lightning.errors import InputError
 
@@ -53,7 +53,7 @@ def require_pycolmap() -> Any:
 
 
 def reconstruct(
-    photographs: list[Photograph],
+    photographs: list[FoundPhotograph],
     folder: Path,
     work: Path,
     sparse: Path,
@@ -113,7 +113,7 @@ def _quiet(colmap: Any) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _camera_groups(photographs: list[Photograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
+def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
     """Return the names that share a camera, group by group, and those that have a camera each."""
     if mode == "per_image":
         return [], [p.path.name for p in photographs]
