@@ -3,7 +3,7 @@
 import math
 
 import torch
-from data.posed_captures import Known, read, wall, write_llff
+from posed_captures import Known, read, wall, write_llff
 
 from nerf_lightning.commands.filming import in_front_of_near_plane
 from nerf_lightning.geometry.cameras import pinhole_cameras

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from data.posed_captures import Known, read, wall, write_colmap, write_llff
+from posed_captures import Known, read, wall, write_colmap, write_llff
 
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.recorded_frame import in_recorded_frame

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from data.posed_captures import Known, ring, write_colmap, write_llff, write_transforms
+from posed_captures import Known, ring, write_colmap, write_llff, write_transforms
 from running import FAST
 
 WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}

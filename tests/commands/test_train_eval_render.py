@@ -6,7 +6,7 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
-from data.captures import real_capture
+from captures import real_capture
 from running import FAST
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from videos import read_video
