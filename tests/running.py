@@ -40,3 +40,13 @@ def start(*arguments: str, **options) -> subprocess.Popen:
         text=True,
         **options,
     )
+
+
+def said(result, *parts: str) -> None:
+    """Expect one paragraph with these words, exit code 2, and no traceback."""
+    assert result.code == 2, result.err
+    paragraph = result.err.strip()
+    assert len(paragraph.splitlines()) == 1, paragraph
+    assert "Traceback" not in paragraph
+    for part in parts:
+        assert part in paragraph, paragraph

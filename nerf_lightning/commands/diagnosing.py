@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nerf_lightning.commands.build import build
-from nerf_lightning.commands.run_folder import job_folder
+from nerf_lightning.commands.run_folder import output_folder
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.data.doctor.examine import examine
 from nerf_lightning.export.atomic import whole_file
@@ -27,7 +27,8 @@ def diagnose(config: DictConfig) -> int:
     """Do what the config says; return the number of checks whose verdict is `wrong`."""
     started = time.monotonic()
     scene = build(config.scene).read()
-    folder = _folder(config, scene.name)
+    default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
     _write_json(folder / "doctor.json", scene.name, checks)
     save_png(folder / "doctor.png", doctor_picture(evidence, checks))
@@ -59,13 +60,6 @@ def print_checks(checks: Sequence[Check]) -> None:
         console.print(line)
         if check.cure:
             console.print(Text(f"{'':<{width + 9}}cure: {check.cure}"))
-
-
-def _folder(config: DictConfig, name: str) -> Path:
-    chosen = job_folder() or config.paths.output_dir
-    if chosen:
-        return Path(chosen)
-    return Path(config.paths.root_dir) / name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
 
 
 def _write_json(path: Path, name: str, checks: Sequence[Check]) -> None:

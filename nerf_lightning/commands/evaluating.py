@@ -6,7 +6,7 @@ from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.finish import metric_lines
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
-from nerf_lightning.commands.run_folder import output_folder
+from nerf_lightning.commands.run_folder import beside_checkpoint, output_folder
 
 
 def evaluate(config: DictConfig) -> float:
@@ -16,7 +16,7 @@ def evaluate(config: DictConfig) -> float:
     checkpoint = read_checkpoint(config.ckpt)
     settings.keep_tile(checkpoint.tile_points)
     model = load_model(checkpoint).to(settings.device)
-    folder = output_folder(config.paths.output_dir, checkpoint.path, "evaluation")
+    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
     scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
     with settings.inference():
         metrics = build(config.evaluation).score(model, scene, scene.background, settings.inference_tile_points, folder)

@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.errors import InputError
@@ -33,22 +31,15 @@ def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:
         scene = replace(scene, cameras=replace(scene.cameras, ndc=ndc), far=far)
     if torch.equal(scene.to_user, record.to_user):
         return scene
-    here, there = scene.to_user.double(), record.to_user.double()
-    c2w = poses_from_user(_poses_to_user(scene.cameras.c2w.double(), here), there).float()
-    points = points_from_user(scene.points.double() @ here[:3, :3].mT + here[:3, 3], there).float()
-    ratio = 1.0 if record.cameras.ndc is not None else unit_of(here) / unit_of(there)
+    # The model's frame as this scene's sees it: theirs to the user's, and the user's to this one.
+    apart = torch.linalg.inv(scene.to_user.double()) @ record.to_user.double()
+    ratio = 1.0 if record.cameras.ndc is not None else 1.0 / unit_of(apart)
     return replace(
         scene,
-        cameras=replace(scene.cameras, c2w=c2w),
+        cameras=replace(scene.cameras, c2w=poses_from_user(scene.cameras.c2w.double(), apart).float()),
         near=ratio * scene.near,
         far=ratio * scene.far,
         aabb=record.aabb,
-        points=points,
+        points=points_from_user(scene.points.double(), apart).float(),
         to_user=record.to_user,
     )
-
-
-def _poses_to_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
-    turned = (to_user[:3, :3] / unit_of(to_user)) @ c2w[:, :, :3]
-    centers = c2w[:, :, 3] @ to_user[:3, :3].mT + to_user[:3, 3]
-    return torch.cat([turned, centers[:, :, None]], dim=-1)

@@ -198,17 +198,21 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
         part.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def output_folder(given: str | None, checkpoint: Path, name: str) -> Path:
-    """Return where a command that reads a checkpoint writes: as given, else a folder of this name in its run folder.
+def beside_checkpoint(checkpoint: Path, name: str) -> Path:
+    """Return the folder of this name in the run folder that a checkpoint lies in."""
+    beside = checkpoint.absolute().parent
+    return (beside.parent if beside.name == "checkpoints" else beside) / name
+
+
+def output_folder(given: str | None, default: Path) -> Path:
+    """Return where a command that does not train writes: as given, else by default.
 
     The jobs of a sweep have folders of their own.
 
     Raises:
         InputError: the folder cannot be made or written.
     """
-    beside = checkpoint.absolute().parent
-    run_folder = beside.parent if beside.name == "checkpoints" else beside
-    folder = job_folder() or (Path(given) if given else run_folder / name)
+    folder = job_folder() or Path(given or default)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{os.getpid()}.probe"

@@ -14,6 +14,7 @@ from nerf_lightning.data.checks import (
     check_bounds,
     check_divisible,
     check_step,
+    contents,
     known_background,
     listed,
     one_size,
@@ -115,9 +116,8 @@ class BlenderReader(Reader):
             raise InputError(f"The folder {self.root} does not exist. Set scene.root to the capture's folder.")
         files = {split: self.root / f"transforms_{split}.json" for split in SPLITS}
         if not files["train"].is_file():
-            present = listed(sorted(path.name for path in self.root.iterdir())) or "nothing"
             raise InputError(
-                f"{files['train']} does not exist; the folder holds {present}. "
+                f"{files['train']} does not exist; the folder holds {contents(self.root)}. "
                 "Set scene.root to the folder that holds transforms_train.json."
             )
         frames = {

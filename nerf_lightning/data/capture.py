@@ -57,6 +57,17 @@ class Capture:
     """Photographs that have no pose."""
 
 
+def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
+    """Return the model that holds all of these lenses, a scene having one; None where fisheyes are among others.
+
+    >>> common_lens_model({"pinhole", "radial_tangential"}), common_lens_model({"pinhole", "fisheye"})
+    ('radial_tangential', None)
+    """
+    if "fisheye" in kinds:
+        return "fisheye" if len(kinds) == 1 else None
+    return "radial_tangential" if "radial_tangential" in kinds else "pinhole"
+
+
 def filtered(capture: Capture, pattern: str | None) -> Capture:
     """Return the views whose names fit a pattern of * and ?.
 

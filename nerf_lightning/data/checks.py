@@ -26,6 +26,11 @@ def listed(items: Iterable[object], cap: int = 10) -> str:
     return shown if len(names) <= cap else f"{shown} and {len(names) - cap} more"
 
 
+def contents(folder: Path) -> str:
+    """Return what a folder holds, in a few words."""
+    return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+
+
 def check_step(name: str, value: int) -> None:
     """Refuse a factor or stride below 1.
 

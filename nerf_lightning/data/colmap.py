@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.capture import Capture, View
+from nerf_lightning.data.capture import Capture, View, common_lens_model
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
 from nerf_lightning.data.checks import is_absolute, is_there, listed
 from nerf_lightning.data.colmap_model import find_model, read_model
@@ -110,10 +110,10 @@ def _lens_model(used: set[str], folder: Path) -> LensModel:
             f"{listed(LAYOUTS)}. Undistort the photographs with `colmap image_undistorter`, or reconstruct with "
             "OPENCV (or OPENCV_FISHEYE)."
         )
-    kinds = {LAYOUTS[name][0] for name in used}
-    if {"radial_tangential", "fisheye"} <= kinds or {"pinhole", "fisheye"} <= kinds:
+    lens_model = common_lens_model({LAYOUTS[name][0] for name in used})
+    if lens_model is None:
         raise InputError(
             f"{folder} mixes fisheye lenses with others ({listed(sorted(used))}), and a scene has one kind. Undistort "
             "the photographs with `colmap image_undistorter`, or split the capture."
         )
-    return "fisheye" if "fisheye" in kinds else "radial_tangential" if "radial_tangential" in kinds else "pinhole"
+    return lens_model

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from nerf_lightning.data.capture import Capture, View
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
-from nerf_lightning.data.checks import listed
+from nerf_lightning.data.checks import contents, listed
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 
@@ -84,9 +84,9 @@ def _array(path: Path) -> ndarray:
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:
     if not path.is_file():
-        present = listed(sorted(p.name for p in path.parent.iterdir())) or "nothing"
         raise InputError(
-            f"{path} does not exist; the folder holds {present}. Point scene.root at the folder that has it."
+            f"{path} does not exist; the folder holds {contents(path.parent)}. "
+            "Point scene.root at the folder that has it."
         )
     rows = _array(path)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":

@@ -1,6 +1,7 @@
 """How much of space is modelled: a box, what lies in front of a near plane, or everything."""
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -18,24 +19,22 @@ FORWARD_FACING = 0.82
 LEAST_AHEAD = 0.1
 
 
-def choose_space(asked: str, cameras: Cameras, capture: Capture, has_transparency: bool) -> tuple[Space, str]:
+def choose_space(
+    asked: Space | Literal["auto"], cameras: Cameras, capture: Capture, has_transparency: bool
+) -> tuple[Space, str]:
     """Return the space, and why.
 
     Raises:
         InputError: NDC was asked for and cannot work.
     """
     cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
-    if asked == "ndc":
-        if not ahead:
-            raise InputError(
-                f"scene.space=ndc needs cameras that all look the same way, but some pixels of {capture.source} look "
-                "sideways or back. Use scene.space=contracted, or auto."
-            )
-        return "ndc", "as asked"
-    if asked == "bounded":
-        return "bounded", "as asked"
-    if asked == "contracted":
-        return "contracted", "as asked"
+    if asked == "ndc" and not ahead:
+        raise InputError(
+            f"scene.space=ndc needs cameras that all look the same way, but some pixels of {capture.source} look "
+            "sideways or back. Use scene.space=contracted, or auto."
+        )
+    if asked != "auto":
+        return asked, "as asked"
     if has_transparency:
         return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
     if ahead and cosine > FORWARD_FACING and capture.bounds is not None:

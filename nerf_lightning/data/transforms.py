@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.capture import Capture, View
+from nerf_lightning.data.capture import Capture, View, common_lens_model
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
-from nerf_lightning.data.checks import is_absolute, is_there, listed, pose_from_matrix
+from nerf_lightning.data.checks import contents, is_absolute, is_there, listed, pose_from_matrix
 from nerf_lightning.data.images import ENDINGS, image_size
 from nerf_lightning.data.json_files import keys_of, read_json
 from nerf_lightning.data.photographs import Photograph
@@ -121,8 +121,8 @@ def _absent(path: Path) -> str:
             f"{path} does not exist, but transforms_train.json does: this is the Blender format. "
             f"Use scene=blender scene.root={path.parent}."
         )
-    present = listed(sorted(p.name for p in path.parent.iterdir())) or "nothing"
-    return f"{path} does not exist; the folder holds {present}. Point scene.root at the folder with {path.name}."
+    held = contents(path.parent)
+    return f"{path} does not exist; the folder holds {held}. Point scene.root at the folder with {path.name}."
 
 
 def _picture(path: Path, where: str, name: object) -> Path:
@@ -164,9 +164,10 @@ def _four_rows(matrix: object) -> object:
 
 
 def _one_lens(kinds: set[LensModel], path: Path) -> LensModel:
-    if "fisheye" in kinds and len(kinds) > 1:
+    lens_model = common_lens_model(kinds)
+    if lens_model is None:
         raise InputError(f"{path} mixes fisheye lenses with others, and a scene has one kind. Split the capture.")
-    return "fisheye" if "fisheye" in kinds else "radial_tangential" if "radial_tangential" in kinds else "pinhole"
+    return lens_model
 
 
 def _splits(

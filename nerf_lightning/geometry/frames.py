@@ -64,6 +64,16 @@ def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.eye(3).to(up) + skew + skew @ skew / (1.0 + cosine)
 
 
+def gaps_around(azimuth: Float[Tensor, "views"]) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
+    """Return azimuths in degrees in order, and the way from each to the next, the last one's to the first.
+
+    >>> [part.tolist() for part in gaps_around(torch.tensor([90.0, 0.0, -120.0]))]
+    [[-120.0, 0.0, 90.0], [120.0, 90.0, 150.0]]
+    """
+    around = azimuth.sort().values
+    return around, torch.cat([around[1:], around[:1] + 360]) - around
+
+
 def average_pose(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3 4"]:
     """Return the pose in the middle of cameras that look the same way, as LLFF takes it."""
     back = functional.normalize(c2w[:, :, 2].sum(dim=0), dim=0)

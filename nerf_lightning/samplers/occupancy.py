@@ -81,7 +81,6 @@ class OccupancySampler(AnySampler):
         if resolution % BLOCK or resolution < BLOCK:
             raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
         self.wanted = (resolution, num_cascades, cone_angle)
-        self.resolution, self.num_cascades, self.cone_angle = resolution, num_cascades or 1, cone_angle or 0.0
         self.num_steps = num_steps
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity

@@ -2,7 +2,7 @@
 
 import pytest
 from posed_captures import Known, write_colmap, write_llff, write_transforms
-from running import FAST
+from running import FAST, said
 
 BROKEN = {
     "colmap": ("sparse/0/images.bin", ("images.bin ends after 100 bytes", "cut short", "nerf poses images=DIR")),
@@ -17,13 +17,8 @@ def train(nerf, tmp_path, kind, *settings):
     return nerf("train", f"scene={kind}", *where, *FAST, *settings)
 
 
-def said(result, tmp_path, *parts):
-    assert result.code == 2, result.err
-    paragraph = result.err.strip()
-    assert len(paragraph.splitlines()) == 1, paragraph
-    assert "Traceback" not in paragraph
-    for part in parts:
-        assert part in paragraph, paragraph
+def refused(result, tmp_path, *parts):
+    said(result, *parts)
     assert not (tmp_path / "run").exists()
     assert not list((tmp_path / "cache").glob("*.pixels")) if (tmp_path / "cache").exists() else True
 
@@ -34,18 +29,20 @@ def test_a_broken_capture_is_one_paragraph_and_leaves_nothing(nerf, tmp_path, ki
     name, parts = BROKEN[kind]
     path = tmp_path / "capture" / name
     path.write_bytes(path.read_bytes()[:100])
-    said(train(nerf, tmp_path, kind), tmp_path, *parts)
+    refused(train(nerf, tmp_path, kind), tmp_path, *parts)
 
 
 def test_an_unknown_space_is_no_silent_auto(nerf, tmp_path):
     write_colmap(tmp_path / "capture", Known())
-    said(train(nerf, tmp_path, "colmap", "scene.space=unbounded"), tmp_path, "space", "auto", "bounded", "contracted")
+    refused(
+        train(nerf, tmp_path, "colmap", "scene.space=unbounded"), tmp_path, "space", "auto", "bounded", "contracted"
+    )
 
 
 def test_a_root_that_is_a_number(nerf, tmp_path):
-    said(train(nerf, tmp_path, "colmap", "scene.root=123"), tmp_path, "root")
+    refused(train(nerf, tmp_path, "colmap", "scene.root=123"), tmp_path, "root")
 
 
 def test_a_downscale_that_is_not_whole(nerf, tmp_path):
     write_colmap(tmp_path / "capture", Known())
-    said(train(nerf, tmp_path, "colmap", "scene.downscale=1.5"), tmp_path, "downscale", "1.5")
+    refused(train(nerf, tmp_path, "colmap", "scene.downscale=1.5"), tmp_path, "downscale", "1.5")

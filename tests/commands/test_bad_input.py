@@ -9,19 +9,10 @@ import sys
 import pytest
 import torch
 import yaml
-from running import FAST, REPOSITORY, start
+from running import FAST, REPOSITORY, said, start
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO, sweep_leftovers
 from nerf_lightning.errors import InputError
-
-
-def said(result, *parts):
-    assert result.code == 2, result.err
-    paragraph = result.err.strip()
-    assert len(paragraph.splitlines()) == 1, paragraph
-    assert "Traceback" not in paragraph
-    for part in parts:
-        assert part in paragraph, paragraph
 
 
 @pytest.fixture

@@ -6,9 +6,10 @@ from torch import Tensor
 
 from nerf_lightning.data.doctor.check import Check, Evidence
 from nerf_lightning.data.doctor.epipolar import distances, parallax, places
-from nerf_lightning.geometry.cameras import PixelIndex, rays_through_pixels
+from nerf_lightning.geometry.boxes import distances_in_box
+from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
-from nerf_lightning.types import Scene
+from nerf_lightning.types import PixelIndex, Scene
 
 # Rays that meet at a smaller angle (radians) say little of distances.
 LEAST_PARALLAX = 0.04
@@ -141,11 +142,8 @@ def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
         (steps * scene.cameras.height[view]).long(), (steps * scene.cameras.width[view]).long(), indexing="ij"
     )
     rays = rays_through_pixels(scene.cameras, PixelIndex(torch.full_like(x, view), x, y), scene.near, scene.far)
-    slope = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
-    ends = (scene.aabb[:, None, None] - rays.origins) / slope
-    entry = torch.maximum(ends.amin(dim=0).amax(dim=-1), rays.near)
-    leave = torch.minimum(ends.amax(dim=0).amin(dim=-1), rays.far)
-    return (leave > entry).float().mean()
+    enter, leave = distances_in_box(rays, scene.aabb)
+    return (leave > enter).float().mean()
 
 
 def _units(low: float, high: float, near: float, far: float) -> str:

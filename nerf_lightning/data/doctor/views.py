@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.doctor.check import Check, Evidence
-from nerf_lightning.geometry.frames import focus_point
+from nerf_lightning.geometry.frames import focus_point, gaps_around
 from nerf_lightning.types import Scene
 
 FEW, TOO_FEW = 15, 5
@@ -76,15 +76,14 @@ def coverage(evidence: Evidence) -> Check:
     if scene.space == "ndc":
         return Check("coverage", "ok", "forward-facing: new views are good between the cameras, not beside them")
     azimuth, elevation = directions_seen(scene)
-    around = azimuth.sort().values
-    gaps = torch.cat([around[1:], around[:1] + 360]) - around
-    widest = gaps.sort(descending=True).values
+    around, gaps = gaps_around(azimuth)
+    widest = float(gaps.max())
     up = f"heights of {float(elevation.min()):.0f} to {float(elevation.max()):.0f} degrees"
-    message = f"seen from {360 - float(widest[0]):.0f} degrees around, from {up}"
-    if len(gaps) > 8 and 50 < float(widest[0]) < 140:
-        at = float(around[int(gaps.argmax())] + widest[0] / 2)
+    message = f"seen from {360 - widest:.0f} degrees around, from {up}"
+    if len(gaps) > 8 and 50 < widest < 140:
+        at = float(around[int(gaps.argmax())] + widest / 2)
         cure = f"Photographs are missing around {(at + 180) % 360 - 180:.0f} degrees (see doctor.png); take some there."
-        return Check("coverage", "look", f"{message}, with a gap of {float(widest[0]):.0f} degrees", cure)
+        return Check("coverage", "look", f"{message}, with a gap of {widest:.0f} degrees", cure)
     return Check("coverage", "ok", message)
 
 

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
+from nerf_lightning.geometry.frames import gaps_around
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting, horizontal
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.types import Cameras
@@ -37,8 +38,8 @@ class AutoPath(CameraPath):
         longest: int = 480,
         fps: int = 30,
     ) -> None:
+        check_film(num_frames, width, height, fps)
         check_setting("longest", longest, longest >= 1, "at least 1 pixel")
-        Spiral(num_frames, width=width, height=height, fps=fps)  # refuses what is out of range
         self.num_frames, self.width, self.height, self.fps = num_frames, width, height, fps
         self.longest = longest
 
@@ -64,9 +65,6 @@ def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> flo
     270
     """
     up = up / up.norm()
-    axis = torch.eye(3).to(up)[int(up.abs().argmin())]
-    east = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
+    east = horizontal(up)
     north = torch.linalg.cross(up, east)
-    angles = torch.rad2deg(torch.atan2(offsets @ north, offsets @ east)).sort().values
-    around = torch.cat([angles, angles[:1] + 360.0])
-    return float(around.diff().max())
+    return float(gaps_around(torch.atan2(offsets @ north, offsets @ east).rad2deg())[1].max())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Cameras
@@ -54,6 +55,25 @@ def check_setting(name: str, value: object, good: bool, rule: str) -> None:
     """
     if not good:
         raise InputError(f"path.{name} is {value}, but must be {rule}")
+
+
+def check_film(num_frames: int, width: int | None, height: int | None, fps: int) -> None:
+    """Refuse what no film can be.
+
+    Raises:
+        InputError: a setting that all paths share is out of its range.
+    """
+    check_setting("num_frames", num_frames, num_frames >= 1, "at least 1")
+    check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
+    check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
+    check_setting("fps", fps, fps >= 1, "at least 1")
+
+
+def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
+    axis = torch.zeros_like(up)
+    axis[0 if abs(float(up[0])) < 0.9 else 1] = 1.0
+    return normalize(axis - (axis @ up) * up, dim=0)
 
 
 class CameraPath(ABC):

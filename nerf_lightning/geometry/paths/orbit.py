@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.geometry.cameras import pinhole_cameras
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting, horizontal
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -43,14 +43,11 @@ class Orbit(CameraPath):
         height: int | None = None,
         fps: int = 30,
     ) -> None:
-        check_setting("num_frames", num_frames, num_frames >= 1, "at least 1")
+        check_film(num_frames, width, height, fps)
         check_setting("elevation", elevation, -90 < elevation < 90, "between -90 and 90 degrees, both excluded")
         check_setting("radius", radius, radius is None or 0 < radius < math.inf, "a positive distance, or null")
         check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
         check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
-        check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
-        check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
-        check_setting("fps", fps, fps >= 1, "at least 1")
         self.num_frames, self.elevation, self.radius = num_frames, elevation, radius
         self.turns, self.start, self.fps = turns, start, fps
         self.width, self.height = width, height
@@ -66,17 +63,10 @@ class Orbit(CameraPath):
     def _directions(self, up: Float[Tensor, "3"]) -> Float[Tensor, "frames 3"]:
         """Return unit vectors from the centre to the cameras."""
         up = normalize(up, dim=0)
-        east = _horizontal(up)
+        east = horizontal(up)
         north = torch.linalg.cross(up, east)
         steps = torch.arange(self.num_frames, dtype=up.dtype, device=up.device) / self.num_frames
         azimuth = (math.radians(self.start) + 2 * math.pi * self.turns * steps)[:, None]
         level = torch.cos(azimuth) * east + torch.sin(azimuth) * north
         elevation = math.radians(self.elevation)
         return math.cos(elevation) * level + math.sin(elevation) * up
-
-
-def _horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
-    axis = torch.zeros_like(up)
-    axis[0 if abs(float(up[0])) < 0.9 else 1] = 1.0
-    return normalize(axis - (axis @ up) * up, dim=0)

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.geometry.cameras import pinhole_cameras
 from nerf_lightning.geometry.frames import average_pose
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -37,12 +37,9 @@ class Spiral(CameraPath):
         height: int | None = None,
         fps: int = 30,
     ) -> None:
-        check_setting("num_frames", num_frames, num_frames >= 1, "at least 1")
+        check_film(num_frames, width, height, fps)
         check_setting("reach", reach, 0 < reach < math.inf, "a positive share")
         check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
-        check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
-        check_setting("fps", fps, fps >= 1, "at least 1")
         self.num_frames, self.reach, self.turns, self.fps = num_frames, reach, turns, fps
         self.width, self.height = width, height
 
