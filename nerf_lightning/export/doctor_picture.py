@@ -87,6 +87,8 @@ def _draw_cameras(
         x, y = centers[views][:, shown].unbind(dim=-1)
         axes.scatter(x.numpy(), y.numpy(), s=9, color=COLOURS[split], label=label, zorder=3)
     everything = torch.cat([centers[:, shown], middle[None, shown]]).numpy()
+    if scene.space == "bounded":
+        everything = np.concatenate([everything, scene.aabb[:, shown].numpy()])
     if len(content):
         inner = content[:, shown].numpy()
         everything = np.concatenate([everything, np.quantile(inner, [0.03, 0.97], axis=0)])
