@@ -2,12 +2,13 @@
 
 import pytest
 import torch
-from posed_captures import Known, read, wall, write_colmap, write_llff
+from posed_captures import Known, read, ring, wall, write_colmap, write_llff
 
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.frames import unit_of
 
 
 def rays_of(scene, name):
@@ -32,9 +33,12 @@ def test_some_of_the_views_are_seen_along_the_rays_of_training(tmp_path, space):
 
 
 def test_distances_and_points_follow_the_unit(tmp_path):
-    root = write_colmap(tmp_path, Known())
+    poses = ring()
+    poses[-1, :, 3] *= 1.5  # left out below, and it is the farthest camera that the unit follows
+    root = write_colmap(tmp_path, Known(c2w=poses))
     whole = read("colmap", root, space="contracted", near=1.0, far=30.0)
     some = read("colmap", root, space="contracted", near=1.0, far=30.0, frames="p_[0-3]*")
+    assert unit_of(whole.to_user) > 1.2 * unit_of(some.to_user)
     moved = in_recorded_frame(some, scene_record(whole))
     torch.testing.assert_close(moved.near, whole.near[:4])
     torch.testing.assert_close(moved.far, whole.far[:4])
