@@ -90,7 +90,7 @@ def _build_parts(config: DictConfig) -> Parts:
 
 
 def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
-    former = None if folder.checkpoint is None else read_checkpoint(folder.checkpoint)
+    former = folder.read_checkpoint()
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder.path)
         parts.settings.keep_precision(former.precision)
@@ -104,7 +104,7 @@ def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
     _announce(parts, folder.path, former)
     if former is None:
         describe_run(trainer.loggers, config)
-    trainer.fit(parts.system, parts.data, ckpt_path=folder.checkpoint, weights_only=True)
+    trainer.fit(parts.system, parts.data, ckpt_path=None if former is None else former.path, weights_only=True)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder.path))
         raise SystemExit(128 + parts.signals.received)
