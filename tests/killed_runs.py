@@ -3,11 +3,12 @@
     python tests/killed_runs.py PLANS ARGUMENTS...
 
 PLANS is a json list; each start of the program takes the next: `{"after": SECONDS}`, or `{"in": FUNCTION, "call": N}`
-for the N-th call of one of the functions that saving goes through, before, amid or after it. `null` lets it run to the
-end. Prints a json list with what became of each start.
+for the N-th call of one of the functions that saving goes through, before, amid or after it, or `{"full": N}` for a
+disk that is full at the N-th save. `null` lets it run to the end. Prints a json list with what became of each start.
 """
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -61,6 +62,19 @@ def arm(where: str, call: int, folder: str) -> None:
     setattr(module, name, deadly)
 
 
+def fill_disk(call: int) -> None:
+    """Let the disk be full at the `call`-th save."""
+    real, calls = torch.save, []
+
+    def save(content, file):
+        calls.append(1)
+        if len(calls) == call:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(content, file)
+
+    torch.save = save
+
+
 def child(plan: dict | None, arguments: list[str], log: Path) -> None:
     with log.open("a") as file:
         os.dup2(file.fileno(), 1)
@@ -68,6 +82,8 @@ def child(plan: dict | None, arguments: list[str], log: Path) -> None:
     folder = next(argument.partition("=")[2] for argument in arguments if argument.startswith("paths.output_dir="))
     if plan is not None and "in" in plan:
         arm(plan["in"], plan["call"], f"{folder}/checkpoints")
+    if plan is not None and "full" in plan:
+        fill_disk(plan["full"])
     if plan is not None and "after" in plan:
         threading.Timer(plan["after"], die).start()
     sys.argv = ["nerf", *arguments]
@@ -93,8 +109,6 @@ def main() -> None:
             child(plan, arguments, log)
         _, status = os.waitpid(process, 0)
         ended.append(os.waitstatus_to_exitcode(status))
-        if ended[-1] not in (0, -signal.SIGKILL):
-            break
     print(json.dumps(ended))
 
 

@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -52,10 +52,13 @@ class RunFolder:
             return read_checkpoint(self.named_checkpoint)
         folder = self.path / "checkpoints"
         found = newest_checkpoint(folder)
-        if found is not None and found.path.name == PREVIOUS and (folder / LAST).exists():
-            # Else the next save would put the damaged one in the place of the good one.
+        if found is None or found.path.name == LAST:
+            return found
+        # Else the next save would put the damaged one in the place of the good one.
+        with contextlib.suppress(FileNotFoundError):
             os.replace(folder / LAST, folder / DAMAGED)
-        return found
+        os.replace(folder / PREVIOUS, folder / LAST)
+        return replace(found, path=folder / LAST)
 
     def finish(self, step: int) -> None:
         """Note that the run is complete."""

@@ -74,6 +74,34 @@ def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, nev
 
 
 @pytest.mark.slow
+def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
+    """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""
+    folder = tmp_path / "run"
+    codes, said, content = finish_after([{"full": 3}, {"full": 12}], capture, folder)
+    assert codes == [2, 2, 0], said
+    assert said.count("nerf: The checkpoint") == 2, said
+    assert "No space left on device" in said
+    assert f"Free some space, then go on with resume={folder}." in said
+    assert "Traceback" not in said
+    assert all(torch.equal(content["state_dict"][key], value) for key, value in never_killed["state_dict"].items())
+
+
+@pytest.mark.slow
+def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(capture, tmp_path, never_killed):
+    folder = tmp_path / "run"
+    finish_after([], capture, folder)
+    last = folder / "checkpoints" / "last.ckpt"
+    finished, whole = torch.load(last, weights_only=True), last.read_bytes()
+    last.write_bytes(whole[: len(whole) // 2])
+    codes, said, content = finish_after([], capture, folder)
+    assert codes == [0], said
+    assert f"{last} is damaged; the one before is used instead" in said
+    assert (folder / "checkpoints" / "damaged.ckpt").stat().st_size == len(whole) // 2
+    for state in (finished, content):
+        assert all(torch.equal(state["state_dict"][key], value) for key, value in never_killed["state_dict"].items())
+
+
+@pytest.mark.slow
 @pytest.mark.exhaustive
 def test_a_run_that_is_killed_at_50_moments_ends_the_same(capture, tmp_path, never_killed):
     killed = 0
