@@ -7,6 +7,7 @@ from typing import Any, Literal
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoints import Checkpoints, writer
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.checkpoints import last_good_checkpoint
@@ -66,10 +67,7 @@ class NanGuard(Callback):
         self._act(trainer, pl_module, cause)
 
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
-        writer(trainer).wait()
-        # The first rank writes; the others must not look before it has.
-        trainer.strategy.barrier("nan_guard")
-        good = last_good_checkpoint(Checkpoints.folder(trainer))
+        good = ranks.from_first(lambda: _last_good(trainer))
         if self.on_nan == "stop" or system.progress.rollbacks >= self.max_rollbacks:
             raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
@@ -113,3 +111,8 @@ class NanGuard(Callback):
         lower = f"Go on from it at a lower rate with {resume}, or begin" if self.on_nan == "stop" else "Begin"
         weights = f"a new run from its weights (init_from={good})"
         return f"The last good checkpoint is {good}. {lower} {weights} with {settings}."
+
+
+def _last_good(trainer: Trainer) -> Path | None:
+    writer(trainer).wait()
+    return last_good_checkpoint(Checkpoints.folder(trainer))

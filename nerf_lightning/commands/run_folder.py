@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import json
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
-from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, Checkpoint, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
 from nerf_lightning.commands.suggestions import flatten
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
@@ -42,23 +42,25 @@ class RunFolder:
     named_checkpoint: Path | None
     """The checkpoint that the user named to go on from."""
 
-    def read_checkpoint(self) -> Checkpoint | None:
-        """Read where training goes on: the checkpoint that the user named, else the newest that is whole, else None.
+    def whole_checkpoint(self) -> Path | None:
+        """Return where training goes on: the checkpoint that the user named, else the newest that is whole, if any.
 
         Raises:
             InputError: there are checkpoints, and none can be read.
         """
         if self.named_checkpoint is not None:
-            return read_checkpoint(self.named_checkpoint)
+            return self.named_checkpoint
         folder = self.path / "checkpoints"
         found = newest_checkpoint(folder)
-        if found is None or found.path.name == LAST:
-            return found
+        if found is None:
+            return None
+        if found.path.name == LAST:
+            return found.path
         # Else the next save would put the damaged one in the place of the good one.
         with contextlib.suppress(FileNotFoundError):
             os.replace(folder / LAST, folder / DAMAGED)
         os.replace(folder / PREVIOUS, folder / LAST)
-        return replace(found, path=folder / LAST)
+        return folder / LAST
 
     def finish(self, step: int) -> None:
         """Note that the run is complete."""
