@@ -94,13 +94,15 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     assert system.progress.step == 4
 
 
-def test_gradients_that_stay_not_finite_stop_the_run_with_advice():
+def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
     system = make_system(None)
     with torch.no_grad():
         system.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    with pytest.raises(InputError, match=r"not a finite number since 10 steps .*optimizer\.lr.*trainer\.clip_norm=1"):
-        gradients(system, ball_scene(), steps=20)
-    assert system.progress.step == 9
+    gradients(system, ball_scene(), steps=7)
+    assert system.guard.in_row == 7
+    assert system.guard.first_module.startswith("levels.fine.field.")
+    assert not system.is_sound()
+    assert system.broken_weights() == "levels.fine.field.color_head"
 
 
 def test_weights_that_are_not_finite_are_not_saved():
