@@ -29,6 +29,25 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3
     return torch.stack([torch.stack(row) for row in rows])
 
 
+def quaternion_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """Return the unit quaternion w, x, y, z (w not negative) of a rotation; the inverse of `rotation_from_quaternion`.
+
+    It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (AIAA 00-4101, 2000), so no case is special.
+
+    >>> quaternion_from_rotation(torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])).round(decimals=4).tolist()
+    [0.7071, 0.0, 0.0, 0.7071]
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.double()
+    rows = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    vector = torch.linalg.eigh(torch.stack([torch.stack(row) for row in rows]))[1][:, -1]
+    return (vector if vector[0] >= 0 else -vector).to(rotation)
+
+
 def look_at(
     eye: Float[Tensor, "*views 3"], target: Float[Tensor, "*views 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*views 3 4"]:
