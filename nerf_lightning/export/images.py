@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -40,9 +40,6 @@ class ImagesExport(Export):
     """
 
     def __init__(self, split: Split = "test", max_views: int | None = None, depth: DepthKind = "distance"):
-        for name, value, known in (("split", split, get_args(Split)), ("depth", depth, get_args(DepthKind))):
-            if value not in known:
-                raise InputError(f"what.{name}={value}: choose one of {', '.join(known)}.")
         if max_views is not None and max_views < 1:
             raise InputError(f"what.max_views={max_views}: give at least one view, or null for all.")
         self.split, self.max_views, self.depth = split, max_views, depth
@@ -107,7 +104,9 @@ def _plain(name: str) -> str:
 
 def _save_opacity(path: Path, opacity: Float[Tensor, "height width"]) -> None:
     with whole_file(path) as part:
-        Image.fromarray(to_bytes(opacity[..., None])[..., 0].numpy()).save(part, format="PNG")
+        Image.fromarray(to_bytes(opacity[..., None].expand(-1, -1, 3))[..., 0].contiguous().numpy()).save(
+            part, format="PNG"
+        )
 
 
 def _save_depth(folder: Path, name: str, scale: float) -> None:

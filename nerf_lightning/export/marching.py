@@ -16,7 +16,7 @@ BLOCK = 64
 def marching_cubes(
     density: Float[ndarray, "x y z"], level: float, report: Report, stage: str = "surface", block: int = BLOCK
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Return the surface density = level: vertices in units of cells, and faces that run anticlockwise seen from outside.
+    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside.
 
     Blocks share the points between them and so the vertices there, bit for bit, which are then made one.
     """

@@ -15,17 +15,20 @@ from nerf_lightning.export.base import Export, refuse_ndc
 from nerf_lightning.export.components import without_floaters
 from nerf_lightning.export.lattice import require_resolution, sample_density
 from nerf_lightning.export.marching import marching_cubes
-from nerf_lightning.export.mesh_files import MESH_FORMATS, MeshFormat, save_mesh
+from nerf_lightning.export.mesh_files import MeshFormat, save_mesh
 from nerf_lightning.export.mesh_libraries import require_library
-from nerf_lightning.export.surface_colors import SEEN_FROM, SeenFrom, surface_colors
+from nerf_lightning.export.seen_faces import seen_faces
+from nerf_lightning.export.surface_colors import SeenFrom, surface_colors
 from nerf_lightning.export.surface_level import surface_level
 from nerf_lightning.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.models.levels import RadianceModel
 
 # The density's grid, and as much again for the mesh.
 BYTES_PER_POINT = 8
+# So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
+RATIO = 10.0
 # A guess at how the time is shared; the bar corrects itself.
-COSTS = {"density": 6.0, "surface": 2.0, "colours": 4.0}
+COSTS = {"density": 6.0, "surface": 2.0, "views": 6.0, "colours": 4.0}
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +41,7 @@ class MeshExport(Export):
         threshold: density per scene unit at the surface; None: where rendering sees it (`surface_level`).
         colors: seen from the nearest cameras, or along the surface's normal.
         min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
+        seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
         faces: most faces, reached by decimation; None keeps all.
         format: of the file.
     """
@@ -48,6 +52,7 @@ class MeshExport(Export):
         threshold: float | None = None,
         colors: SeenFrom = "cameras",
         min_share: float = 0.01,
+        seen_only: bool = True,
         faces: int | None = None,
         format: MeshFormat = "ply",
     ):
@@ -57,11 +62,8 @@ class MeshExport(Export):
             raise InputError(f"what.min_share={min_share}: give a share from 0 (all is kept) to 1 (the largest part).")
         if faces is not None and faces < 4:
             raise InputError(f"what.faces={faces}: a closed mesh has 4 or more; null keeps all.")
-        for name, value, known in (("colors", colors, SEEN_FROM), ("format", format, MESH_FORMATS)):
-            if value not in known:
-                raise InputError(f"what.{name}={value}: choose one of {', '.join(known)}.")
         self.resolution, self.threshold, self.colors = resolution, threshold, colors
-        self.min_share, self.faces, self.format = min_share, faces, format
+        self.min_share, self.seen_only, self.faces, self.format = min_share, seen_only, faces, format
 
     def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""
@@ -73,18 +75,21 @@ class MeshExport(Export):
             if record.space == "bounded":
                 _close(density)
             level = self._level(model, record, density, tile_points)
-            vertices, faces = marching_cubes(density, level, report)
+            _to_log_ratio(density, level)
+            vertices, faces = marching_cubes(density, 0.0, report)
             del density
+            vertices = lattice.to_scene(vertices)
+            if self.seen_only:
+                faces = seen_faces(model, record, vertices, faces, tile_points, report)
             vertices, faces = self._cleaned(vertices, faces)
             normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
-            points = torch.from_numpy(lattice.to_scene(vertices)).float()
-            outward = torch.from_numpy(normals).float()
+            points, outward = (torch.from_numpy(each).float() for each in (vertices, normals))
             # Two cells to each side: so far the surface may be off.
             reach = 2.0 * lattice.spacing
             colors = surface_colors(model, record, points, outward, reach, self.colors, tile_points, report)
-        path = folder / f"mesh.{self.format}"
-        to_user = record.to_user.double()
-        placed, turned = points_to_user(points.double(), to_user), directions_to_user(outward.double(), to_user)
+        path, to_user = folder / f"mesh.{self.format}", record.to_user.double()
+        placed = points_to_user(torch.from_numpy(vertices), to_user)
+        turned = directions_to_user(torch.from_numpy(normals), to_user)
         save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy())
         log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
         return [path]
@@ -118,6 +123,13 @@ class MeshExport(Export):
         decimation = require_library("fast_simplification")
         few, kept = decimation.simplify(vertices, faces.astype(np.int32), target_count=self.faces)
         return np.asarray(few, np.float64), np.asarray(kept, np.int64)
+
+
+def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
+    """Replace densities by log(density / level), bounded: densities grow by factors, so between points that is straight."""
+    density /= level
+    np.clip(density, 1.0 / RATIO, RATIO, out=density)
+    np.log(density, out=density)
 
 
 def _close(density: Float[ndarray, "x y z"]) -> None:

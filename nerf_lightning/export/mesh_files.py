@@ -1,7 +1,7 @@
 """Mesh files: PLY, OBJ and GLB, with a colour and a normal for each vertex."""
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -11,7 +11,6 @@ from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.mesh_libraries import require_library
 
 MeshFormat = Literal["ply", "obj", "glb"]
-MESH_FORMATS = get_args(MeshFormat)
 
 
 def save_mesh(
@@ -26,12 +25,12 @@ def save_mesh(
     form = path.suffix[1:]
     shown = _linear(colors) if form == "glb" else colors
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=shown, process=False)
-    settings: dict[str, Any] = {
+    settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},
         "glb": {"include_normals": True, "tree_postprocessor": _unlit},
-    }[form]
-    content = mesh.export(file_type=form, **settings)
+    }
+    content = mesh.export(file_type=form, **settings[form])
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
 

@@ -8,12 +8,8 @@ from numpy import ndarray
 
 from nerf_lightning.export.atomic import whole_file
 
-LAYOUT = np.dtype(
-    [
-        *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
-        *((name, "u1") for name in ("red", "green", "blue")),
-    ]
-)
+NUMBERS, COLORS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
+LAYOUT = np.dtype([*((name, "<f4") for name in NUMBERS), *((name, "u1") for name in COLORS)])
 
 
 def save_points(
@@ -24,11 +20,11 @@ def save_points(
 ) -> None:
     """Write a point cloud, whole or not at all."""
     rows = np.empty(len(points), LAYOUT)
-    for name, column in zip(LAYOUT.names or (), (*points.T, *normals.T, *colors.T), strict=True):
+    for name, column in zip((*NUMBERS, *COLORS), (*points.T, *normals.T, *colors.T), strict=True):
         rows[name] = column
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    properties = [f"property {kinds[LAYOUT[name].str]} {name}" for name in LAYOUT.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property float {name}" for name in NUMBERS] + [f"property uchar {name}" for name in COLORS]
+    header += ["end_header"]
     with whole_file(path) as part, part.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode())
         file.write(rows.tobytes())

@@ -1,6 +1,6 @@
 """Colours of points on a surface: a short ray through each is rendered."""
 
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,7 +16,6 @@ from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.types import RayBundle, RaySamples
 
 SeenFrom = Literal["cameras", "normal"]
-SEEN_FROM = get_args(SeenFrom)
 # Of a short ray.
 SAMPLES = 8
 # Cameras whose views of a point are averaged.

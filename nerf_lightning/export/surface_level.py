@@ -15,8 +15,8 @@ from nerf_lightning.types import PixelIndex
 RAYS = 1 << 13
 # Rays that stop less light than this have met no surface.
 OPAQUE = 0.9
-# Where three quarters of them end it is denser than the level. At the median, thin and grazed surfaces have holes; below
-# the first quartile, surfaces swell.
+# Where three quarters of them end it is denser than the level. At the median, thin and grazed surfaces have holes;
+# below the first quartile, surfaces swell.
 QUANTILE = 0.25
 
 
