@@ -103,10 +103,9 @@ def _plain(name: str) -> str:
 
 
 def _save_opacity(path: Path, opacity: Float[Tensor, "height width"]) -> None:
+    grey = to_bytes(opacity[..., None].expand(-1, -1, 3))[..., 0]
     with whole_file(path) as part:
-        Image.fromarray(to_bytes(opacity[..., None].expand(-1, -1, 3))[..., 0].contiguous().numpy()).save(
-            part, format="PNG"
-        )
+        Image.fromarray(grey.contiguous().numpy()).save(part, format="PNG")
 
 
 def _save_depth(folder: Path, name: str, scale: float) -> None:

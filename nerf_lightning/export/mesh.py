@@ -126,7 +126,7 @@ class MeshExport(Export):
 
 
 def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
-    """Replace densities by log(density / level), bounded: densities grow by factors, so between points that is straight."""
+    """Replace densities by log(density / level), bounded: they grow by factors, and so their logarithm is straight."""
     density /= level
     np.clip(density, 1.0 / RATIO, RATIO, out=density)
     np.log(density, out=density)

@@ -51,15 +51,15 @@ def test_points_lie_on_the_ball_with_its_normals_and_colours_in_the_users_frame(
 
 
 def test_what_one_view_alone_sees_is_left_out(tmp_path):
-    scene = record()
+    scene = scene_record(ball_scene(num_views=6, size=24))  # 60 degrees apart
     eye = scene.cameras.c2w[scene.splits["train"][0], :, 3]
 
     def with_speck(positions):  # close before one camera, outside of what the others see
-        return torch.minimum(ball(0.7)(positions), ball(0.12, (0.45 * eye).tolist())(positions))
+        return torch.minimum(ball(0.7)(positions), ball(0.12, (0.48 * eye).tolist())(positions))
 
     everything, _ = exported(tmp_path, solid(with_speck), scene, agreement=0)
     confirmed, _ = exported(tmp_path, solid(with_speck), scene, agreement=1, tolerance=0.02)
-    speck = (0.45 * eye).numpy()
+    speck = (0.48 * eye).numpy()
     assert (np.linalg.norm(everything.vertices - speck, axis=1) < 0.2).any()
     assert not (np.linalg.norm(confirmed.vertices - speck, axis=1) < 0.2).any()
     assert len(confirmed.vertices) > 100
