@@ -1,15 +1,15 @@
 """Run folders: chosen before anything is written, held by one process, never shared by two configs.
 
-A run folder has `run.json` (its config's fingerprint, and the step at which it finished), `.hydra/` (config and
-overrides), `checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
+A run folder has `run.json` (its config's fingerprint, and what it came to), `.hydra/` (config and overrides),
+`checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
 """
 
 import contextlib
-import hashlib
 import itertools
 import json
 import os
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
-from nerf_lightning.commands.suggestions import flatten
+from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
+from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
-
-# Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
-NOT_IDENTITY = (
-    *("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
-    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
-)
-IDENTITY = ("callbacks.collapse_guard.",)
 
 
 @dataclass
@@ -40,6 +35,7 @@ class RunFolder:
     lock: FileLock
     named_checkpoint: Path | None
     """The checkpoint that the user named to go on from."""
+    began: float = field(default_factory=time.monotonic)
 
     @property
     def checkpoint(self) -> Path | None:
@@ -47,14 +43,22 @@ class RunFolder:
         last = self.path / "checkpoints" / "last.ckpt"
         return self.named_checkpoint or (last if last.is_file() else None)
 
-    def finish(self, step: int) -> None:
+    def finish(self, step: int, psnr: float | None) -> None:
         """Note that the run is complete."""
-        note = json.loads((self.path / "run.json").read_text())
-        _write_json(self.path / "run.json", note | {"finished_at_step": step})
+        self._note(finished_at_step=step, psnr=psnr)
+
+    def stop(self, restarted: bool) -> None:
+        """Note that the run was stopped; a `restarted` one is started again by its scheduler, and then goes on."""
+        self._note(**({"preempted": True} if restarted else {}))
 
     def release(self) -> None:
         """Let others have the folder."""
         self.lock.release()
+
+    def _note(self, **values: Any) -> None:
+        note = read_note(self.path)
+        seconds = round(note.get("seconds", 0.0) + time.monotonic() - self.began, 1)
+        _write_json(self.path / "run.json", note | {"seconds": seconds} | values)
 
 
 def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> RunFolder:
@@ -83,9 +87,14 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
         raise InputError(
             f"The run folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
         ) from error
-    note = _read_note(folder)
-    started = note.get("started") or datetime.now().isoformat(timespec="seconds")
-    _write_json(folder / "run.json", {"fingerprint": _digest(identity), "started": started})
+    note = read_note(folder)
+    kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
+        key: note[key] for key in ("started", "seconds") if key in note
+    }
+    job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
+    _write_json(
+        folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings_digest(config)} | kept | job
+    )
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
@@ -106,23 +115,19 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
     OmegaConf.save(OmegaConf.create(list(hydra_config.overrides.task)), folder / ".hydra" / "overrides.yaml")
 
 
-def run_identity(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    leaves = flatten(config)
-    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
-
-
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
         return _to_resume(Path(resume), identity)
     folder = job_folder or (Path(given) if given else None)
-    if folder is None and resume == "auto":
-        folder = _newest_unfinished(Path(config.paths.root_dir), _digest(identity), num_steps)
+    if folder is None and (resume == "auto" or was_requeued()):
+        of_job = None if resume == "auto" else slurm_job()
+        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), num_steps, of_job)
     if folder is None:
         return _fresh(Path(config.paths.root_dir) / config.scene.name)
     if (folder / "run.json").exists():
-        _refuse_other_run(folder, identity, resuming=resume == "auto")
+        resuming = resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
+        _refuse_other_run(folder, identity, resuming)
     return folder
 
 
@@ -140,7 +145,7 @@ def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
 
 
 def _refuse_other_run(folder: Path, identity: dict[str, Any], resuming: bool) -> None:
-    if _read_note(folder).get("fingerprint") == _digest(identity):
+    if read_note(folder).get("fingerprint") == fingerprint(identity):
         if resuming:
             return
         raise InputError(
@@ -163,11 +168,12 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 
-def _newest_unfinished(root: Path, digest: str, num_steps: int) -> Path | None:
+def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
     notes = sorted(root.rglob("run.json"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in notes:
-        note = _read_note(file.parent)
-        if note.get("fingerprint") == digest and note.get("finished_at_step", -1) < num_steps:
+        note = read_note(file.parent)
+        ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
+        if ours and note.get("finished_at_step", -1) < num_steps:
             return file.parent
     return None
 
@@ -179,18 +185,6 @@ def _fresh(parent: Path) -> Path:
             (parent / name).mkdir(parents=True)
             return parent / name
     raise AssertionError("unreachable: the names never end")
-
-
-def _read_note(folder: Path) -> dict[str, Any]:
-    try:
-        note = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return note if isinstance(note, dict) else {}
-
-
-def _digest(identity: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -4,12 +4,20 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.commands.slurm import was_requeued
+from nerf_lightning.errors import InputError
+
 # What belongs to one start of a run, not to the run.
-OF_ONE_START = ("resume=", "paths.", "init_from=")
+OF_ONE_START = ("resume=", "paths.", "init_from=", "sweep.")
 
 
 def prepare(arguments: list[str]) -> list[str]:
-    """Repeat the overrides that a run was started with where it is resumed by name; the user's own come after them."""
+    """Repeat the overrides that a run was started with where it is resumed by name; the user's own come after them.
+
+    Raises:
+        InputError: a sweep would begin where one has been.
+    """
+    _refuse_second_sweep(arguments)
     resumed = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     if not resumed or resumed[-1] in ("auto", "null"):
         return arguments
@@ -22,9 +30,22 @@ def prepare(arguments: list[str]) -> list[str]:
     return [*former, *arguments]
 
 
+def _refuse_second_sweep(arguments: list[str]) -> None:
+    values = dict(argument.partition("=")[::2] for argument in arguments)
+    folder = Path(values.get("hydra.sweep.dir", "").strip("'\""))
+    goes_on = values.get("sweep.resume", "").lower() == "true" or was_requeued()
+    if "hydra.sweep.dir" in values and not goes_on and next(folder.glob("*/run.json"), None) is not None:
+        raise InputError(
+            f"{folder} already holds runs of a sweep. Add sweep.resume=true to go on with it or to add to it, or give "
+            "another folder with paths.output_dir=DIR."
+        )
+
+
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
     # Imported late: torch and Lightning take seconds, and --help needs neither.
+    from nerf_lightning.commands.preemption import preemptible
     from nerf_lightning.commands.training import train
 
-    return train(config)
+    with preemptible():
+        return train(config)

@@ -12,8 +12,10 @@ from typing import Any, Literal
 import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -21,7 +23,7 @@ log = logging.getLogger(__name__)
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
 MOST_CPU_TILE_POINTS = 1 << 18
-ALL_THREADS = torch.get_num_threads()
+ALL_THREADS = min(torch.get_num_threads(), num_cores())
 M_MMAP_THRESHOLD = -3
 M_TRIM_THRESHOLD = -1
 
@@ -39,7 +41,8 @@ class TrainerSettings:
             measured at the start of a run and kept; None trains a batch whole. The result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
         val_every_steps: steps between two looks at the validation rays.
-        num_threads: torch's threads on the CPU; None: one per core.
+        num_threads: torch's threads on the CPU; None: one per core that is
+            ours (cores.py).
     """
 
     def __init__(
@@ -98,7 +101,7 @@ class TrainerSettings:
             precision=self.precision,  # type: ignore[arg-type]
             callbacks=list(callbacks),
             logger=list(loggers) or False,
-            plugins=[AtomicCheckpointIO()],
+            plugins=[AtomicCheckpointIO(), *_slurm()],
             val_check_interval=min(self.val_every_steps, num_steps),
             check_val_every_n_epoch=None,
             num_sanity_val_steps=0,
@@ -160,6 +163,11 @@ def has_native_bfloat16(device_type: str) -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(getattr(torch.cpu, probe, bool)() for probe in probes)
+
+
+def _slurm() -> list[SLURMEnvironment]:
+    # Lightning would save in the midst of a step and requeue by itself; ours is commands/preemption.py.
+    return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
 
 
 def _keep_large_blocks() -> None:

@@ -20,6 +20,7 @@ from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
 from nerf_lightning.commands.overrides import to_type
+from nerf_lightning.commands.preemption import wants_restart
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.tile_choice import measured_tile
@@ -59,6 +60,9 @@ def train(config: DictConfig) -> float | None:
         write_config(folder.path, config, HydraConfig.get())
         with _log_file(folder.path):
             return _run(config, parts, folder)
+    except SystemExit as stop:
+        folder.stop(restarted=wants_restart(stop.code))
+        raise
     finally:
         folder.release()
 
@@ -109,7 +113,7 @@ def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder.path))
         raise SystemExit(128 + parts.signals.received)
     psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder.path)
-    folder.finish(trainer.global_step)
+    folder.finish(trainer.global_step, psnr)
     for logger in trainer.loggers:
         logger.finalize("success")
     return psnr

@@ -1,6 +1,5 @@
 """Fill the pixel store from picture files: one array for all of them, decoded straight into place."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,6 +11,7 @@ from jaxtyping import Int
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from torch import Tensor
 
+from nerf_lightning.cores import num_cores
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.types import PixelStore
@@ -48,7 +48,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
         shown: whether there is a bar at all.
     """
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    threads = min(MAX_THREADS, os.cpu_count() or 1)
+    threads = min(MAX_THREADS, num_cores())
     with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
         return list(bar.track(pool.map(work, range(count)), total=count, description=label))
 
