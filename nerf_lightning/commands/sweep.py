@@ -62,6 +62,8 @@ class SweepWatch(Callback):
         (sweep.folder / ".hydra" / "sweep.yaml").write_text(yaml.safe_dump(record))
         if "sweep" in config:
             print(f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}", file=sys.stderr)
+        # Optuna's database library lists its parts.
+        logging.getLogger("alembic").setLevel(logging.WARNING)
         launcher = config.hydra.launcher._target_
         if launcher.endswith(LOCAL_LAUNCHERS):
             _share_cores(launcher, config.hydra.launcher)

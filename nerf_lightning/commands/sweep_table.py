@@ -1,6 +1,7 @@
 """The table at the end of a sweep: a row per job, the best first, printed and written as `sweep.md` and `sweep.csv`."""
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,11 @@ def _texts(row: Row) -> list[str]:
 def _text(column: str, value: Any) -> str:
     if value is None:
         return ""
-    return f"{value:.{DECIMALS[column]}f}" if column in DECIMALS else str(value)
+    if column in DECIMALS:
+        return f"{value:.{DECIMALS[column]}f}"
+    # What a sampler proposes has digits that nobody reads.
+    is_long_number = re.fullmatch(r"-?\d*\.\d{7,}(e-?\d+)?", str(value))
+    return f"{float(value):.6g}" if is_long_number else str(value)
 
 
 def _relative(folder: Path, sweep_folder: Path) -> str:
