@@ -43,7 +43,7 @@ class RunFolder:
         last = self.path / "checkpoints" / "last.ckpt"
         return self.named_checkpoint or (last if last.is_file() else None)
 
-    def finish(self, step: int, psnr: float | None) -> None:
+    def finish(self, step: int, psnr: float | None = None) -> None:
         """Note that the run is complete."""
         self._note(finished_at_step=step, psnr=psnr)
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from running import FAST, start
 
-QUICK = (*FAST, "logger=none", "trainer.num_threads=1", "final.video=false", "callbacks.checkpoints.every_steps=5")
+QUICK = (*FAST, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
 
 
 def arguments(capture, folder, *more):
@@ -59,6 +59,19 @@ def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, 
     assert len(lines) == 4
     assert f"{psnr[0]:.2f}" in lines[2]
     assert f"{psnr[0]:.2f}" in output
+
+
+@pytest.mark.slow
+def test_parallel_jobs_share_the_cores(capture, tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cores = len(os.sched_getaffinity(0))
+    code, output = run(*arguments(capture, tmp_path, "hydra/launcher=parallel", "seed=0,1"))
+    assert code == 0, output
+    assert output.count(f"cpu, {max(1, cores // 2)} threads") == 2
+    folder = tmp_path / "slurm"
+    one_core = {"SLURM_CPUS_PER_TASK": "1"}
+    code, output = run(*arguments(capture, folder, "hydra/launcher=parallel", "seed=0,1"), env=one_core)
+    assert output.count("cpu, 1 threads") == 2, output
 
 
 @pytest.mark.slow
