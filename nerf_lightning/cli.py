@@ -7,7 +7,7 @@ import ast
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,21 +81,16 @@ def _run(command: str, arguments: list[str]) -> None:
 
     module = importlib.import_module(f"nerf_lightning.commands.{command}")
 
-    def explain(error: BaseException) -> str | None:
-        from nerf_lightning.commands.suggestions import paragraph
-
-        return paragraph(error, command, conf_folder())
-
     def task(config: "DictConfig") -> Any:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             from nerf_lightning.commands.sweep_job import run_job
 
-            return run_job(module.run, config, explain)
+            return run_job(module.run, config, command)
         # Caught inside the job as well: Hydra would print the overrides first.
-        with _explained(explain):
+        with explained(command):
             return module.run(config)
 
-    with _explained(explain):
+    with explained(command):
         prepare = getattr(module, "prepare", list)
         sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
@@ -108,14 +103,16 @@ def _run(command: str, arguments: list[str]) -> None:
 
 
 @contextmanager
-def _explained(explain: Callable[[BaseException], str | None]) -> Iterator[None]:
+def explained(command: str) -> Iterator[None]:
     """Turn bad input into one paragraph and exit code 2."""
     try:
         yield
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        message = explain(error)
+        from nerf_lightning.commands.suggestions import paragraph
+
+        message = paragraph(error, command, conf_folder())
         if message is None:
             raise
         _complain(message)

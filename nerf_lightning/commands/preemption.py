@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
+from torch import distributed
+
 from nerf_lightning.callbacks.stop_signals import stop_signals, submitit_signal
 from nerf_lightning.commands.slurm import requeue
 
@@ -22,6 +24,9 @@ from nerf_lightning.commands.slurm import requeue
 @contextmanager
 def preemptible() -> Iterator[None]:
     """Leave at a scheduler's signal, and requeue if it wants that."""
+    if distributed.is_initialized():  # a worker: the process that started it hears the scheduler
+        yield
+        return
     listened = [number for number in stop_signals() if number != signal.SIGINT]
     former = {number: signal.signal(number, _leave) for number in listened}
     try:

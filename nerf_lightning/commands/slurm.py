@@ -23,7 +23,8 @@ def was_requeued() -> bool:
 def requeue() -> None:
     """Ask Slurm to start this job again; the first of a job's processes asks for all of them."""
     job = slurm_job()
-    if job is None or os.environ.get("SLURM_PROCID", "0") != "0":
+    # torchrun numbers its processes itself.
+    if job is None or os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":
         return
     command = ["scontrol", "requeue", job]
     try:

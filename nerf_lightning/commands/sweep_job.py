@@ -19,11 +19,11 @@ from omegaconf import DictConfig
 from nerf_lightning.commands.run_identity import finished_run
 from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import was_requeued
+from nerf_lightning.commands.suggestions import paragraph
+from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.export.atomic import whole_file
 
 log = logging.getLogger(__name__)
-
-Explain = Callable[[BaseException], str | None]
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class JobRecord:
             part.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
 
-def run_job(run: Callable[[DictConfig], Any], config: DictConfig, explain: Explain) -> Any:
+def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:
     """Run one job of a sweep and return its value, None where it failed.
 
     Args:
-        run: the command.
+        run: what the command does.
         config: the job's config.
-        explain: says what a person must know of an error, or None for an error that nobody foresaw.
+        command: its name.
 
     Raises:
         SystemExit: a signal stopped the job, which stops a sweep whose jobs run in one process.
@@ -69,9 +69,12 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, explain: Expla
             return _skip(record, former, sweep_folder)
         value = run(config)
     except Exception as error:
-        _failed(record, error, explain(error)).write(sweep_folder)
+        _failed(record, error, paragraph(error, command, conf_folder())).write(sweep_folder)
         return None
-    except (SystemExit, KeyboardInterrupt):
+    except (SystemExit, KeyboardInterrupt) as stop:
+        if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started
+            replace(record, state="failed", reason="its processes have said why").write(sweep_folder)
+            return None
         replace(record, state="stopped").write(sweep_folder)
         # joblib would kill the other jobs before they have saved.
         if elsewhere and stop_file(sweep_folder).exists():

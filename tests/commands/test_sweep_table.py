@@ -70,7 +70,8 @@ def test_files_are_whole_and_the_text_is_short(tmp_path, capsys):
         {"job": 1, "lr": "1e-3", "PSNR": None, "SSIM": None, "folder": "c"},
     ]
     write_rows(rows, tmp_path)
-    assert list(csv.DictReader((tmp_path / "sweep.csv").open()))[0]["PSNR"] == "20.123456789"
+    header, first, *_ = csv.reader((tmp_path / "sweep.csv").read_text().splitlines())
+    assert dict(zip(header, first, strict=True))["PSNR"] == "20.123456789"
     assert (tmp_path / "sweep.md").read_text().splitlines() == [
         "| job | lr | PSNR | SSIM | folder |",
         "| --- | --- | --- | --- | --- |",
