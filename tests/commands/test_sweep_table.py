@@ -10,12 +10,12 @@ from nerf_lightning.commands.sweep_job import JobRecord, read_records
 from nerf_lightning.commands.sweep_table import job_rows, print_rows, write_rows
 
 
-def leave_run(folder, overrides, psnr, ssim=0.5, **note):
+def leave_run(folder, overrides, measured, ssim=0.5, **note):
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     (folder / "run.json").write_text(json.dumps({"finished_at_step": 10, "seconds": 3.25} | note))
-    if psnr is not None:
-        (folder / "metrics.json").write_text(json.dumps({"psnr": psnr, "ssim": ssim}))
+    if measured is not None:
+        (folder / "metrics.json").write_text(json.dumps({"psnr": measured, "ssim": ssim}))
 
 
 def record(folder, number, overrides, state="finished", **more):
