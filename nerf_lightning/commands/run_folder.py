@@ -19,7 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
+from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
+from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
@@ -37,11 +38,25 @@ class RunFolder:
     """The checkpoint that the user named to go on from."""
     began: float = field(default_factory=time.monotonic)
 
-    @property
-    def checkpoint(self) -> Path | None:
-        """Where training goes on, or None where nothing was saved yet."""
-        last = self.path / "checkpoints" / "last.ckpt"
-        return self.named_checkpoint or (last if last.is_file() else None)
+    def whole_checkpoint(self) -> Path | None:
+        """Return where training goes on: the checkpoint that the user named, else the newest that is whole, if any.
+
+        Raises:
+            InputError: there are checkpoints, and none can be read.
+        """
+        if self.named_checkpoint is not None:
+            return self.named_checkpoint
+        folder = self.path / "checkpoints"
+        found = newest_checkpoint(folder)
+        if found is None:
+            return None
+        if found.path.name == LAST:
+            return found.path
+        # Else the next save would put the damaged one in the place of the good one.
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(folder / LAST, folder / DAMAGED)
+        os.replace(folder / PREVIOUS, folder / LAST)
+        return folder / LAST
 
     def finish(self, step: int, psnr: float | None = None) -> None:
         """Note that the run is complete."""
@@ -108,11 +123,15 @@ def job_folder() -> Path | None:
 
 def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
     """Keep the config where Hydra would: `.hydra/config.yaml`, `hydra.yaml` and `overrides.yaml`."""
-    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-    OmegaConf.save(
-        OmegaConf.masked_copy(hydra_config, ["job", "runtime", "overrides"]), folder / ".hydra" / "hydra.yaml"
-    )
-    OmegaConf.save(OmegaConf.create(list(hydra_config.overrides.task)), folder / ".hydra" / "overrides.yaml")
+    kept = {
+        "config.yaml": config,
+        "hydra.yaml": OmegaConf.masked_copy(hydra_config, ["job", "runtime", "overrides"]),
+        "overrides.yaml": OmegaConf.create(list(hydra_config.overrides.task)),
+    }
+    for name, content in kept.items():
+        # Whole or not at all: a resume by the folder's name reads them.
+        with whole_file(folder / ".hydra" / name) as part:
+            OmegaConf.save(content, part)
 
 
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
