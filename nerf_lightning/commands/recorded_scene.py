@@ -8,6 +8,7 @@ import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.overrides import quoted
+from nerf_lightning.commands.plain_yaml import plain_yaml, read_plain_yaml
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 
@@ -31,7 +32,10 @@ def scene_overrides(path: str) -> list[str]:
             f"{path} was trained on the scene '{name}', which conf/scene/ lacks. Name the scene: "
             f"nerf eval ckpt={path} scene=... ({', '.join(sorted(known))})."
         )
-    recorded = yaml.safe_load(checkpoint.config).get("scene", {})
+    config = plain_yaml(checkpoint.config, f"The config in {path}")
+    recorded = config.get("scene") if isinstance(config, dict) else None
+    if not isinstance(recorded, dict):
+        raise InputError(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
@@ -53,8 +57,8 @@ def _found(place: str, checkpoint: Path) -> str:
     try:
         if Path(place).expanduser().is_absolute() or Path(place).exists():
             return place
-        note = (checkpoint.parent.parent / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
-        there = Path(yaml.safe_load(note)["runtime"]["cwd"]) / place
+        note = read_plain_yaml(checkpoint.parent.parent / ".hydra" / "hydra.yaml")
+        there = Path(note["runtime"]["cwd"]) / place
         return str(there) if there.exists() else place
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError, yaml.YAMLError):
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, InputError):
         return place

@@ -35,9 +35,13 @@ class LlffReader(CaptureReader):
         """Return all views with their bounds."""
         root = self.folder()
         path = root / "poses_bounds.npy"
+        self.require_inside(path)
         rows = _rows(path)
         pictures = self._pictures(root)
+        self.require_inside(pictures, self.images)
         names = picture_files(pictures)
+        for name in names:
+            self.require_inside(pictures / name, self.images)
         if len(names) != len(rows):
             raise InputError(
                 f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
