@@ -58,6 +58,7 @@ def _require_sizes(width: object, height: object, views: int) -> None:
         if not bool(((values > 0) & (values <= MOST_PIXELS)).all()):
             raise ValueError(key)
     assert isinstance(width, Tensor)
+    assert isinstance(height, Tensor)
     if not bool((width * height <= MOST_PIXELS).all()):
         raise ValueError(f"width and height: more than {MOST_PIXELS:,} pixels")
 

@@ -10,7 +10,7 @@ import pickle
 import pickletools
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ def load_tensors(path: Path) -> Any:
     """
     with path.open("rb") as file:
         if zipfile.is_zipfile(file):
-            pickles = [_objects_of_archive(path)]
+            pickles: list[BinaryIO] = [_objects_of_archive(path)]
         else:
             file.seek(0)
             pickles = [file] * LEGACY_PICKLES
@@ -73,7 +73,7 @@ def _objects_of_archive(path: Path) -> io.BytesIO:
         return io.BytesIO(archive.read(objects[0]))
 
 
-def _require_plain(stream: Any) -> None:
+def _require_plain(stream: BinaryIO) -> None:
     """Read the instructions of a pickle without following them."""
     for code, argument, _ in pickletools.genops(stream):
         if code.name == "GLOBAL" and argument not in CALLED and not _names_a_type(str(argument)):
@@ -94,8 +94,8 @@ def _require_own_memory(content: Any, path: Path) -> None:
         if isinstance(node, Tensor):
             if node.numel() * node.element_size() > node.untyped_storage().nbytes():
                 raise InputError(
-                    f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: whatever is done "
-                    "with it would fill the memory. This program saves none such; use another file."
+                    f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: whatever is "
+                    "done with it would fill the memory. This program saves none such; use another file."
                 )
         elif isinstance(node, (dict, list, tuple, set)) and id(node) not in seen:
             seen.add(id(node))

@@ -14,6 +14,8 @@ from nerf_lightning.errors import InputError
 
 # Settings of scenes that say where a capture lies.
 PLACES = ("root", "path")
+# Settings that say where to write, what to fetch and how far to trust: the user's alone.
+OF_THE_USER = ("download", "cache_dir", "allow_outside", "max_gigabytes")
 
 
 def scene_overrides(path: str) -> list[str]:
@@ -39,13 +41,15 @@ def scene_overrides(path: str) -> list[str]:
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
+    if ours.get("download") and not Path(str(values.get("path"))).exists():
+        values.pop("path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
     return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
 
 
 def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield what may be taken from a file: plain values of settings that we know, but no classes and no addresses."""
     for key, value in recorded.items():
-        if key not in ours or key.startswith("_") or key == "download":
+        if key not in ours or key.startswith("_") or key in OF_THE_USER:
             continue
         if isinstance(value, dict) and isinstance(ours[key], dict):
             yield from _plain_values(value, ours[key], f"{path}{key}.")

@@ -20,7 +20,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
+from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.suggestions import flatten
+from nerf_lightning.data.json_files import read_json
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 
@@ -28,6 +30,7 @@ from nerf_lightning.export.atomic import whole_file
 NOT_IDENTITY = (
     *("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
     *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
+    *("scene.allow_outside", "scene.max_gigabytes"),
 )
 IDENTITY = ("callbacks.collapse_guard.",)
 
@@ -70,6 +73,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     """
     identity = run_identity(config)
     folder = _choose(config, identity, num_steps, job_folder)
+    require_no_way_out(folder)
     try:
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".hydra" / "lock")
@@ -157,7 +161,10 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     saved = folder / ".hydra" / "config.yaml"
     if not saved.is_file():
         return "its config was not kept"
-    other = run_identity(OmegaConf.load(saved))  # type: ignore[arg-type]
+    content = read_plain_yaml(saved)
+    if not isinstance(content, dict):
+        return "its config is damaged"
+    other = run_identity(OmegaConf.create(content))
     keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
     shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
@@ -183,8 +190,8 @@ def _fresh(parent: Path) -> Path:
 
 def _read_note(folder: Path) -> dict[str, Any]:
     try:
-        note = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError):
+        note = read_json(folder / "run.json")
+    except InputError:
         return {}
     return note if isinstance(note, dict) else {}
 
@@ -204,6 +211,23 @@ def beside_checkpoint(checkpoint: Path, name: str) -> Path:
     return (beside.parent if beside.name == "checkpoints" else beside) / name
 
 
+def require_no_way_out(folder: Path) -> None:
+    """Refuse to write into a folder with links that lead out of it: an unpacked archive may have brought them.
+
+    Raises:
+        InputError: with the link.
+    """
+    root = os.path.realpath(folder)
+    for base, folders, names in os.walk(root):
+        for path in (Path(base) / name for name in (*folders, *names)):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
+                raise InputError(
+                    f"{path} is a symbolic link to {os.readlink(path)}, and writing into {folder} would write there. "
+                    "Remove the link (or put what it names in its place), or give another folder with "
+                    "paths.output_dir=DIR."
+                )
+
+
 def output_folder(given: str | None, default: Path) -> Path:
     """Return where a command that does not train writes: as given, else by default.
 
@@ -213,6 +237,9 @@ def output_folder(given: str | None, default: Path) -> Path:
         InputError: the folder cannot be made or written.
     """
     folder = job_folder() or Path(given or default)
+    if given is None:
+        # Beside a checkpoint that may come from anybody.
+        require_no_way_out(default.parent if default.is_symlink() else default)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{os.getpid()}.probe"

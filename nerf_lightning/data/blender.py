@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.data.base import Reader
-from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.blender_frames import Frame, read_frames
+from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.checks import (
     check_bounds,
     check_divisible,
