@@ -126,7 +126,7 @@ def _escaped(letter: str) -> str:
 
 
 def _complain(message: str) -> None:
-    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, and no line looks like ours.
+    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
     shown = "".join(letter if letter.isprintable() else _escaped(letter) for letter in message[:MOST_LETTERS])
     print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -10,7 +10,7 @@ import pickle
 import pickletools
 import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ def load_tensors(path: Path) -> Any:
     """
     with path.open("rb") as file:
         if zipfile.is_zipfile(file):
-            pickles: list[BinaryIO] = [_objects_of_archive(path)]
+            pickles: list[Any] = [_objects_of_archive(path)]
         else:
             file.seek(0)
             pickles = [file] * LEGACY_PICKLES
@@ -73,7 +73,7 @@ def _objects_of_archive(path: Path) -> io.BytesIO:
         return io.BytesIO(archive.read(objects[0]))
 
 
-def _require_plain(stream: BinaryIO) -> None:
+def _require_plain(stream: Any) -> None:
     """Read the instructions of a pickle without following them."""
     for code, argument, _ in pickletools.genops(stream):
         if code.name == "GLOBAL" and argument not in CALLED and not _names_a_type(str(argument)):

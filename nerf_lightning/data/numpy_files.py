@@ -43,7 +43,7 @@ def array_header(start: bytes, size: int) -> ArrayHeader:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)
     if dtype.hasobject:
-        raise ValueError("Object arrays are programs in disguise, and are not read")
+        raise ValueError("Object arrays cannot be loaded: they are programs in disguise")
     num_bytes = math.prod(shape) * dtype.itemsize
     if num_bytes != size - stream.tell():
         raise ValueError(f"its header announces {num_bytes:,} bytes of numbers, and {size - stream.tell():,} are there")

@@ -106,8 +106,9 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
     """Write the pixels under another name, and the header once they have theirs."""
     part, note = base.with_suffix(".part"), base.with_suffix(".json.part")
     try:
-        # Under the lock, what lies there was left by a process that was killed.
+        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
         part.unlink(missing_ok=True)
+        note.unlink(missing_ok=True)
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part)}))
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
