@@ -259,6 +259,7 @@ def bombs(folder):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.slow
 def test_bombs_stay_small(tmp_path):
     expected = bombs(tmp_path)
     code = (

@@ -298,6 +298,7 @@ for kind, place, words in kinds:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.slow
 def test_bombs_stay_small(tmp_path):
     listed = tmp_path / "bombs.json"
     listed.write_text(json.dumps([(kind, str(place), words) for kind, place, words in bombs(tmp_path)]))
