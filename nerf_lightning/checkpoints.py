@@ -22,7 +22,7 @@ from nerf_lightning.types import Background, Cameras, Scene, Space
 
 FORMAT = 1
 KEY = "nerf_lightning"
-PRECISIONS = ("32-true", "bf16-mixed")
+PRECISIONS = ("32-true", "tf32", "bf16-mixed")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
+from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.suggestions import flatten
 from nerf_lightning.data.json_files import read_json
@@ -209,23 +210,6 @@ def beside_checkpoint(checkpoint: Path, name: str) -> Path:
     """Return the folder of this name in the run folder that a checkpoint lies in."""
     beside = checkpoint.absolute().parent
     return (beside.parent if beside.name == "checkpoints" else beside) / name
-
-
-def require_no_way_out(folder: Path) -> None:
-    """Refuse to write into a folder with links that lead out of it: an unpacked archive may have brought them.
-
-    Raises:
-        InputError: with the link.
-    """
-    root = os.path.realpath(folder)
-    for base, folders, names in os.walk(root):
-        for path in (Path(base) / name for name in (*folders, *names)):
-            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
-                raise InputError(
-                    f"{path} is a symbolic link to {os.readlink(path)}, and writing into {folder} would write there. "
-                    "Remove the link (or put what it names in its place), or give another folder with "
-                    "paths.output_dir=DIR."
-                )
 
 
 def output_folder(given: str | None, default: Path) -> Path:

@@ -56,7 +56,7 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
-    outside = [path for path in pictures if not path.resolve().is_relative_to(folder.resolve())]
+    outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
     if outside and not allow_outside:
         raise InputError(
             f"images={folder}: {listed((path.name for path in outside), 4)} are symbolic links out of this folder. If "

@@ -7,7 +7,8 @@ from omegaconf import OmegaConf
 from running import FAST, said
 
 from nerf_lightning.commands.former_overrides import former_overrides, to_give_again
-from nerf_lightning.commands.run_folder import open_run, require_no_way_out
+from nerf_lightning.commands.links import require_no_way_out
+from nerf_lightning.commands.run_folder import open_run
 from nerf_lightning.errors import InputError
 
 
