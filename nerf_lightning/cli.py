@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent
 USAGE_ERROR = 2
+MOST_LETTERS = 5000
 
 
 def main() -> None:
@@ -125,6 +126,12 @@ def _near(word: str, known: list[str]) -> str:
     return f" Did you mean {' or '.join(close)}?" if close else ""
 
 
+def _escaped(letter: str) -> str:
+    return " " if letter.isspace() else letter.encode("unicode_escape").decode("ascii")
+
+
 def _complain(message: str) -> None:
-    print(f"nerf: {message}", file=sys.stderr)
+    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
+    shown = "".join(letter if letter.isprintable() else _escaped(letter) for letter in message[:MOST_LETTERS])
+    print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

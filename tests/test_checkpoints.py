@@ -14,7 +14,7 @@ FISHEYE = (0.1, -0.02, 0.01, 0.0, 0.0, 0.0)
 def saved(path, change=lambda cameras: None):
     record = make_record(ball_scene(lens=FISHEYE, lens_model="fisheye"), config="", choices={})
     change(record["scene"]["cameras"])
-    state = {"precision": "32", "tile_points": None}
+    state = {"precision": "32-true", "tile_points": None}
     torch.save({"state_dict": {}, "global_step": 0, "nerf_lightning": record | state}, path / "last.ckpt")
     return path / "last.ckpt"
 

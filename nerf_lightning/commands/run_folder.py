@@ -21,6 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
+from nerf_lightning.commands.links import require_no_way_out
+from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
@@ -89,6 +91,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     """
     identity = run_identity(config)
     folder = _choose(config, identity, num_steps, job_folder)
+    require_no_way_out(folder)
     try:
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".hydra" / "lock")
@@ -181,7 +184,10 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     saved = folder / ".hydra" / "config.yaml"
     if not saved.is_file():
         return "its config was not kept"
-    other = run_identity(OmegaConf.load(saved))  # type: ignore[arg-type]
+    content = read_plain_yaml(saved)
+    if not isinstance(content, dict):
+        return "its config is damaged"
+    other = run_identity(OmegaConf.create(content))
     keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
     shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
@@ -209,30 +215,3 @@ def _fresh(parent: Path) -> Path:
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     with whole_file(path) as part:
         part.write_text(json.dumps(content, indent=2) + "\n")
-
-
-def beside_checkpoint(checkpoint: Path, name: str) -> Path:
-    """Return the folder of this name in the run folder that a checkpoint lies in."""
-    beside = checkpoint.absolute().parent
-    return (beside.parent if beside.name == "checkpoints" else beside) / name
-
-
-def output_folder(given: str | None, default: Path) -> Path:
-    """Return where a command that does not train writes: as given, else by default.
-
-    The jobs of a sweep have folders of their own.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-    """
-    folder = job_folder() or Path(given or default)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{os.getpid()}.probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
-        ) from error
-    return folder

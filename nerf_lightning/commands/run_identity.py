@@ -16,6 +16,7 @@ from nerf_lightning.commands.suggestions import flatten
 NOT_IDENTITY = (
     *("paths.", "resume", "sweep.", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
     *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
+    *("scene.allow_outside", "scene.max_gigabytes"),
 )
 IDENTITY = ("callbacks.collapse_guard.",)
 # What may differ between two starts of which the second has nothing left to do.

@@ -1,11 +1,12 @@
 """What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
+from nerf_lightning.commands.plain_yaml import read_plain_yaml
+from nerf_lightning.data.json_files import read_json
+from nerf_lightning.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -52,16 +53,16 @@ def by_key(overrides: list[str]) -> dict[str, str]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
+        content = read_json(path)
+    except InputError:
         return {}
     return content if isinstance(content, dict) else {}
 
 
 def _read_overrides(path: Path) -> list[str]:
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError):
+        content = read_plain_yaml(path)
+    except InputError:
         return []
     return [str(override) for override in content] if isinstance(content, list) else []
 

@@ -2,13 +2,10 @@
 
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.errors import InputError
-
-# What belongs to one start of a run, not to the run.
-OF_ONE_START = ("resume=", "paths.", "init_from=", "sweep.")
 
 
 def prepare(arguments: list[str]) -> list[str]:
@@ -23,11 +20,10 @@ def prepare(arguments: list[str]) -> list[str]:
         return arguments
     path = Path(resumed[-1].strip("'\""))
     folder = path.parent.parent if path.suffix == ".ckpt" else path
-    saved = folder / ".hydra" / "overrides.yaml"
-    if not saved.is_file():
-        return arguments
-    former = [str(override) for override in OmegaConf.load(saved) if not str(override).startswith(OF_ONE_START)]
-    return [*former, *arguments]
+    # Imported late: --help needs no parser of overrides.
+    from nerf_lightning.commands.former_overrides import former_overrides
+
+    return [*former_overrides(folder, arguments), *arguments]
 
 
 def _refuse_second_sweep(arguments: list[str]) -> None:

@@ -20,6 +20,7 @@ from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.former_overrides import to_give_again
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.preemption import wants_restart
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
@@ -158,7 +159,8 @@ def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> lis
 
 
 def _resume_command(folder: Path) -> str:
-    return f"nerf train {to_type('resume', str(folder))}"
+    again = to_give_again(HydraConfig.get().overrides.task)
+    return " ".join(["nerf train", to_type("resume", str(folder)), *again])
 
 
 @contextmanager

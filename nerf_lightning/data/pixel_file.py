@@ -21,12 +21,14 @@ from filelock import FileLock
 from jaxtyping import UInt8
 from torch import Tensor
 
+from nerf_lightning.data.json_files import read_json
 from nerf_lightning.data.pixel_store import layout
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import PixelStore
 
 FORMAT = 1
 SPOTS, SPOT_BYTES = 64, 4096
+LONGEST_SIDE = 1 << 24
 GIGABYTE = 1e9
 
 log = logging.getLogger(__name__)
@@ -104,8 +106,9 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
     """Write the pixels under another name, and the header once they have theirs."""
     part, note = base.with_suffix(".part"), base.with_suffix(".json.part")
     try:
-        # Under the lock, what lies there was left by a process that was killed.
+        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
         part.unlink(missing_ok=True)
+        note.unlink(missing_ok=True)
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part)}))
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
@@ -123,11 +126,14 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     """Return the header of a store that is whole and up to date, else None."""
     path = base.with_suffix(".pixels")
     try:
-        header = Header(**json.loads(base.with_suffix(".json").read_text(encoding="utf-8")))
+        if not base.with_suffix(".json").exists():
+            return None
+        header = Header(**read_json(base.with_suffix(".json")))
+        _require_numbers(header)
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, InputError) as error:
         log.warning("%s.json is damaged (%s); the photographs are read anew.", base, error)
         return None
     if not sound:
@@ -137,6 +143,15 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
         log.info("%s was made from other contents, or they were not compared then; it is made anew.", path)
         return None
     return header
+
+
+def _require_numbers(header: Header) -> None:
+    """Refuse sizes that are none: offsets into the file follow from them."""
+    sizes_fit = all(
+        len(size) == 2 and all(type(side) is int and 0 < side < LONGEST_SIDE for side in size) for size in header.sizes
+    )
+    if not sizes_fit or type(header.masked) is not bool or type(header.has_transparency) is not bool:
+        raise ValueError("sizes or switches that are none")
 
 
 def _spots(path: Path) -> int:
