@@ -82,7 +82,7 @@ def benchmark(config: DictConfig) -> float:
         "matrix": _multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
         "train_plain": lambda: _train(bench, config.steps, plain=True),
-        "load": lambda: _load(bench),
+        "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
         "loaded": loaded_steps,
         "render": lambda: _render(bench, config.render_rays, plain=False),
         "render_plain": lambda: _render(bench, config.render_rays, plain=True),
@@ -212,10 +212,6 @@ def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[fl
         for name, value in stage_seconds(bench.system, bench.batch, bench.optimizer).items():
             result.setdefault(f"{name}, share of a step", []).append(value * steps / one)
     return result
-
-
-def _load(bench: Bench) -> None:
-    bench.batches.at(0, bench.batches.crop_rays(0))
 
 
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:

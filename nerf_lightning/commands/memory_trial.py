@@ -21,11 +21,11 @@ from nerf_lightning.models.pictures import render_picture, tile_rays_for
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch, RayBundle, Rendering, Scene
+from nerf_lightning.types import Batch, RayBundle, Rendering
 
 # So many that rays of different lengths make a mean, and so few that it takes a second at most.
 TRIAL_POINTS, FEWEST_RAYS = 2048, 4
-TRIAL_SIDE = 64
+TRIAL_SIDE = 256
 EXAMPLE = 1024
 
 
@@ -97,9 +97,9 @@ def _step(
         model.zero_grad(set_to_none=True)
         return peak_bytes(work, settings.device)
 
-    held(_few_rays(model), 1)  # compiles kernels
+    held(_few_rays(model, training=True), 1)  # compiles kernels
     system.learn_points_per_ray()
-    few = _few_rays(model)
+    few = _few_rays(model, training=True)
     two, four, larger = held(few, 2), held(few, 4), held(2 * few, 2)
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
     copies = max(0.0, two - few * (2 * per_batch_ray + per_tile_ray) - gradients)
@@ -108,8 +108,8 @@ def _step(
     return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
 
 
-def _few_rays(model: RadianceModel) -> int:
-    return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training=True)))
+def _few_rays(model: RadianceModel, training: bool) -> int:
+    return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
 
 
 def _tensors(batch: Batch) -> list[Tensor]:
@@ -121,7 +121,7 @@ def _tensors(batch: Batch) -> list[Tensor]:
 def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> int:
     """Return what the largest picture of the scene holds while it is rendered and measured."""
     model, scene = system.model, batches.scene
-    few = _few_rays(model)
+    few = _few_rays(model, training=False)
     rays = batches.at(0, batches.crop_rays(0)).rays.to(settings.device)
 
     def rendered(count: int) -> int:
@@ -133,36 +133,33 @@ def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: Ra
     per_ray = (rendered(2 * few) - rendered(few)) / few
     num_pixels = int((scene.pixels.width * scene.pixels.height).max())
     tile_rays = min(num_pixels, tile_rays_for(model, settings.inference_tile_points if tile is None else tile))
-    return int(num_pixels * _bytes_per_pixel(scene, settings.device) + tile_rays * per_ray)
+    # A small picture, cut into as many tiles by a stand-in that holds as much for each ray.
+    share = TRIAL_SIDE**2 / num_pixels
+    side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
+    camera = resized(scene.cameras[:1], side, side)
+    stand_in = _StandIn(int(per_ray)).to(settings.device)
+
+    def work() -> None:
+        tile_points = max(1, int(tile_rays * share))
+        picture = render_picture(stand_in, camera, 0, scene.near[:1], scene.far[:1], scene.background, tile_points)
+        image_metrics(picture.rgb, picture.rgb)
+
+    return int(peak_bytes(work, settings.device) / share)
 
 
-def _bytes_per_pixel(scene: Scene, device: torch.device) -> float:
-    """Return what a pixel of a picture takes besides what the model computes: its ray, its colour, its scores."""
+class _StandIn(RadianceModel):
+    """A model that computes nothing, and takes as much memory for each ray as another does."""
 
-    def held(side: int) -> int:
-        size = torch.tensor([side], device=scene.near.device)
-        cameras, nothing = resized(scene.cameras[:1], size, size), _Nothing().to(device)
-
-        def work() -> None:
-            picture = render_picture(nothing, cameras, 0, scene.near[:1], scene.far[:1], scene.background, TRIAL_POINTS)
-            image_metrics(picture.rgb, picture.rgb)
-
-        return peak_bytes(work, device)
-
-    return (held(2 * TRIAL_SIDE) - held(TRIAL_SIDE)) / (3 * TRIAL_SIDE**2)
-
-
-class _Nothing(RadianceModel):
-    """A model that computes nothing: all that is held is not the model's."""
-
-    def __init__(self) -> None:
+    def __init__(self, bytes_per_ray: int):
         super().__init__({})
+        self.bytes_per_ray = bytes_per_ray
         self.parameter = nn.Parameter(torch.zeros(()))
 
     def points_per_ray(self, training: bool) -> float:
         return 1.0
 
     def forward(self, rays: RayBundle, background: Tensor | None, random: RayRandom | None) -> list[Rendering]:
+        torch.empty(rays.near.numel() * self.bytes_per_ray, dtype=torch.uint8, device=rays.near.device)
         rgb = torch.zeros_like(rays.directions)
         return [Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))]
 

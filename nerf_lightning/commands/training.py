@@ -19,6 +19,7 @@ from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.memory_plan import announce_memory
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
@@ -102,6 +103,7 @@ def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
         )
     trainer = parts.settings.build(folder.path, parts.num_steps, parts.callbacks, _loggers(config, folder.path, former))
     _announce(parts, folder.path, former)
+    announce_memory(parts.settings, parts.system, parts.data)
     if former is None:
         describe_run(trainer.loggers, config)
     trainer.fit(parts.system, parts.data, ckpt_path=folder.checkpoint, weights_only=True)
