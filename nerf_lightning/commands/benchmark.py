@@ -2,8 +2,8 @@
 
 Machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are compared round by
 round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32 without tiles,
-the machine's matrix product, making a batch, the configured step with batches from the loader, and rendering. "Plain" is the same mathematics as one would first write
-it: float32, whole batches, torch around the same hash grid kernel, no screening of what lies behind opaque samples.
+the machine's matrix product, making a batch, the configured step with batches from the loader, and rendering. "Plain"
+is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid kernel, no screening of what lies behind opaque samples.
 """
 
 import json

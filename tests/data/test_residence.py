@@ -27,10 +27,11 @@ def loader(scene, ahead=False):
 
 
 def equal(ours, theirs):
+    names = ("origins", "directions", "near", "far", "camera_index")
+    pairs = [(ours.rgba, theirs.rgba), (ours.weight, theirs.weight)]
     return all(
         torch.equal(a, b)
-        for a, b in [(ours.rgba, theirs.rgba), (ours.weight, theirs.weight), (ours.rays.near, theirs.rays.near)]
-        + [(ours.rays.origins, theirs.rays.origins), (ours.rays.directions, theirs.rays.directions)]
+        for a, b in [*pairs, *((getattr(ours.rays, name), getattr(theirs.rays, name)) for name in names)]
     )
 
 
