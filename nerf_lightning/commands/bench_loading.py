@@ -26,8 +26,10 @@ class LoadedSteps:
         """Take the steps."""
         waited = 0.0
         for _ in range(self.steps):
-            found: list[Batch] = []
-            waited += seconds_of(lambda into=found: into.append(next(self.stream)))
-            self.train_on(found[0])
+            waited += seconds_of(self._load)
+            self.train_on(self.batch)
             self.batches.progress.advance(self.batches.progress.batch_rays)
         self.waits.append(waited / self.steps)
+
+    def _load(self) -> None:
+        self.batch = next(self.stream)

@@ -3,7 +3,8 @@
 Machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are compared round by
 round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32 without tiles,
 the machine's matrix product, making a batch, the configured step with batches from the loader, and rendering. "Plain"
-is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid kernel, no screening of what lies behind opaque samples.
+is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid kernel, no
+screening of what lies behind opaque samples.
 """
 
 import json
@@ -33,7 +34,7 @@ from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.models.pictures import tile_rays_for, tiles
+from nerf_lightning.models.tiles import tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types import Batch, RayBundle
@@ -78,7 +79,7 @@ def benchmark(config: DictConfig) -> float:
     bench = _prepare(config)
     reached = _train_first(bench, config)
     loaded_steps = LoadedSteps(bench.batches, bench.train_on, config.steps)
-    kinds: dict[str, Callable[[], None]] = {
+    kinds: dict[str, Callable[[], Any]] = {
         "matrix": _multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
         "train_plain": lambda: _train(bench, config.steps, plain=True),
@@ -136,17 +137,16 @@ def _prepare(config: DictConfig) -> Bench:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     data.settle(settings.device)
-    batches = data.batches
     if settings.measures_tile:
-        settings.tile_points = system.tile_points = measured_tile(settings, system, batches)
+        settings.tile_points = system.tile_points = measured_tile(settings, system, data.batches)
     optimizer, plain = system.configure_optimizers(), torch.optim.Adam(system.model.parameters(), lr=1e-6)
     # Stand-ins for what Lightning's trainer provides.
     setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
     setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
-    return Bench(settings, system, batches, optimizer, plain)
+    return Bench(settings, system, data.batches, optimizer, plain)
 
 
-def _interleaved(kinds: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+def _interleaved(kinds: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
     seconds: dict[str, list[float]] = {name: [] for name in kinds}
     for number in range(rounds + 1):
         for name, work in kinds.items():

@@ -65,10 +65,10 @@ class MemoryPlan:
         largest = max(
             (row for row in [*self.rows, *self.instead] if row.counts and row.cure), key=lambda row: row.num_bytes
         )
+        needed, free, most = (f"{size / GIGABYTE:.1f} GB" for size in (self.total, self.free, largest.num_bytes))
         return (
-            f"The run needs about {self.total / GIGABYTE:.1f} GB of memory, and {self.free / GIGABYTE:.1f} GB are free: it "
-            f"may be stopped by the system. Most of it is {largest.what} ({largest.num_bytes / GIGABYTE:.1f} GB): "
-            f"{largest.cure}."
+            f"The run needs about {needed} of memory, and {free} are free: it may be stopped by the system. "
+            f"Most of it is {largest.what} ({most}): {largest.cure}."
         )
 
 
@@ -80,14 +80,12 @@ def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: Ra
     pixels = data.scene.pixels
     moves = data.fits(device)
     where = "GPU" if device.type == "cuda" else "memory"
-    mapped = isinstance(pixels, MappedPixelStore)
     if moves:
         row = Row("pixels", num_bytes(pixels), where, cure="lower data.device_budget, or raise scene.downscale")
     else:
         # What lies in memory already is not asked for again.
-        row = Row(
-            "pixels", num_bytes(pixels), f"mapped file {pixels.path}" if mapped else "memory, there already", False
-        )
+        there = f"mapped file {pixels.path}" if isinstance(pixels, MappedPixelStore) else "memory, there already"
+        row = Row("pixels", num_bytes(pixels), there, counts=False)
     weights = sum(tensor.nbytes for tensor in [*system.model.parameters(), *system.model.buffers()])
     steps = [_step(trial, tile, where), _picture(trial, data, where)]
     gaps = 0 if device.type == "cuda" else int(GAPS * max(row.num_bytes for row in steps))

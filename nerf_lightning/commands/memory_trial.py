@@ -6,7 +6,7 @@ pixels and in the rays of a tile, so a few trials say all.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,8 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.geometry.cameras import resized
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import render_picture, tile_rays_for
+from nerf_lightning.models.pictures import render_picture
+from nerf_lightning.models.tiles import tile_rays_for
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
@@ -113,9 +114,8 @@ def _few_rays(model: RadianceModel, training: bool) -> int:
 
 
 def _tensors(batch: Batch) -> list[Tensor]:
-    found: list[Tensor] = []
-    batch.map(lambda tensor: found.append(tensor) or tensor)
-    return found
+    rays = (getattr(batch.rays, field.name) for field in fields(batch.rays))
+    return [batch.rgba, batch.weight, *rays]
 
 
 def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> int:

@@ -7,7 +7,8 @@ import psutil
 import torch
 from lightning.pytorch import LightningDataModule
 
-from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
+from nerf_lightning import ranks
+from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Scene
@@ -56,6 +57,12 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
+        least = batch_rays if sample_budget is None else batch_rays >> (BATCH_SIZES - 1)
+        if min(least, val_rays) < ranks.world_size():
+            raise InputError(
+                f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "
+                "processes without a ray. Raise them, or use fewer devices."
+            )
         if sample_budget is not None and (sample_budget < 1 or crop_steps):
             raise InputError(
                 f"data.sample_budget={sample_budget} with data.crop_steps={crop_steps}: give a positive budget and no "
@@ -65,18 +72,7 @@ class RayDataModule(LightningDataModule):
             raise InputError(f"data.device_budget={device_budget}: give gigabytes, 0 for none of them, or auto.")
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
-        if scene.background == "none" and scene.pixels.has_transparency:
-            raise InputError(
-                f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
-                "scene.background=none would train on colours without their alpha. Use white, black or random."
-            )
-        if scene.background == "random" and not scene.pixels.has_transparency:
-            log.warning(
-                "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
-                "scene is part of them and is learnt as matter. Give the background's colour instead "
-                "(scene.background=black or white).",
-                scene.name,
-            )
+        _check_background(scene)
         for split in ("train", "val"):
             if not scene.splits.get(split):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
@@ -112,3 +108,18 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> FixedRays:
         """Return the fixed validation rays."""
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
+
+
+def _check_background(scene: Scene) -> None:
+    if scene.background == "none" and scene.pixels.has_transparency:
+        raise InputError(
+            f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
+            "scene.background=none would train on colours without their alpha. Use white, black or random."
+        )
+    if scene.background == "random" and not scene.pixels.has_transparency:
+        log.warning(
+            "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
+            "scene is part of them and is learnt as matter. Give the background's colour instead "
+            "(scene.background=black or white).",
+            scene.name,
+        )

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from nerf_lightning import ranks
 from nerf_lightning.data.prefetch import made_ahead
 from nerf_lightning.data.residence import sent
 from nerf_lightning.errors import InputError
@@ -102,6 +103,8 @@ def gather(scene: Scene, pixels: PixelIndex) -> Batch:
 class RayBatches:
     """The training loader: an iterable of `Batch` that reads its place from the run's progress.
 
+    Where a run has several processes, each gets its share of the one batch.
+
     Args:
         scene: where the pixels come from.
         progress: shared with the system, which advances it after each step.
@@ -170,13 +173,14 @@ class RayBatches:
         return gather(self.scene, self.pixels_at(attempt, rays_seen, batch_rays))
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
-        """Return which pixels that batch holds."""
+        """Return which pixels this process has of that batch."""
         crop_rays = self.crop_rays(attempt)
         if rays_seen < crop_rays:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:
             domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
-        place = position + torch.arange(self.progress.batch_rays if batch_rays is None else batch_rays)
+        count = self.progress.batch_rays if batch_rays is None else batch_rays
+        place = position + torch.arange(count)[ranks.share(count)]
         epochs, epoch = torch.unique_consecutive(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
         numbers = permute(place % len(domain), len(domain), keys if len(keys) == 1 else keys[epoch])
@@ -185,6 +189,8 @@ class RayBatches:
 
 class FixedRays:
     """The validation loader: a fixed, evenly spread subset of a split's rays, the same for every run and seed.
+
+    Where a run has several processes, each gets its share.
 
     Args:
         scene: where the pixels come from.
@@ -201,7 +207,8 @@ class FixedRays:
         domain = PixelDomain(scene, scene.splits[split])
         count = min(num_rays, len(domain))
         numbers = permute(torch.arange(count), len(domain), torch.full((count,), fold("validation")))
-        self.chunks = [domain.locate(sent(part, domain.ends.device)) for part in numbers.split(chunk)]
+        mine = numbers[ranks.share(count)].split(chunk)
+        self.chunks = [domain.locate(sent(part, domain.ends.device)) for part in mine]
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "
