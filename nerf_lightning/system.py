@@ -193,7 +193,8 @@ class RadianceFieldSystem(LightningModule):
                 f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
                 "or tiles (trainer.tile_points=auto)."
             ) from error
-        self.tile_points = self.tile_points // 2
+        points = batch.rays.near.numel() * self.model.points_per_ray(training=True)
+        self.tile_points = int(min(self.tile_points, points)) // 2
         log.warning(
             "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
         )
