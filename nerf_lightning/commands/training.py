@@ -21,6 +21,7 @@ from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
 from nerf_lightning.commands.former_overrides import to_give_again
+from nerf_lightning.commands.memory_plan import announce_memory
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.preemption import wants_restart
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
@@ -118,6 +119,8 @@ def _run(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
         tile = ranks.from_first(lambda: measured_tile(parts.settings, parts.system, parts.data.batches))
         parts.system.tile_points = parts.settings.tile_points = tile
+    if ranks.is_first():
+        announce_memory(parts.settings, parts.system, parts.data)
     if parts.settings.compile:
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
     trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))

@@ -13,8 +13,9 @@ import shutil
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from filelock import FileLock
@@ -57,6 +58,18 @@ class Header:
     def num_bytes(self) -> int:
         """Size of the file."""
         return self.num_pixels * (5 if self.masked else 4)
+
+
+@dataclass(frozen=True)
+class MappedPixelStore(PixelStore):
+    """A store whose arrays are a file's. Pickled, it is a name: another process maps the same file."""
+
+    path: Path = field(kw_only=True)
+    header: Header = field(kw_only=True)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send the path, not the pixels, which may be more than memory holds."""
+        return _mapped, (self.path, self.header)
 
 
 def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> PixelStore:
@@ -165,13 +178,23 @@ def _spots(path: Path) -> int:
     return checksum
 
 
-def _mapped(path: Path, header: Header) -> PixelStore:
+def _mapped(path: Path, header: Header) -> MappedPixelStore:
     """Return the store as views of the file; what is written to them stays in this process."""
     bytes_ = _mapped_bytes(path)
     rgba = bytes_[: 4 * header.num_pixels].view(-1, 4)
     sizes = [(width, height) for width, height in header.sizes]
     mask = bytes_[4 * header.num_pixels :] if header.masked else None
-    return PixelStore(rgba, *layout(sizes), has_transparency=header.has_transparency, mask=mask)
+    offset, width, height = layout(sizes)
+    return MappedPixelStore(
+        rgba=rgba,
+        offset=offset,
+        width=width,
+        height=height,
+        has_transparency=header.has_transparency,
+        mask=mask,
+        path=path,
+        header=header,
+    )
 
 
 def _mapped_bytes(path: Path) -> UInt8[Tensor, "bytes"]:
