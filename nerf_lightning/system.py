@@ -168,14 +168,16 @@ class RadianceFieldSystem(LightningModule):
         for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
             rendering = self._render(batch.rays[tile], None if background is None else background[tile])
             error = (rendering.rgb - target[tile]).square().mean(dim=-1)
-            self.squared_errors.append(error[batch.weight[tile] > 0])
+            self.squared_errors.append(torch.stack([error, batch.weight[tile]]))
 
     def on_validation_epoch_end(self) -> None:
         """Log the PSNR of the fixed rays and its standard error (delta method).
 
         Straight to the loggers, since Lightning would count the step before.
         """
-        error = torch.cat(self.squared_errors).double()
+        # Masked on the host: on XLA a size that depends on data stops the device.
+        error, weight = torch.cat(self.squared_errors, dim=-1).cpu()
+        error = error[weight > 0].double()
         self.squared_errors.clear()
         mean = error.mean()
         standard_error = error.std() / error.numel() ** 0.5

@@ -14,7 +14,7 @@ class StepGuard:
     """Decide whether a step may be taken, and count those that may not.
 
     On the CPU the step is left out. Elsewhere reading the answer would stop the device, so the step is taken with
-    gradients of zero, and the count is read every `every_steps` steps.
+    gradients of zero, and every `every_steps` steps the count of the steps before is read, which is there already.
 
     Args:
         patience: so many bad steps in a row end the run.
@@ -35,6 +35,8 @@ class StepGuard:
         bad = ~torch.isfinite(losses.sum() + _sum_of_gradients(parameters))
         if self.counts is None or self.counts.device != bad.device:
             self.counts = torch.zeros(2, dtype=torch.long, device=bad.device)
+        if bad.device.type != "cpu" and step % self.every_steps == 0:
+            self.require_progress(step)
         total, in_row = self.counts[0] + bad, (self.counts[1] + 1) * bad
         self.counts = torch.stack([total, in_row])
         if bad.device.type == "cpu":
@@ -43,14 +45,12 @@ class StepGuard:
         for parameter in parameters:
             if parameter.grad is not None:
                 parameter.grad.masked_fill_(bad, 0.0)
-        if step % self.every_steps == 0:
-            self.require_progress(step)
         return True
 
     @property
     def skipped(self) -> int:
         """Steps left out so far."""
-        return 0 if self.counts is None else int(self.counts[0])
+        return self.state()[0]
 
     def require_progress(self, step: int) -> None:
         """Read the count.
@@ -58,10 +58,11 @@ class StepGuard:
         Raises:
             InputError: too many bad steps in a row.
         """
-        if self.counts is None or int(self.counts[1]) < self.patience:
+        _, in_row = self.state()
+        if in_row < self.patience:
             return
         raise InputError(
-            f"The loss or its gradients are not a finite number since {int(self.counts[1])} steps (now step {step}), "
+            f"The loss or its gradients are not a finite number since {in_row} steps (now step {step}), "
             "so nothing is learnt any more; the run stops, and nothing of these steps was kept. Try a smaller "
             "optimizer.lr, gradient clipping (trainer.clip_norm=1), trainer.precision=32-true, or check the capture's "
             "poses, near and far."
@@ -69,7 +70,7 @@ class StepGuard:
 
     def state(self) -> list[int]:
         """What a checkpoint keeps."""
-        return [0, 0] if self.counts is None else [int(x) for x in self.counts]
+        return [0, 0] if self.counts is None else self.counts.tolist()
 
     def restore(self, state: list[int], device: torch.device) -> None:
         """Take the counts up again."""

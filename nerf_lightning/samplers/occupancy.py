@@ -206,7 +206,8 @@ class OccupancySampler(AnySampler):
         if step % self.update_every or step == 0:
             return
         if self._numbers is None or self._numbers.device != self.possible.device:
-            self._numbers = self.possible.flatten().nonzero()[:, 0]
+            # Counted on the host, once: a size that depends on data is none of XLA's.
+            self._numbers = self.possible.flatten().cpu().nonzero()[:, 0].to(self.possible.device)
         number = self._numbers
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
