@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.backends import is_on
+# Elsewhere (XLA, and whatever comes after it) the search would go to the host and back.
+SEARCHING_DEVICES = ("cpu", "cuda", "mps")
 
 
 def search(
@@ -12,13 +13,21 @@ def search(
 ) -> Int[Tensor, "*rays m"]:
     """Return how many of each row's `ordered` numbers are below each of `numbers`; with `right`, at most as large.
 
-    XLA would send a binary search to the host and back. There each number is compared with all: the compiler fuses
-    comparison and sum, so that nothing of that size is stored.
-
     >>> search(torch.tensor([1.0, 2.0, 2.0, 3.0]), torch.tensor([0.0, 2.0, 9.0])).tolist()
     [0, 1, 4]
     """
-    if numbers.device.type != "xla" and is_on("searchsorted"):
+    if numbers.device.type in SEARCHING_DEVICES:
         return torch.searchsorted(ordered.contiguous(), numbers.contiguous(), right=right)
-    left, row = numbers[..., :, None], ordered[..., None, :]
-    return (row <= left if right else row < left).sum(dim=-1)
+    return search_by_comparison(ordered, numbers, right)
+
+
+def search_by_comparison(
+    ordered: Float[Tensor, "*rays n"], numbers: Float[Tensor, "*rays m"], right: bool = False
+) -> Int[Tensor, "*rays m"]:
+    """Return the same by comparing all with all; a compiler fuses comparison and sum, so that no n x m is stored.
+
+    >>> search_by_comparison(torch.tensor([1.0, 2.0, 2.0, 3.0]), torch.tensor([0.0, 2.0, 9.0]), right=True).tolist()
+    [0, 3, 4]
+    """
+    row, each = ordered[..., None, :], numbers[..., :, None]
+    return (row <= each if right else row < each).sum(dim=-1)
