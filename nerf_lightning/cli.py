@@ -81,17 +81,17 @@ def _run(command: str, arguments: list[str]) -> None:
 
     def task(config: "DictConfig") -> Any:
         # Caught inside the job as well: Hydra would print the overrides first, and run the next job of a sweep.
-        with _explained(command):
+        with explained(command):
             return module.run(config)
 
-    with _explained(command):
+    with explained(command):
         prepare = getattr(module, "prepare", list)
         sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)()
 
 
 @contextmanager
-def _explained(command: str) -> Iterator[None]:
+def explained(command: str) -> Iterator[None]:
     """Turn bad input into one paragraph and exit code 2."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException

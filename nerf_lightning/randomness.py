@@ -74,9 +74,9 @@ class RayRandom(TensorStruct):
         return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle", count))
 
 
-def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu") -> RayRandom:
-    """Return the random numbers of a whole batch; `key` comes from `fold`."""
-    slots = torch.arange(num_rays, device=device)
+def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu", first: int = 0) -> RayRandom:
+    """Return the random numbers of a batch, or of its rays from slot `first` on; `key` comes from `fold`."""
+    slots = torch.arange(first, first + num_rays, device=device)
     return RayRandom(key=torch.full_like(slots, key), slots=slots)
 
 

@@ -1,8 +1,9 @@
 """The one LightningModule: it wires model, loss, optimizer and schedule together, and holds no mathematics."""
 
+import logging
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -10,12 +11,13 @@ from lightning.pytorch import LightningModule
 from torch import Tensor
 from torch.optim import Optimizer
 
+from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import Progress, batch_size
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import tile_rays_for, tiles
+from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.optimizers.step_guard import StepGuard
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors, blend
@@ -25,12 +27,27 @@ from nerf_lightning.types import Background, Batch, RayBundle, Rendering
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
 
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A process's part of a step's batch."""
+
+    first: int
+    """Its first ray's slot in the batch."""
+    num_rays: int
+    """Rays of the whole batch."""
+    weight: Tensor
+    """Sum of the weights of the whole batch."""
+
 
 class RadianceFieldSystem(LightningModule):
     """Train a radiance model on ray batches.
 
     A step is cut into tiles of rays whose gradients add up: the activations stay in the cache, and the result is the
-    whole step's up to rounding. Hence the optimisation is manual.
+    whole step's up to rounding. Hence the optimisation is manual. Where a run has several processes, each has its share
+    of the batch, and their gradients are added up once a step.
 
     Args:
         model: the levels.
@@ -110,38 +127,92 @@ class RadianceFieldSystem(LightningModule):
         optimizer, progress = self.optimizers(), self.progress
         optimizer.zero_grad()  # type: ignore[union-attr]
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
-        self.last_step = self.accumulate_gradients(batch, self.manual_backward)
+        num_rays = progress.batch_rays
+        share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
+        self.last_step = self.accumulate_gradients(batch, self.manual_backward, share)
+        ranks.add_up([self.last_step["losses"], *self._gradients()])
         if self.guard.allows(self.last_step["losses"], self.model.parameters(), progress.step):
             self._update(optimizer)
-        progress.advance(batch.rays.near.numel())
+        progress.advance(num_rays)
+        if progress.step == 1 or progress.step % BATCH_STEPS == 0:
+            self._agree_on_measurements()
         if self.sample_budget is not None and (progress.step == 1 or progress.step % BATCH_STEPS == 0):
             points = self.model.points_per_ray(training=True)
             progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
 
-    def accumulate_gradients(self, batch: Batch, backward: Callable[[Tensor], None]) -> dict[str, Tensor]:
-        """Send a batch forward and backward, tile by tile.
+    def accumulate_gradients(
+        self, batch: Batch, backward: Callable[[Tensor], None], share: "Share | None" = None
+    ) -> dict[str, Tensor]:
+        """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
+
+        Args:
+            batch: rays, colours, weights.
+            backward: adds a loss's gradients to the parameters'.
+            share: what part of the step's batch this is; None: all of it.
 
         Returns:
-            `losses` per level, and each ray's `foreground` light, `target` colour and `weight`, detached.
+            `losses` per level, and each ray's `foreground` light, `target` colour and `weight`, detached. The losses of
+            all shares add up to the batch's.
         """
+        share = Share(0, batch.rays.near.numel(), batch.weight.sum()) if share is None else share
+        counts = [count.clone() for count in self.model.counts()]
+        while True:
+            try:
+                return self._accumulate(batch, backward, share)
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                self._take_smaller_tiles(batch, error)
+            self.model.zero_grad(set_to_none=False)
+            for count, before in zip(self.model.counts(), counts, strict=True):
+                count.copy_(before)
+
+    def _accumulate(self, batch: Batch, backward: Callable[[Tensor], None], share: "Share") -> dict[str, Tensor]:
         num_rays = batch.rays.near.numel()
         key = fold(self.seed, self.progress.attempt, self.progress.step)
-        random = batch_random(key, num_rays, self.device)
+        random = batch_random(key, num_rays, self.device, share.first)
         background = background_colors(self.background, num_rays, self.device, random)
         target = blend(batch.rgba, background)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
-        weight = batch.weight * (num_rays / batch.weight.sum().clamp(min=1.0))
+        weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
         losses, foreground = [], []
         for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
             behind = None if background is None else background[tile]
             renderings = self.model(batch.rays[tile], behind, random[tile])
             loss = self.loss(renderings, target[tile], weight[tile])
-            share = torch.stack(loss) * (target[tile].shape[0] / num_rays)
-            backward(share.sum())
-            losses.append(share.detach())
+            part = torch.stack(loss) * (target[tile].shape[0] / share.num_rays)
+            backward(part.sum())
+            losses.append(part.detach())
             foreground.append(renderings[-1].foreground.detach())
         seen = {"foreground": torch.cat(foreground), "target": target, "weight": batch.weight}
         return {"losses": torch.stack(losses).sum(0)} | seen
+
+    def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
+        if self.tile_points is None or self._tile_rays(batch.rays.near.numel(), training=True) == 1:
+            raise InputError(
+                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
+                "or tiles (trainer.tile_points=auto)."
+            ) from error
+        self.tile_points = self.tile_points // 2
+        log.warning(
+            "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
+        )
+
+    def _gradients(self) -> list[Tensor]:
+        # Every rank must send the same ones; a parameter that no ray of this rank has reached has none yet.
+        if ranks.world_size() == 1:
+            return []
+        for parameter in self.model.parameters():
+            if parameter.requires_grad and parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        return [parameter.grad for parameter in self.model.parameters() if parameter.grad is not None]
+
+    def _agree_on_measurements(self) -> None:
+        if ranks.world_size() > 1:
+            measured = self.model.measurements()
+            ranks.add_up(measured)
+            for value in measured:
+                value /= ranks.world_size()
 
     def learn_points_per_ray(self) -> None:
         """Take over how many samples the rays rendered so far have had, where a level measures it."""
@@ -179,13 +250,15 @@ class RadianceFieldSystem(LightningModule):
         error, weight = torch.cat(self.squared_errors, dim=-1).cpu()
         error = error[weight > 0].double()
         self.squared_errors.clear()
-        mean = error.mean()
-        standard_error = error.std() / error.numel() ** 0.5
+        ones = torch.ones_like(error)
+        count, first, second = ranks.total(torch.stack([ones.sum(), error.sum(), error.square().sum()]))
+        mean = first / count
+        standard_error = ((second / count - mean.square()).clamp(min=0) / (count - 1).clamp(min=1)).sqrt()
         values = {
             "val/psnr": float(-10.0 * torch.log10(mean)),
             "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean),
         }
-        self.log("val/psnr", values["val/psnr"], logger=False)
+        self.log("val/psnr", values["val/psnr"], logger=False, sync_dist=True)
         for logger in self.trainer.loggers:
             logger.log_metrics(values, self.trainer.global_step)
 
@@ -197,6 +270,7 @@ class RadianceFieldSystem(LightningModule):
             "bad_steps": self.guard.state(),
             "tile_points": self.tile_points,
             "num_threads": torch.get_num_threads(),
+            "world_size": ranks.world_size(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -206,7 +280,8 @@ class RadianceFieldSystem(LightningModule):
             setattr(self.progress, name, value)
         self.guard.restore(state["bad_steps"], self.device)
         self.tile_points = state["tile_points"]
-        torch.set_num_threads(state["num_threads"])
+        if state.get("world_size", 1) == ranks.world_size():
+            torch.set_num_threads(state["num_threads"])
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)

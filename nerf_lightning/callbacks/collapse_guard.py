@@ -7,6 +7,7 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning import ranks
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.errors import require_positive
 
@@ -48,7 +49,8 @@ class CollapseGuard(Callback):
         after_crop = (progress.rays_seen - batches.crop_rays(progress.attempt)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
             return
-        self.failed = self.failed + 1 if is_constant(pl_module.last_step, self.ratio) else 0
+        seen = whole_batch(pl_module.last_step)
+        self.failed = self.failed + 1 if is_constant(seen, self.ratio) else 0
         if self.failed >= self.patience:
             self.failed = 0
             self._restart(trainer, pl_module)
@@ -82,6 +84,12 @@ class CollapseGuard(Callback):
             logger.log_metrics({"train/attempt": system.progress.attempt}, step)
         for writer in tensorboard_writers(trainer.loggers):
             writer.add_text("collapse_guard", message, step)
+
+
+def whole_batch(last_step: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return what all processes saw of a step's rays."""
+    parts = ranks.gather({name: last_step[name].cpu() for name in ("foreground", "target", "weight")})
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:

@@ -40,8 +40,9 @@ class EpochFigures(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Draw the whole curve."""
-        path = Path(trainer.default_root_dir) / "images" / "loss_curve.png"
-        save_png(path, loss_curve(self.steps, self.losses))
+        if trainer.is_global_zero:
+            path = Path(trainer.default_root_dir) / "images" / "loss_curve.png"
+            save_png(path, loss_curve(self.steps, self.losses))
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the curve across a resume."""
@@ -52,6 +53,8 @@ class EpochFigures(Callback):
         self.steps, self.losses = list(state_dict["steps"]), list(state_dict["losses"])
 
     def _draw(self, trainer: Trainer, system: Any, epoch: int) -> None:
+        if not trainer.is_global_zero:
+            return
         _, picture = render_validation_view(trainer, system, self.view)
         figure = epoch_figure(picture.rgb, picture.depth, self.steps, self.losses)
         save_png(Path(trainer.default_root_dir) / "images" / "epochs" / f"epoch_{epoch:04d}.png", figure)

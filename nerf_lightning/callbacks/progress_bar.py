@@ -25,8 +25,13 @@ class TrainingProgress(ProgressBar):
         super().__init__()
         self.refresh_seconds, self.line_seconds = refresh_seconds, line_seconds
         self.bar: Progress | None = None
+        self.silent = False
         self.task = TaskID(0)
         self.started, self.first_step, self.shown, self.rays_seen = 0.0, 0, 0.0, 0
+
+    def disable(self) -> None:
+        """Stay silent: Lightning asks it of every process but the first."""
+        self.silent = True
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Show the bar."""
@@ -34,7 +39,7 @@ class TrainingProgress(ProgressBar):
         self.first_step = trainer.global_step
         self.rays_seen = pl_module.progress.rays_seen
         console = Console(stderr=True)
-        if not console.is_terminal:
+        if self.silent or not console.is_terminal:
             return
         self.bar = Progress(
             TextColumn("step {task.completed:,.0f}/{task.total:,.0f}"),
@@ -52,7 +57,7 @@ class TrainingProgress(ProgressBar):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Update what is shown."""
         now, step = time.perf_counter(), trainer.global_step
-        if now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
+        if self.silent or now - self.shown < (self.line_seconds if self.bar is None else self.refresh_seconds):
             return
         per_second = (step - self.first_step) / (now - self.started)
         # Negative after a restart, which counts anew.

@@ -6,6 +6,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning import ranks
 from nerf_lightning.errors import InputError
 
 
@@ -35,7 +36,8 @@ class TimeBudget(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
-        self.used, self.since = self.used + now - self.since, now
+        # All processes stop at the same step: the slowest clock is everybody's.
+        self.used, self.since = ranks.largest(self.used + now - self.since), now
         if pl_module.progress.step % self.every_steps == 0:
             self._fit_schedule(trainer, pl_module)
         if self.used >= self.seconds:

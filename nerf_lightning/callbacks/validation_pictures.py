@@ -29,7 +29,7 @@ class ValidationPictures(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render when it is time."""
         step = trainer.global_step
-        if step % self.every_steps and step != trainer.max_steps:
+        if not trainer.is_global_zero or (step % self.every_steps and step != trainer.max_steps):
             return
         view, picture = render_validation_view(trainer, pl_module, self.view)
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]

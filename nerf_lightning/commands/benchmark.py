@@ -32,7 +32,7 @@ from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.models.pictures import tile_rays_for, tiles
+from nerf_lightning.models.tiles import tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types import Batch, RayBundle

@@ -28,5 +28,6 @@ def prepare(arguments: list[str]) -> list[str]:
 def run(config: DictConfig) -> float:
     """Measure and return the PSNR."""
     from nerf_lightning.commands.evaluating import evaluate
+    from nerf_lightning.commands.processes import on_all_processes
 
-    return evaluate(config)
+    return on_all_processes("eval", config, evaluate)

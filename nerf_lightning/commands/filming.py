@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 from rich.progress import track
 from torch import Tensor
 
+from nerf_lightning import ranks
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.errors import InputError
@@ -46,7 +47,7 @@ def film(
     if form not in FORMATS:
         raise InputError(f"format={form}: choose video (mp4) or frames (PNG files).")
     # Rendered once and kept: the scale of the depth is known at the end only.
-    pictures = [picture for picture in render_path(model, scene, path, background, tile_points)]
+    pictures = ranks.in_turn(list(render_path(model, scene, path, background, tile_points)))
     unit = unit_of(scene.to_user)
     seen = unit * torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
     near, far = unit * float(scene.near.min()), unit * float(scene.far.max())
@@ -63,7 +64,7 @@ def film(
 def render_path(
     model: RadianceModel, scene: SceneRecord, path: CameraPath, background: Background, tile_points: int
 ) -> Iterator[Picture]:
-    """Render one picture per camera of the path; near and far are the widest of the photographs."""
+    """Render this process's pictures of the path; near and far are the widest of the photographs."""
     cameras = path.cameras(frame_of(scene.cameras, scene.aabb))
     count = cameras.c2w.shape[0]
     if scene.cameras.ndc is not None:
@@ -79,7 +80,8 @@ def render_path(
         cameras = replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
     near = scene.near.min().expand(count)
     far = scene.far.max().expand(count)
-    for view in track(range(count), description="filming", transient=True, console=stderr_console()):
+    mine = ranks.every_other(range(count))
+    for view in track(mine, description="filming", transient=True, console=stderr_console()):
         yield render_picture(model, cameras, view, near, far, background, tile_points)
 
 
@@ -91,11 +93,13 @@ def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
 
 
 def _write(folder: Path, name: str, frames: list[UInt8[Tensor, "h w 3"]], fps: int, form: str) -> Path:
-    if form == "frames":
-        write_frames(folder / name, frames)
-        return folder / name
-    write_video(folder / f"{name}.mp4", frames, fps, len(frames))
-    return folder / f"{name}.mp4"
+    target = folder / (name if form == "frames" else f"{name}.mp4")
+    if ranks.is_first():
+        if form == "frames":
+            write_frames(target, frames)
+        else:
+            write_video(target, frames, fps, len(frames))
+    return target
 
 
 def _thinned(values: Tensor, most: int = 1_000_000) -> Tensor:

@@ -10,6 +10,7 @@ from lightning.pytorch import Trainer
 from omegaconf import DictConfig
 from PIL import Image
 
+from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
@@ -58,7 +59,8 @@ class Finish:
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
                 video, depth = film(model, scene_record(scene), self.path, scene.background, tile_points, folder)
-                lines += [f"video        {video}", f"depth        {depth}", *_film_progress(folder)]
+                lines += [f"video        {video}", f"depth        {depth}"]
+                lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
         lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
         print("\n".join(lines))

@@ -5,6 +5,7 @@ from omegaconf import DictConfig
 
 def run(config: DictConfig) -> None:
     """Render colour and depth."""
+    from nerf_lightning.commands.processes import on_all_processes
     from nerf_lightning.commands.rendering import render
 
-    render(config)
+    on_all_processes("render", config, render)

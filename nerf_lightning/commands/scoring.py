@@ -10,6 +10,7 @@ from typing import Any, Literal
 from rich.progress import track
 from torch import Tensor
 
+from nerf_lightning import ranks
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.geometry import depth_error, normal_error, normals_from_depth, surface_depth
@@ -69,7 +70,8 @@ class Scoring:
         kept = {views[i * len(views) // self.num_pictures] for i in range(self.num_pictures)} if views else set()
         rows: list[dict[str, Any]] = []
         started = time.perf_counter()
-        for view in track(views, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
+        mine = ranks.every_other(views)
+        for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
             picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
             truth = photograph(scene, view, background)
             if self.quantize:
@@ -78,6 +80,7 @@ class Scoring:
             if view in kept:
                 panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
                 save_png(folder / "images" / _file_name(self.split, scene.view_names[view]), panel)
+        rows = ranks.in_turn(rows)
         result: dict[str, Any] = mean_over_images([{m: row[m] for m in METRICS} for row in rows]) | {
             "num_images": len(rows),
             "seconds_per_image": (time.perf_counter() - started) / len(rows),
@@ -86,7 +89,8 @@ class Scoring:
         }
         if result["lpips"] is None:
             result["lpips_hint"] = LPIPS_HINT
-        write_metrics(folder, result)
+        if ranks.is_first():
+            write_metrics(folder, result)
         return result
 
     def _views(self, scene: Scene) -> list[int]:

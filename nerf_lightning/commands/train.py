@@ -25,6 +25,7 @@ def prepare(arguments: list[str]) -> list[str]:
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
     # Imported late: torch and Lightning take seconds, and --help needs neither.
+    from nerf_lightning.commands.processes import on_all_processes
     from nerf_lightning.commands.training import train
 
-    return train(config)
+    return on_all_processes("train", config, train)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from lightning.pytorch import Callback
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.callbacks.time_budget import TimeBudget
@@ -54,13 +55,25 @@ def train(config: DictConfig) -> float | None:
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
     parts = _build_parts(config)
-    folder = open_run(config, parts.num_steps, job_folder())
+    held: list[RunFolder] = []
     try:
-        write_config(folder.path, config, HydraConfig.get())
-        with _log_file(folder.path):
-            return _run(config, parts, folder)
+        path, checkpoint = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
+        with _log_file(path) if ranks.is_first() else nullcontext():
+            psnr, last_step = _run(config, parts, path, checkpoint)
+        for folder in held:
+            folder.finish(last_step)
+        return psnr
     finally:
-        folder.release()
+        for folder in held:
+            folder.release()
+
+
+def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> tuple[Path, Path | None]:
+    """Let one process choose and hold the folder for all; return it, and the checkpoint to go on from."""
+    folder = open_run(config, num_steps, job_folder())
+    held.append(folder)
+    write_config(folder.path, config, HydraConfig.get())
+    return folder.path, folder.checkpoint
 
 
 def _build_parts(config: DictConfig) -> Parts:
@@ -89,30 +102,30 @@ def _build_parts(config: DictConfig) -> Parts:
     return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
 
 
-def _run(config: DictConfig, parts: Parts, folder: RunFolder) -> float | None:
-    former = None if folder.checkpoint is None else read_checkpoint(folder.checkpoint)
+def _run(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None) -> tuple[float | None, int]:
+    former = None if checkpoint is None else read_checkpoint(checkpoint)
     if former is not None:
-        log.info("going on from step %d of %s", former.step, folder.path)
+        log.info("going on from step %d of %s", former.step, folder)
         parts.settings.keep_precision(former.precision)
         parts.settings.keep_tile(former.tile_points)
     parts.system.record["precision"] = parts.settings.precision
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
-        parts.system.tile_points = parts.settings.tile_points = measured_tile(
-            parts.settings, parts.system, parts.data.batches
-        )
-    trainer = parts.settings.build(folder.path, parts.num_steps, parts.callbacks, _loggers(config, folder.path, former))
-    _announce(parts, folder.path, former)
+        tile = ranks.from_first(lambda: measured_tile(parts.settings, parts.system, parts.data.batches))
+        parts.system.tile_points = parts.settings.tile_points = tile
+    if parts.settings.compile:
+        log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
+    trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
+    _announce(parts, folder, former)
     if former is None:
         describe_run(trainer.loggers, config)
-    trainer.fit(parts.system, parts.data, ckpt_path=folder.checkpoint, weights_only=True)
+    trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
     if parts.signals.received is not None:
-        log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder.path))
+        log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
         raise SystemExit(128 + parts.signals.received)
-    psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder.path)
-    folder.finish(trainer.global_step)
+    psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder)
     for logger in trainer.loggers:
         logger.finalize("success")
-    return psnr
+    return psnr, trainer.global_step
 
 
 def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:
@@ -130,6 +143,8 @@ def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:
 
 
 def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> list[Logger]:
+    if not ranks.is_first():
+        return []
     purge: dict[str, Any] = {}
     if (folder / "tensorboard").exists():
         # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.

@@ -4,7 +4,8 @@ import logging
 
 from lightning.pytorch import LightningDataModule
 
-from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
+from nerf_lightning import ranks
+from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Scene
 
@@ -45,6 +46,12 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
+        least = batch_rays if sample_budget is None else batch_rays >> (BATCH_SIZES - 1)
+        if min(least, val_rays) < ranks.world_size():
+            raise InputError(
+                f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "
+                "processes without a ray. Raise them, or use fewer devices."
+            )
         if sample_budget is not None and (sample_budget < 1 or crop_steps):
             raise InputError(
                 f"data.sample_budget={sample_budget} with data.crop_steps={crop_steps}: give a positive budget and no "

@@ -5,11 +5,14 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn
 
+from nerf_lightning import ranks
+
 
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
     """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
     console = Console(stderr=True)
-    return Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal))
+    shown = shown and console.is_terminal and ranks.is_first()
+    return Progress(*columns, console=console, transient=True, disable=not shown)
 
 
 class StageProgress:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from nerf_lightning import ranks
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.randomness import fold, permute
@@ -99,6 +100,8 @@ def gather(scene: Scene, pixels: PixelIndex) -> Batch:
 class RayBatches:
     """The training loader: an iterable of `Batch` that reads its place from the run's progress.
 
+    Where a run has several processes, each gets its share of the one batch.
+
     Args:
         scene: where the pixels come from.
         progress: shared with the system, which advances it after each step.
@@ -150,13 +153,13 @@ class RayBatches:
         return gather(self.scene, self.pixels_at(attempt, rays_seen))
 
     def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
-        """Return which pixels that batch holds."""
+        """Return which pixels this process has of that batch."""
         crop_rays = self.crop_rays(attempt)
         if rays_seen < crop_rays:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:
             domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
-        place = position + torch.arange(self.progress.batch_rays)
+        place = position + torch.arange(self.progress.batch_rays)[ranks.share(self.progress.batch_rays)]
         epochs, epoch = torch.unique(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
         return domain.locate(permute(place % len(domain), len(domain), keys[epoch]))
@@ -164,6 +167,8 @@ class RayBatches:
 
 class FixedRays:
     """The validation loader: a fixed, evenly spread subset of a split's rays, the same for every run and seed.
+
+    Where a run has several processes, each gets its share.
 
     Args:
         scene: where the pixels come from.
@@ -180,7 +185,7 @@ class FixedRays:
         domain = PixelDomain(scene, scene.splits[split])
         count = min(num_rays, len(domain))
         numbers = permute(torch.arange(count), len(domain), torch.full((count,), fold("validation")))
-        self.chunks = [domain.locate(part) for part in numbers.split(chunk)]
+        self.chunks = [domain.locate(part) for part in numbers[ranks.share(count)].split(chunk)]
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "

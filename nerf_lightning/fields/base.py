@@ -18,6 +18,9 @@ class Field(nn.Module, ABC):
     needs_random: bool = False
     """True where training draws random numbers for each sample."""
 
+    compiles: bool = True
+    """False where kernels of our own do most of the work, which torch.compile cannot see into."""
+
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 

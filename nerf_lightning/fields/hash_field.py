@@ -36,6 +36,8 @@ class HashField(Field):
         contraction: map all space, contracted around the box, instead of the box alone; None: as the scene's space.
     """
 
+    compiles = False
+
     aabb: Tensor
     bias: Tensor
 

@@ -36,6 +36,18 @@ class AnyLevel(nn.Module):
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
         self.field.place(scene)
 
+    def counts(self) -> list[Tensor]:
+        """Return the buffers in which a training step counts, to put them back where a step is repeated."""
+        return []
+
+    def measurements(self) -> list[Tensor]:
+        """Return the buffers that hold means over rays, which the processes of a run must agree on."""
+        return []
+
+    def compile_field(self) -> bool:
+        """Compile the field where its shapes do not depend on the data; tell whether it was."""
+        return False
+
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
@@ -70,6 +82,12 @@ class Level(AnyLevel):
         """As the sampler says."""
         return float(self.sampler.num_samples_after(int(before)))
 
+    def compile_field(self) -> bool:
+        """Compile the field, for static shapes: dynamic ones may be specialised otherwise after a resume."""
+        if self.field.compiles:
+            self.field.compile(dynamic=False)
+        return self.field.compiles
+
     def forward(
         self,
         rays: RayBundle,
@@ -103,6 +121,8 @@ class RadianceModel(nn.Module):
     def __init__(self, levels: dict[str, AnyLevel]):
         super().__init__()
         self.levels = nn.ModuleDict(levels)
+        self.most_rays: int | None = None
+        """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
         self.points_per_ray(training=False)  # levels that do not fit each other are refused here
 
     @property
@@ -144,6 +164,18 @@ class RadianceModel(nn.Module):
         """Tell the levels where the scene's content lies, once, before training."""
         for level in self._in_order():
             level.place(scene)
+
+    def counts(self) -> list[Tensor]:
+        """Return the buffers of all levels in which a training step counts."""
+        return [count for level in self._in_order() for count in level.counts()]
+
+    def measurements(self) -> list[Tensor]:
+        """Return the buffers of all levels that hold means over rays."""
+        return [measured for level in self._in_order() for measured in level.measurements()]
+
+    def compile_fields(self) -> list[str]:
+        """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
+        return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
     def update(self, step: int, key: int) -> None:
         """Do what the levels do between steps of training."""

@@ -73,6 +73,15 @@ class PackedLevel(AnyLevel):
             self.tally[:2] = 0
             self._samples_per_ray = None
 
+    def counts(self) -> list[Tensor]:
+        """Return samples and rays since the grid's last update."""
+        return [self.tally]
+
+    def measurements(self) -> list[Tensor]:
+        """Return the samples per ray; who changes them is asked for `points_per_ray` anew."""
+        self._samples_per_ray = None
+        return [self.measured]
+
     def statistics(self) -> dict[str, float]:
         """Samples per ray, the share of cells that are occupied, and samples for which there was no room."""
         return {

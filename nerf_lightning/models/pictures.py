@@ -1,6 +1,6 @@
 """Whole views: render every pixel of a camera, a chunk of rays at a time."""
 
-from collections.abc import Iterator
+import logging
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,8 +10,11 @@ from torch import Tensor
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.types import Background, Cameras, RayBundle, TensorStruct
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -22,26 +25,6 @@ class Picture(TensorStruct):
     depth: Float[Tensor, "height width"]
     """Expected distance along the ray; light that escapes ends at far."""
     opacity: Float[Tensor, "height width"]
-
-
-def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
-    """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
-
-    >>> [(part.start, part.stop) for part in tiles(10, 4)]
-    [(0, 4), (4, 7), (7, 10)]
-    """
-    count = max(1, -(-num_rays // tile_rays))
-    size, rest = divmod(num_rays, count)
-    start = 0
-    for number in range(count):
-        stop = start + size + int(number < rest)
-        yield slice(start, stop)
-        start = stop
-
-
-def tile_rays_for(model: RadianceModel, tile_points: int, training: bool = False) -> int:
-    """Return how many rays make a tile of about `tile_points` points, at least one."""
-    return max(1, int(tile_points / model.points_per_ray(training)))
 
 
 @torch.no_grad()
@@ -59,15 +42,28 @@ def render_picture(
     pixels = all_pixels(cameras, view)
     shape = pixels.x.shape
     rays = rays_through_pixels(cameras, pixels.map(torch.flatten), near, far)
-    parts = [
-        _render_tile(model, rays[part].to(device), background)
-        for part in tiles(rays.near.numel(), tile_rays_for(model, tile_points))
-    ]
-    rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
+    rgb, depth, opacity = _render_rays(model, rays, background, tile_points, device)
     if cameras.ndc is not None:
         straight = rays_through_pixels(replace(cameras, ndc=None), pixels.map(torch.flatten), near, far)
         depth = world_distance(straight, depth / rays.far)
     return Picture(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape))
+
+
+def _render_rays(
+    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int, device: torch.device
+) -> tuple[Tensor, ...]:
+    at_once = tile_rays_for(model, tile_points)
+    if model.most_rays is not None:
+        at_once = min(at_once, model.most_rays)
+    while True:
+        try:
+            parts = [_render_tile(model, rays[p].to(device), background) for p in tiles(rays.near.numel(), at_once)]
+            return tuple(torch.cat(column) for column in zip(*parts, strict=True))
+        except RuntimeError as error:
+            if at_once == 1 or not is_out_of_memory(error):
+                raise
+        model.most_rays = at_once = at_once // 2
+        log.warning("no memory to render so many rays at once: from now on %d", at_once)
 
 
 def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,7 +3,7 @@ import logging
 import pytest
 import torch
 
-from nerf_lightning.commands import trainer
+from nerf_lightning.commands import devices, trainer
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.errors import InputError
 
@@ -11,7 +11,7 @@ from nerf_lightning.errors import InputError
 @pytest.fixture
 def native(monkeypatch):
     def pretend(answer):
-        monkeypatch.setattr(trainer, "has_native_bfloat16", lambda device_type: answer)
+        monkeypatch.setattr(devices, "has_native_bfloat16", lambda device_type: answer)
 
     return pretend
 
@@ -33,7 +33,7 @@ def test_a_precision_that_is_asked_for_is_taken_with_a_warning_where_it_is_slow(
 
 
 def test_the_probe_answers_on_this_machine():
-    assert trainer.has_native_bfloat16("cpu") in (True, False)
+    assert devices.has_native_bfloat16("cpu") in (True, False)
 
 
 def test_the_length_is_the_smaller_of_steps_and_epochs():
@@ -86,3 +86,21 @@ def test_bfloat16_trains_and_evaluates(nerf, capture, tmp_path):
     assert result.code == 0, result.err
     weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(value.dtype == torch.float32 for value in weights.values() if value.is_floating_point())
+
+
+def test_what_this_machine_lacks_is_refused_with_a_cure(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    for settings, words in (
+        ({"accelerator": "gpu"}, "torch sees no CUDA device"),
+        ({"accelerator": "mps"}, "torch sees no Apple GPU"),
+        ({"accelerator": "cpu", "precision": "tf32"}, "trainer.precision=32-true"),
+    ):
+        with pytest.raises(InputError, match=words):
+            TrainerSettings(**settings)
+
+
+def test_the_choice_of_the_device_has_its_reason(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "(no GPU found)" in TrainerSettings().describe()
+    assert "(as asked)" in TrainerSettings(accelerator="cpu").describe()

@@ -2,7 +2,8 @@ import torch
 from scenes import ball_scene, some_rays, tiny_model
 
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import render_picture, tile_rays_for, tiles
+from nerf_lightning.models.pictures import render_picture
+from nerf_lightning.models.tiles import tile_rays_for, tiles
 from nerf_lightning.randomness import batch_random
 
 

@@ -1,0 +1,74 @@
+"""Which device computes, and in which numbers: the choice, and the reason that is printed once."""
+
+import logging
+from typing import Literal
+
+import torch
+
+from nerf_lightning.errors import InputError
+
+log = logging.getLogger(__name__)
+
+Accelerator = Literal["auto", "cpu", "gpu", "mps"]
+DeviceType = Literal["cpu", "cuda", "mps"]
+Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
+LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps"}
+
+
+def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
+    """Return the type of device and why it is that one; auto takes a CUDA GPU where there is one, else the CPU.
+
+    Raises:
+        InputError: torch does not see the device that was asked for.
+    """
+    if accelerator == "cpu":
+        return "cpu", "as asked"
+    if accelerator == "mps":
+        if not torch.backends.mps.is_available():
+            raise InputError(
+                "trainer=mps: torch sees no Apple GPU here. It needs a Mac with Apple silicon and macOS 14 or later; "
+                "use trainer=cpu or trainer=auto."
+            )
+        log.warning("trainer=mps has never been tried: compare its first losses with those of trainer=cpu.")
+        return "mps", "as asked, untested"
+    if torch.cuda.is_available():
+        return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
+    if accelerator == "gpu":
+        raise InputError(
+            "trainer=gpu: torch sees no CUDA device here. Use trainer=cpu or trainer=auto, or install a CUDA build "
+            "of torch and check nvidia-smi."
+        )
+    return "cpu", "no GPU found"
+
+
+def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal["32-true", "tf32", "bf16-mixed"], str]:
+    """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
+
+    Raises:
+        InputError: tf32 is asked of a device that has none.
+    """
+    if asked == "auto":
+        native = has_native_bfloat16(device_type)
+        return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"
+    if asked == "tf32" and not _has_tf32(device_type):
+        raise InputError(
+            "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
+            "device here is none. Use trainer.precision=32-true, or auto."
+        )
+    if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
+        log.warning("trainer.precision=%s: this device has no native bfloat16 and emulates it, slowly.", asked)
+    return asked, "as asked"
+
+
+def has_native_bfloat16(device_type: str) -> bool:
+    """Tell whether the device multiplies bfloat16 matrices in hardware."""
+    if device_type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device_type != "cpu":
+        return False
+    probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    return any(getattr(torch.cpu, probe, bool)() for probe in probes)
+
+
+def _has_tf32(device_type: str) -> bool:
+    return device_type == "cuda" and torch.cuda.get_device_capability() >= (8, 0)

@@ -1,0 +1,46 @@
+"""Prepare the process: threads, memory allocator, and warnings that do not concern the user."""
+
+import ctypes
+import logging
+import sys
+import warnings
+from typing import Any
+
+import torch
+
+ALL_THREADS = torch.get_num_threads()
+M_MMAP_THRESHOLD = -3
+M_TRIM_THRESHOLD = -1
+
+
+def prepare_machine(num_threads: int | None) -> None:
+    """Set threads and the allocator, once per process; None: one thread per core."""
+    torch.set_num_threads(num_threads or ALL_THREADS)
+    _keep_large_blocks()
+    _quiet_libraries()
+
+
+def _keep_large_blocks() -> None:
+    # glibc gives blocks of 32 MB and more back to the system at each free; fetching them anew costs more than the
+    # arithmetic done in them (measured: 1.5 times the whole step).
+    if sys.platform != "linux":
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(M_MMAP_THRESHOLD, 1 << 30)
+    mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def _quiet_libraries() -> None:
+    # Advice about data loader workers and the like, which does not apply: our loader is not a DataLoader.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    ignored: list[dict[str, Any]] = [
+        {"message": ".*does not have many workers.*"},
+        {"message": ".*LeafSpec.*", "category": FutureWarning},
+        {"message": ".*isinstance.treespec, LeafSpec.*"},
+        {"message": ".*ckpt_path.*mid-epoch.*"},
+    ]
+    for rule in ignored:
+        warnings.filterwarnings("ignore", **rule)

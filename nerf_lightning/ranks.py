@@ -1,0 +1,114 @@
+"""The processes of a run: which one this is, and sums and words across all of them. Alone, all of it is trivial.
+
+Processes are joined by `commands.processes`; here only torch.distributed is asked whether they are. Each rank works on
+its share of the same global batch, and what any of them decides from, all of them know.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, distributed
+
+from nerf_lightning.errors import InputError
+
+Item = TypeVar("Item")
+
+
+def world_size() -> int:
+    """Return how many processes the run has."""
+    return distributed.get_world_size() if distributed.is_initialized() else 1
+
+
+def rank() -> int:
+    """Return which of them this is, from 0."""
+    return distributed.get_rank() if distributed.is_initialized() else 0
+
+
+def is_first() -> bool:
+    """Tell whether this process speaks and writes for all."""
+    return rank() == 0
+
+
+def share(count: int) -> slice:
+    """Return this rank's part of `count` things in a row; the parts are as equal as can be.
+
+    >>> share(10)
+    slice(0, 10, None)
+    """
+    return part_of(count, rank(), world_size())
+
+
+def part_of(count: int, number: int, parts: int) -> slice:
+    """Return part `number` of `parts`.
+
+    >>> [part_of(10, number, 4) for number in range(4)]
+    [slice(0, 3, None), slice(3, 6, None), slice(6, 8, None), slice(8, 10, None)]
+    """
+    size, rest = divmod(count, parts)
+    start = number * size + min(number, rest)
+    return slice(start, start + size + int(number < rest))
+
+
+def every_other(items: Sequence[Item]) -> Sequence[Item]:
+    """Return this rank's items where they are dealt out in turn."""
+    return items[rank() :: world_size()]
+
+
+def add_up(tensors: Iterable[Tensor]) -> None:
+    """Replace each tensor by its sum over the ranks; all ranks get the same bits."""
+    if world_size() > 1:
+        for pending in [distributed.all_reduce(tensor, async_op=True) for tensor in tensors]:
+            pending.wait()
+
+
+def total(tensor: Tensor) -> Tensor:
+    """Return the sum of a tensor over the ranks."""
+    result = tensor.clone()
+    add_up([result])
+    return result
+
+
+def largest(value: float) -> float:
+    """Return the largest value that any rank has."""
+    if world_size() == 1:
+        return value
+    result = torch.tensor(value, dtype=torch.float64)
+    distributed.all_reduce(result, op=distributed.ReduceOp.MAX)
+    return float(result)
+
+
+def gather(value: Item) -> list[Item]:
+    """Return the values of all ranks, in their order."""
+    if world_size() == 1:
+        return [value]
+    values: list[Any] = [None] * world_size()
+    distributed.all_gather_object(values, value)
+    return values
+
+
+def in_turn(items: Sequence[Item]) -> list[Item]:
+    """Return all items in their first order, where each rank holds its `every_other`."""
+    parts = gather(list(items))
+    rounds = max(map(len, parts))
+    return [part[number] for number in range(rounds) for part in parts if number < len(part)]
+
+
+def from_first(make: Callable[[], Item]) -> Item:
+    """Let the first rank make something, and return it on all of them.
+
+    Raises:
+        InputError: what the first rank raised, on all of them.
+    """
+    if world_size() == 1:
+        return make()
+    told: list[Any] = [None, None]
+    if is_first():
+        try:
+            told[0] = make()
+        except InputError as error:
+            told[1] = str(error)
+    distributed.broadcast_object_list(told, src=0)
+    if told[1] is not None:
+        raise InputError(told[1])
+    return told[0]
