@@ -225,7 +225,7 @@ class RadianceFieldSystem(LightningModule):
 
     def _require_finite_weights(self) -> None:
         # A finite loss may still have had gradients that were not.
-        if not all(bool(torch.isfinite(parameter).all()) for parameter in self.model.parameters()):
+        if not bool(torch.stack([torch.isfinite(parameter).all() for parameter in self.model.parameters()]).all()):
             raise InputError(
                 f"The weights of step {self.trainer.global_step} are not finite numbers, so they are not saved. The "
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "
