@@ -28,7 +28,12 @@ FAST = (
 
 def start(*arguments: str, **options) -> subprocess.Popen:
     """Start the command line as a process of its own."""
-    command = [sys.executable, "-m", "nerf_lightning", *map(str, arguments)]
+    return start_module("nerf_lightning", *arguments, **options)
+
+
+def start_module(module: str, *arguments: str, **options) -> subprocess.Popen:
+    """Start a module as a process of its own."""
+    command = [sys.executable, "-m", module, *map(str, arguments)]
     return subprocess.Popen(
         command,
         # A shell's background jobs ignore Ctrl-C and so would their children; a person's terminal does not.

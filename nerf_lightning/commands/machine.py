@@ -41,6 +41,7 @@ def _quiet_libraries() -> None:
         {"message": ".*LeafSpec.*", "category": FutureWarning},
         {"message": ".*isinstance.treespec, LeafSpec.*"},
         {"message": ".*ckpt_path.*mid-epoch.*"},
+        {"message": ".*checkpoint that ended before the epoch ended.*"},
     ]
     for rule in ignored:
         warnings.filterwarnings("ignore", **rule)

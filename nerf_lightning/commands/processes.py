@@ -168,8 +168,8 @@ def _require_launcher(launcher: Launcher) -> None:
         )
     if launcher != "nerf" and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise InputError(
-            f"A sweep (-m) under trainer={launcher}: each of the processes would run the sweep by itself, and they would "
-            "wait for each other for ever. Start nerf train -m once, with trainer=ddp for jobs of several devices, or with "
+            f"A sweep (-m) under trainer={launcher}: each of the processes would run the sweep by itself, and wait for "
+            "the others for ever. Start nerf train -m once, with trainer=ddp for jobs of several devices, or with "
             "hydra/launcher=submitit_slurm for jobs of a cluster."
         )
     if launcher == "slurm" and "SLURM_PROCID" not in os.environ:

@@ -1,0 +1,162 @@
+"""Several processes train one run: the same batch, the same weights, one folder; and they stop and resume together."""
+
+import json
+import signal
+import socket
+import time
+
+import pytest
+import torch
+from running import FAST, start, start_module
+
+from nerf_lightning.commands import processes
+from nerf_lightning.commands.processes import num_processes
+from nerf_lightning.errors import InputError
+
+STEPS = 50
+TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
+FAST_MODEL = (
+    "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
+    "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
+    "data.batch_rays=256", "data.sample_budget=2000", "data.crop_steps=0",
+)  # fmt: skip
+
+
+def arguments(capture, *extra):
+    return (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "data.batch_rays=101", "scheduler=constant",
+        f"trainer.max_steps={STEPS}", "scene.background=random", "final.video=false", "path.num_frames=3",
+        "evaluation.max_views=3", "callbacks.validation_pictures.every_steps=1000", *extra,
+    )  # fmt: skip
+
+
+def finished(process):
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output
+
+
+def saved(folder):
+    last = folder / "checkpoints" / "last.ckpt"
+    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
+
+
+def assert_close(folder, other):
+    ours, theirs = saved(folder), saved(other)
+    assert ours["global_step"] == theirs["global_step"] == STEPS
+    for name, weight in theirs["state_dict"].items():
+        assert torch.allclose(ours["state_dict"][name].float(), weight.float(), atol=1e-4), name
+    ours, theirs = (json.loads((place / "metrics.json").read_text()) for place in (folder, other))
+    assert [row["name"] for row in ours["per_image"]] == [row["name"] for row in theirs["per_image"]]
+    assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def alone(capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone") / "run"
+    code, output = finished(start(*arguments(capture, f"paths.output_dir={folder}")))
+    assert code == 0, output
+    return folder
+
+
+@pytest.mark.slow
+def test_two_processes_follow_one(capture, tmp_path, alone):
+    """Uneven shares of 101 rays, random backgrounds; views of the evaluation and frames of the film are dealt out."""
+    code, output = finished(start(*arguments(capture, *TWO, "final.video=true", f"paths.output_dir={tmp_path}")))
+    assert code == 0, output
+    assert_close(tmp_path, alone)
+    assert output.count("test PSNR") == 1, "one process speaks"
+    assert output.count("2 processes") == 1
+    assert (tmp_path / "video.mp4").is_file()
+    assert json.loads((tmp_path / "run.json").read_text())["finished_at_step"] == STEPS
+
+
+@pytest.mark.slow
+def test_two_machines_under_torchrun_follow_one_process(capture, tmp_path, alone):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    machines = [
+        start_module(
+            "torch.distributed.run", "--nnodes", 2, "--nproc-per-node", 1, "--node-rank", number,
+            "--master-addr", "127.0.0.1", "--master-port", port, "-m", "nerf_lightning",
+            *arguments(capture, "trainer=torchrun", "trainer.accelerator=cpu", f"paths.output_dir={tmp_path}"),
+        )
+        for number in range(2)
+    ]  # fmt: skip
+    results = [finished(machine) for machine in machines]
+    assert [code for code, _ in results] == [0, 0], results
+    assert_close(tmp_path, alone)
+
+
+@pytest.mark.slow
+def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path, alone):
+    process = start(*arguments(capture, *TWO, f"paths.output_dir={tmp_path}"))
+    while process.poll() is None and saved(tmp_path)["global_step"] < 25:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    code, output = finished(process)
+    assert code == 128 + signal.SIGTERM, output
+    assert 25 <= saved(tmp_path)["global_step"] < STEPS
+    code, output = finished(start("train", f"resume={tmp_path}", "trainer=cpu", "trainer.max_steps=50"))
+    assert code == 0, output
+    assert_close(tmp_path, alone)
+
+
+@pytest.mark.slow
+def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
+    for name, extra in (("one", ()), ("two", TWO)):
+        code, output = finished(start(*arguments(capture, *FAST_MODEL, *extra, f"paths.output_dir={tmp_path / name}")))
+        assert code == 0, output
+    one, two = saved(tmp_path / "one")["nerf_lightning"], saved(tmp_path / "two")["nerf_lightning"]
+    assert one["progress"] == two["progress"]
+    assert one["progress"]["batch_rays"] < 256
+    # Its optimizer divides by roots of tiny gradients, so that rounding grows within steps: the pictures must agree.
+    one, two = (json.loads((tmp_path / name / "metrics.json").read_text())["psnr"] for name in ("one", "two"))
+    assert two == pytest.approx(one, abs=0.2)
+
+
+@pytest.mark.slow
+def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
+    quick = ("trainer.max_steps=3", "final.evaluate=false")
+    sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")
+    code, output = finished(start(sweep[0], "-m", *sweep[1:]))
+    assert code == 0, output
+    steps = {folder.name: saved(folder)["global_step"] for folder in tmp_path.glob("*seed=*")}
+    assert steps == {"0_seed=0": 3, "1_seed=1": 3}
+
+
+def test_what_was_not_started_is_said(nerf, capture, monkeypatch):
+    for name in ("torchrun", "slurm"):
+        result = nerf(*arguments(capture, f"trainer={name}"))
+        assert result.code == 2
+        assert f"trainer={name}: this process was not started by" in result.err
+
+
+def test_processes_that_would_train_alone_are_refused(nerf, capture, monkeypatch):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
+    result = nerf(*arguments(capture))
+    assert result.code == 2
+    assert "Add trainer=torchrun" in result.err
+
+
+def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
+    command, *rest = arguments(capture, "trainer=torchrun", "seed=0,1", f"paths.output_dir={tmp_path}")
+    result = nerf(command, "-m", *rest)
+    assert result.code == 2
+    assert "each of the processes would run the sweep by itself" in result.err
+
+
+def test_a_process_needs_a_device(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert num_processes("auto", "cuda") == 4
+    assert num_processes(2, "cuda") == 2
+    assert num_processes(3, "cpu") == 3
+    for devices, device_type, words in ((8, "cuda", "there are 4 devices"), ("auto", "cpu", "trainer.devices=2")):
+        with pytest.raises(InputError, match=words):
+            num_processes(devices, device_type)
+
+
+def test_the_first_failure_of_its_own_is_the_exit_code():
+    assert processes._exit_code([-15, 2]) == 2
+    assert processes._exit_code([143, 143]) == 143
