@@ -48,7 +48,7 @@ test-fast: setup ## Run the tests that take less than a few seconds each
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
 	@$(MAKE) --no-print-directory xla \
 		|| { echo "make: test-xla is skipped: torch_xla 2.9 cannot be installed here (Linux x86-64, Python 3.11 to 3.13)"; exit 0; }; \
-	PJRT_DEVICE=CPU $(XLA_VENV)/bin/python -m pytest -m xla tests/xla
+	PJRT_DEVICE=CPU $(XLA_VENV)/bin/python -m pytest -m xla tests/xla tests/commands/test_command_on_xla.py
 
 xla: $(XLA_VENV)/.ready ## Make an environment for TPUs, .venv-xla: torch 2.9 with torch_xla, 7 GB
 # torch_xla's newest release is older than the torch that the package asks for, so the floors are left out here.

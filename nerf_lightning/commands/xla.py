@@ -85,7 +85,8 @@ def use_cores(wanted: int | Literal["auto"]) -> int:
     found = runtime.global_runtime_device_count()
     if wanted not in ("auto", found):
         raise InputError(
-            f"trainer.devices={wanted}: this machine has {found} cores. Give trainer.devices={found}, 1 or auto."
+            f"trainer.devices={wanted}: XLA finds {found} cores on this machine. Give trainer.devices=auto for all of "
+            "them, or 1."
         )
     return found
 
