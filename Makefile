@@ -5,6 +5,8 @@ TORCH_INDEX ?=
 XLA_VENV := .venv-xla
 # Hydra overrides: make train ARGS="scene=blender scene.root=data/lego"
 ARGS ?=
+# How long make soak lasts.
+SECONDS ?= 1800
 
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 PINNED := -c constraints/torch.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
@@ -20,7 +22,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-fast test-xla xla check format lint types layers bench clean
+.PHONY: help setup train test test-all test-fast test-xla xla check format lint types layers bench soak clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -39,8 +41,11 @@ $(VENV)/.ready: pyproject.toml constraints/torch.txt
 train: setup ## Train the embedded scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
-test: setup ## Run every test
+test: setup ## Run every test, but for those that take many minutes
 	@$(VENV)/bin/python -m pytest
+
+test-all: setup ## Run every test, the exhaustive ones included
+	@$(VENV)/bin/python -m pytest -m ""
 
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(VENV)/bin/python -m pytest -m "not slow"
@@ -75,6 +80,9 @@ layers: setup ## Check that dependencies point downward
 
 bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 	@$(VENV)/bin/nerf bench $(ARGS)
+
+soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
+	@$(VENV)/bin/python tests/soak.py $(SECONDS)
 
 clean: ## Remove the virtual environment and caches (run folders stay)
 	rm -rf $(VENV) $(XLA_VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

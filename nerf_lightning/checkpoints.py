@@ -5,8 +5,11 @@ Under the key `nerf_lightning`: format, version, config (resolved, as yaml text)
 config group), scene (cameras, bounds, splits, frame), and the run's state that the system adds.
 """
 
+import contextlib
+import logging
 import pickle
 import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
@@ -21,6 +24,10 @@ from nerf_lightning.types import Background, Cameras, LensModel, Scene, Space
 
 FORMAT = 1
 KEY = "nerf_lightning"
+LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+DAMAGED = "damaged.ckpt"
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,8 @@ class Checkpoint:
     """Optimizer steps of the run."""
     precision: str
     tile_points: int | None
+    good: bool
+    """Saved while all was finite, and no step was being left out."""
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -101,9 +110,40 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
             step=int(content["global_step"]),
             precision=record["precision"],
             tile_points=record["tile_points"],
+            good=record.get("bad_steps", [0, 0])[1] == 0,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is damaged: its record lacks or garbles {error}. Use another checkpoint.") from error
+        raise InputError(f"{path} is damaged: its record lacks or garbles {error}. {_instead_of(path)}") from error
+
+
+def newest_checkpoint(folder: Path) -> Checkpoint | None:
+    """Read `last.ckpt`, or where it is damaged or missing `previous.ckpt`, and say so; None where nothing was saved.
+
+    Raises:
+        InputError: neither can be read.
+    """
+    last, previous = folder / LAST, folder / PREVIOUS
+    if not last.is_file() and not previous.is_file():
+        return None
+    try:
+        return read_checkpoint(last)
+    except InputError as error:
+        try:
+            found = read_checkpoint(previous)
+        except InputError:
+            raise error from None
+    reason = "is damaged" if last.exists() else "is missing"
+    log.warning("%s %s; the one before is used instead: %s, of step %d.", last, reason, previous, found.step)
+    return found
+
+
+def last_good_checkpoint(folder: Path) -> Path | None:
+    """Return the newest of a run's checkpoints that is whole and was saved while all was finite, if there is one."""
+    for path in (folder / LAST, folder / PREVIOUS):
+        with contextlib.suppress(InputError):
+            if read_checkpoint(path).good:
+                return path
+    return None
 
 
 def _cameras(record: dict[str, Any]) -> Cameras:
@@ -122,15 +162,33 @@ def _load(path: Path) -> dict[str, Any]:
             "look there for last.ckpt or best.ckpt."
         )
     try:
+        _require_checksums(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and nothing "
             "from a file is executed. Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(
-            f"{path} cannot be read ({path.stat().st_size} bytes; cut off, empty, or not a checkpoint). "
-            "Use the other checkpoint of the run (best.ckpt or last.ckpt), or train again."
+            f"{path} cannot be read ({path.stat().st_size} bytes; damaged, cut off, empty, or not a checkpoint). "
+            f"{_instead_of(path)}"
         ) from error
     return content if isinstance(content, dict) else {}
+
+
+def _require_checksums(path: Path) -> None:
+    # torch.load compares no checksums: a block of zeros in the middle of the weights would be believed.
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+
+
+def _instead_of(path: Path) -> str:
+    """Return the advice to use another checkpoint, by name."""
+    others = [path.with_name(name) for name in (LAST, PREVIOUS, BEST) if name != path.name]
+    names = " or ".join(str(other) for other in others if other.is_file())
+    return f"Use another checkpoint of the run ({names})." if names else "The run has no other one: train again."

@@ -131,7 +131,7 @@ class RadianceFieldSystem(LightningModule):
         share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
         self.last_step = self.accumulate_gradients(batch, self.manual_backward, share)
         ranks.add_up([self.last_step["losses"], *self._gradients()])
-        if self.guard.allows(self.last_step["losses"], self.model.parameters(), progress.step):
+        if self.guard.allows(self.last_step["losses"], self.model.named_parameters()):
             self._update(optimizer)
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
@@ -193,7 +193,8 @@ class RadianceFieldSystem(LightningModule):
                 f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
                 "or tiles (trainer.tile_points=auto)."
             ) from error
-        self.tile_points = self.tile_points // 2
+        points = batch.rays.near.numel() * self.model.points_per_ray(training=True)
+        self.tile_points = int(min(self.tile_points, points)) // 2
         log.warning(
             "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
         )
@@ -223,9 +224,19 @@ class RadianceFieldSystem(LightningModule):
         self.model.zero_grad(set_to_none=True)
         self.model.forget_measurements()
 
+    def is_sound(self) -> bool:
+        """Tell whether the run is one to come back to: the last step was taken, and the weights are finite."""
+        return self.guard.in_row == 0 and not self.broken_weights()
+
+    def broken_weights(self) -> str | None:
+        """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
+        for name, parameter in self.model.named_parameters():
+            if not bool(torch.isfinite(parameter).all()):
+                return name.rpartition(".")[0]
+        return None
+
     def _require_finite_weights(self) -> None:
-        # A finite loss may still have had gradients that were not.
-        if not bool(torch.stack([torch.isfinite(parameter).all() for parameter in self.model.parameters()]).all()):
+        if self.broken_weights():
             raise InputError(
                 f"The weights of step {self.trainer.global_step} are not finite numbers, so they are not saved. The "
                 f"last good checkpoint, where one was saved, is {self.trainer.default_root_dir}/checkpoints/last.ckpt. "

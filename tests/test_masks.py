@@ -102,7 +102,7 @@ def validation_psnr(scene):
     logged = {}
     logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
     system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
-    system.log = lambda name, value, logger: None
+    system.log = lambda name, value, **options: None
     with torch.no_grad():
         for batch in FixedRays(scene, "val", 200, 64):
             system.validation_step(batch, 0)

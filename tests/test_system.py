@@ -7,6 +7,7 @@ from scenes import ball_scene, tiny_model
 from nerf_lightning.data.ray_batches import Progress, RayBatches
 from nerf_lightning.errors import InputError
 from nerf_lightning.losses.mse import MeanSquaredError
+from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.schedules.exponential import ExponentialDecay
 from nerf_lightning.system import RadianceFieldSystem
 
@@ -93,13 +94,15 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     assert system.progress.step == 4
 
 
-def test_gradients_that_stay_not_finite_stop_the_run_with_advice():
+def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
     system = make_system(None)
     with torch.no_grad():
         system.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    with pytest.raises(InputError, match=r"not a finite number since 10 steps .*optimizer\.lr.*trainer\.clip_norm=1"):
-        gradients(system, ball_scene(), steps=20)
-    assert system.progress.step == 9
+    gradients(system, ball_scene(), steps=7)
+    assert system.guard.in_row == 7
+    assert system.guard.first_module.startswith("levels.fine.field.")
+    assert not system.is_sound()
+    assert system.broken_weights() == "levels.fine.field.color_head"
 
 
 def test_weights_that_are_not_finite_are_not_saved():
@@ -147,7 +150,7 @@ def test_validation_has_no_jitter():
     logged = {}
     logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
     system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
-    system.log = lambda name, value, logger: None
+    system.log = lambda name, value, **options: None
     loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
     values = []
     for _ in range(2):
@@ -157,3 +160,55 @@ def test_validation_has_no_jitter():
         values.append(dict(logged))
     assert values[0] == values[1]
     assert values[0]["val/psnr_standard_error"] > 0
+
+
+def stingy_model(room):
+    """A model that has room for so many rays at once, and a list of what was tried."""
+    model, tried = tiny_model(density_bias=0.5), []
+    render = model.forward
+
+    def forward(rays, background, random):
+        tried.append(rays.near.numel())
+        if tried[-1] > room:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return render(rays, background, random)
+
+    model.forward = forward
+    return model, tried
+
+
+def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog):
+    scene = ball_scene()
+    wanted, losses = gradients(make_system(100_000), scene)
+    model, tried = stingy_model(room=20)
+    got, got_losses = gradients(make_system(2_000, model=model), scene)
+    assert torch.allclose(got, wanted, atol=1e-6)
+    assert torch.allclose(got_losses, losses)
+    assert tried[0] == 64
+    assert tried[-1] <= 20
+    assert "from now on tiles of" in caplog.text
+
+
+def test_without_memory_for_a_single_ray_the_run_ends_with_advice():
+    with pytest.raises(InputError, match="There is no memory"):
+        gradients(make_system(100_000, model=stingy_model(room=0)[0]), ball_scene())
+
+
+def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(caplog):
+    scene = ball_scene()
+    wanted = render_picture(tiny_model(density_bias=0.5), scene.cameras, 1, scene.near, scene.far, "white", 10**6)
+    model, tried = stingy_model(room=40)
+    for _ in range(2):
+        picture = render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", 10**6)
+    torch.testing.assert_close(picture.rgb, wanted.rgb)
+    assert tried[:3] == [144, 72, 36]
+    assert max(tried[3:]) == 36
+    assert caplog.text.count("from now on") == 2
+
+
+def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(monkeypatch):
+    model, compiled = tiny_model(), []
+    monkeypatch.setattr(torch.nn.Module, "compile", lambda module, **options: compiled.append((module, options)))
+    model.levels["coarse"].field.compiles = False
+    assert model.compile_fields() == ["fine"]
+    assert compiled == [(model.levels["fine"].field, {"dynamic": False})]

@@ -1,69 +1,79 @@
-"""Checkpoints written so that a crash at any moment leaves either the old file or the new one, never half of one."""
+"""Saving beside training: the training waits for a copy in memory, a thread of its own writes the file."""
 
-import errno
-import os
-import tempfile
+import logging
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning_utilities.core.apply_func import apply_to_collection
+from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.callbacks.checkpoint_file import write_checkpoint
+
+# Copies in memory: one being written, one that waits for it (`last` and `best` fall due at the same step).
+MOST_COPIES = 2
+
+log = logging.getLogger(__name__)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Write to a temporary file in the same folder, force it to the disk, then rename.
+    """Copy what is saved to the host's memory, and write it in the background, whole or not at all.
 
-    Lightning's own way goes through the system's temporary folder, and a move across file systems is not atomic.
+    Lightning's AsyncCheckpointIO lets any number of copies wait, tells of a failure at the next save only, and puts
+    Lightning's own writer in the place of ours.
     """
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.writer: ThreadPoolExecutor | None = None
+        self.writes: deque[Future[None]] = deque()
+
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write the checkpoint, or leave the former one as it was.
+        """Take a copy and return; wait first where too many copies are not written yet.
 
         Raises:
-            InputError: the disk is full or the folder cannot be written.
+            InputError: an earlier write failed.
         """
-        target = Path(path)
-        temporary = None
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
-            with os.fdopen(handle, "wb") as file:
-                torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-            _sync_folder(target.parent)
-        except BaseException as error:
-            if temporary is not None and os.path.exists(temporary):
-                os.unlink(temporary)
-            if isinstance(error, (OSError, RuntimeError)):
-                raise _cannot_save(target, error) from error
-            raise
+        while len(self.writes) >= MOST_COPIES:
+            self.writes.popleft().result()
+        self.raise_failure()
+        if self.writer is None:
+            self.writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
+        # The optimizer changes its tensors in place, and callbacks their lists: nothing may be shared.
+        copy = apply_to_collection(checkpoint, Tensor, _on_the_host)
+        self.writes.append(self.writer.submit(write_checkpoint, copy, Path(path)))
+
+    def raise_failure(self) -> None:
+        """Return at once.
+
+        Raises:
+            InputError: a write has failed.
+        """
+        while self.writes and self.writes[0].done():
+            self.writes.popleft().result()
+
+    def wait(self) -> None:
+        """Return when everything is on the disk.
+
+        Raises:
+            InputError: a write has failed.
+        """
+        while self.writes:
+            self.writes.popleft().result()
+
+    def teardown(self) -> None:
+        """Wait; the run may be ending with an error of its own, so failures are only told."""
+        for write in self.writes:
+            error = write.exception()
+            if error is not None:
+                log.error("%s", error)
+        self.writes.clear()
+        if self.writer is not None:
+            self.writer.shutdown()
+            self.writer = None
 
 
-def sweep_leftovers(folder: Path) -> None:
-    """Remove the temporary files that a killed process left in a checkpoint folder."""
-    for leftover in folder.glob(".*.ckpt.*.tmp"):
-        leftover.unlink(missing_ok=True)
-
-
-def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
-    kept = f"The former checkpoint {target} is unharmed. " if target.exists() else ""
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    cure = "Free some space" if full else f"See that there is space and that {target.parent} can be written"
-    return InputError(
-        f"The checkpoint {target} could not be saved: {error}. {kept}{cure}, "
-        f"then go on with resume={target.parent.parent}."
-    )
-
-
-def _sync_folder(folder: Path) -> None:
-    # A rename is safe against a power cut only once the folder is on the disk; Windows cannot open folders.
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+def _on_the_host(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", copy=True)

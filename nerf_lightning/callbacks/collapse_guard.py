@@ -46,7 +46,7 @@ class CollapseGuard(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then."""
         progress, batches = pl_module.progress, trainer.datamodule.batches  # type: ignore[attr-defined]
-        after_crop = (progress.rays_seen - batches.crop_rays(progress.attempt)) / batches.batch_rays
+        after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
             return
         seen = whole_batch(pl_module.last_step)
@@ -64,20 +64,20 @@ class CollapseGuard(Callback):
         self.failed = state_dict["failed"]
 
     def _restart(self, trainer: Trainer, system: Any) -> None:
-        step, attempt = trainer.global_step, system.progress.attempt
-        if attempt >= self.max_restarts:
+        step, restarts = trainer.global_step, system.progress.restarts
+        if restarts >= self.max_restarts:
             log.warning(
                 "Step %d: the renders are constant again, after %d restarts; training goes on as it is. Check the "
                 "poses, near and far, or try field.density_activation=softplus, scene.background=random or a smaller "
                 "optimizer.lr.",
                 step,
-                attempt,
+                restarts,
             )
             return
         system.restart()
         message = (
             f"Step {step}: the renders are constant while the photographs are not (a collapsed run). "
-            f"Restarted with new weights: attempt {attempt + 2} of at most {self.max_restarts + 1}."
+            f"Restarted with new weights: attempt {restarts + 2} of at most {self.max_restarts + 1}."
         )
         log.warning(message)
         for logger in trainer.loggers:

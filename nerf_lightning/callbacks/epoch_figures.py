@@ -34,7 +34,7 @@ class EpochFigures(Callback):
             self.losses.append(float(pl_module.last_step["losses"].cpu().sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
         per_figure = self.every_epochs * len(batches.whole)
-        seen = pl_module.progress.rays_seen - batches.crop_rays(pl_module.progress.attempt)
+        seen = pl_module.progress.rays_seen - batches.crop_rays(pl_module.progress.restarts)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
             self._draw(trainer, pl_module, epoch=seen // len(batches.whole))
 

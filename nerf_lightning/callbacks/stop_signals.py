@@ -24,6 +24,10 @@ class StopSignals(Callback):
         self.received: int | None = None
         self.former: dict[int, Any] = {}
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Remember the handlers from before Lightning's, which would keep a finished trainer alive and deaf."""
+        self.former = {number: signal.getsignal(number) for number in SIGNALS}
+
     def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Listen."""
         self._listen()
@@ -39,7 +43,7 @@ class StopSignals(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Stop where the step is whole, all processes at the same one."""
-        received = int(ranks.largest(self.received or 0))
+        received = int(ranks.largest(float(self.received or 0)))
         if received:
             self.received = received
             trainer.should_stop = True
@@ -52,8 +56,7 @@ class StopSignals(Callback):
 
     def _listen(self) -> None:
         for number in SIGNALS:
-            before = signal.signal(number, self._handle)
-            self.former.setdefault(number, before)
+            signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None and number == signal.SIGINT:

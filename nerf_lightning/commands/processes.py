@@ -117,7 +117,8 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # it repeats what the workers have said
     with tempfile.TemporaryDirectory(prefix="nerf-") as folder, _share_of_cores(count):
         OmegaConf.save(config, Path(folder) / "config.yaml")
-        OmegaConf.save(OmegaConf.masked_copy(HydraConfig.get(), HYDRA_PARTS), Path(folder) / "hydra.yaml")
+        hydra: Any = HydraConfig.get()
+        OmegaConf.save(OmegaConf.masked_copy(hydra, HYDRA_PARTS), Path(folder) / "hydra.yaml")
         settings = LaunchConfig(
             min_nodes=1,
             max_nodes=1,

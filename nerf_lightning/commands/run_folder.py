@@ -19,7 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.callbacks.checkpoint_io import sweep_leftovers
+from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
+from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
 from nerf_lightning.commands.suggestions import flatten
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
@@ -41,11 +42,25 @@ class RunFolder:
     named_checkpoint: Path | None
     """The checkpoint that the user named to go on from."""
 
-    @property
-    def checkpoint(self) -> Path | None:
-        """Where training goes on, or None where nothing was saved yet."""
-        last = self.path / "checkpoints" / "last.ckpt"
-        return self.named_checkpoint or (last if last.is_file() else None)
+    def whole_checkpoint(self) -> Path | None:
+        """Return where training goes on: the checkpoint that the user named, else the newest that is whole, if any.
+
+        Raises:
+            InputError: there are checkpoints, and none can be read.
+        """
+        if self.named_checkpoint is not None:
+            return self.named_checkpoint
+        folder = self.path / "checkpoints"
+        found = newest_checkpoint(folder)
+        if found is None:
+            return None
+        if found.path.name == LAST:
+            return found.path
+        # Else the next save would put the damaged one in the place of the good one.
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(folder / LAST, folder / DAMAGED)
+        os.replace(folder / PREVIOUS, folder / LAST)
+        return folder / LAST
 
     def finish(self, step: int) -> None:
         """Note that the run is complete."""
@@ -99,11 +114,15 @@ def job_folder() -> Path | None:
 
 def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
     """Keep the config where Hydra would: `.hydra/config.yaml`, `hydra.yaml` and `overrides.yaml`."""
-    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-    OmegaConf.save(
-        OmegaConf.masked_copy(hydra_config, ["job", "runtime", "overrides"]), folder / ".hydra" / "hydra.yaml"
-    )
-    OmegaConf.save(OmegaConf.create(list(hydra_config.overrides.task)), folder / ".hydra" / "overrides.yaml")
+    kept = {
+        "config.yaml": config,
+        "hydra.yaml": OmegaConf.masked_copy(hydra_config, ["job", "runtime", "overrides"]),
+        "overrides.yaml": OmegaConf.create(list(hydra_config.overrides.task)),
+    }
+    for name, content in kept.items():
+        # Whole or not at all: a resume by the folder's name reads them.
+        with whole_file(folder / ".hydra" / name) as part:
+            OmegaConf.save(content, part)
 
 
 def run_identity(config: DictConfig) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> t
     folder = open_run(config, num_steps, job_folder())
     held.append(folder)
     write_config(folder.path, config, HydraConfig.get())
-    return folder.path, folder.checkpoint
+    return folder.path, folder.whole_checkpoint()
 
 
 def _build_parts(config: DictConfig) -> Parts:

@@ -32,6 +32,13 @@ class Progress:
     """Rays of the next step; they may adapt to how many samples a ray has."""
     largest_batch: int = 0
     """Rays of a step at most."""
+    rollbacks: int = 0
+    """Attempts that went back to a checkpoint, instead of the beginning."""
+
+    @property
+    def restarts(self) -> int:
+        """Attempts that began anew."""
+        return self.attempt - self.rollbacks
 
     def advance(self, num_rays: int) -> None:
         """Count one step of `num_rays` rays."""
@@ -137,9 +144,9 @@ class RayBatches:
         self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
         self.crop_steps, self.restart_crop_steps = steps, max(steps, restart_steps)
 
-    def crop_rays(self, attempt: int) -> int:
-        """Return how many rays an attempt takes from the crop."""
-        return self.batch_rays * (self.restart_crop_steps if attempt else self.crop_steps)
+    def crop_rays(self, restarts: int) -> int:
+        """Return how many rays a run takes from the crop after so many restarts."""
+        return self.batch_rays * (self.restart_crop_steps if restarts else self.crop_steps)
 
     def __len__(self) -> int:
         return self.num_steps
@@ -154,7 +161,7 @@ class RayBatches:
 
     def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
         """Return which pixels this process has of that batch."""
-        crop_rays = self.crop_rays(attempt)
+        crop_rays = self.crop_rays(attempt - self.progress.rollbacks)
         if rays_seen < crop_rays:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:

@@ -52,7 +52,7 @@ def render_picture(
 def _render_rays(
     model: RadianceModel, rays: RayBundle, background: Background, tile_points: int, device: torch.device
 ) -> tuple[Tensor, ...]:
-    at_once = tile_rays_for(model, tile_points)
+    at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
     while True:

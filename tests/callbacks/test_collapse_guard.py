@@ -9,7 +9,7 @@ from nerf_lightning.callbacks.collapse_guard import CollapseGuard, is_constant
 
 class StubTrainer(Trainer):
     global_step, loggers = 0, ()
-    datamodule = SimpleNamespace(batches=SimpleNamespace(batch_rays=64, crop_rays=lambda attempt: 64 * 50))
+    datamodule = SimpleNamespace(batches=SimpleNamespace(batch_rays=64, crop_rays=lambda restarts: 64 * 50))
 
     def __init__(self):
         pass
@@ -17,7 +17,7 @@ class StubTrainer(Trainer):
 
 class StubSystem:
     def __init__(self, alive):
-        self.progress = SimpleNamespace(step=0, attempt=0, rays_seen=0)
+        self.progress = SimpleNamespace(step=0, restarts=0, attempt=0, rays_seen=0)
         self.alive = alive
         self.restarts = 0
 
@@ -29,6 +29,7 @@ class StubSystem:
 
     def restart(self):
         self.restarts += 1
+        self.progress.restarts += 1
         self.progress.attempt += 1
         self.progress.step = self.progress.rays_seen = 0
 

@@ -1,18 +1,13 @@
 """What a person reads when the input is bad: one paragraph that names the thing and the cure, exit code 2."""
 
-import os
 import re
 import signal
 import subprocess
-import sys
 
 import pytest
 import torch
 import yaml
-from running import FAST, REPOSITORY, said, start
-
-from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO, sweep_leftovers
-from nerf_lightning.errors import InputError
+from running import FAST, said, start
 
 
 @pytest.fixture
@@ -215,45 +210,6 @@ def test_a_loss_that_is_not_a_number(nerf, capture, tmp_path):
     assert len(said_lines) == 1
     assert re.search("not (a )?finite number", said_lines[0])
     assert "optimizer.lr" in said_lines[0]
-
-
-def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
-    """A real limit on the size of files, in a process of its own."""
-    path = tmp_path / "checkpoints" / "last.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"step": torch.tensor(1)}, path)
-    code = (
-        "import resource, signal, torch, sys\n"
-        "from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO\n"
-        "from nerf_lightning.errors import InputError\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
-        "try:\n"
-        f"    AtomicCheckpointIO().save_checkpoint({{'step': torch.zeros(1_000_000)}}, {str(path)!r})\n"
-        "except InputError as error:\n"
-        "    print(error); sys.exit(2)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 2, done.stderr
-    assert "could not be saved" in done.stdout
-    assert f"The former checkpoint {path} is unharmed" in done.stdout
-    assert int(torch.load(path, weights_only=True)["step"]) == 1
-    assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
-
-
-def test_what_a_killed_process_left_is_swept(tmp_path):
-    (tmp_path / ".last.ckpt.abc.tmp").write_text("half")
-    (tmp_path / "last.ckpt").write_text("whole")
-    sweep_leftovers(tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
-
-
-def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
-    def full(handle):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
-        AtomicCheckpointIO().save_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
 
 
 def test_no_ffmpeg(nerf, last, tmp_path, monkeypatch):
