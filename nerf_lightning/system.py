@@ -230,10 +230,10 @@ class RadianceFieldSystem(LightningModule):
 
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
-        for name, parameter in self.model.named_parameters():
-            if not bool(torch.isfinite(parameter).all()):
-                return name.rpartition(".")[0]
-        return None
+        names, parameters = zip(*self.model.named_parameters(), strict=True)
+        # One read from the device for all.
+        finite = torch.stack([torch.isfinite(parameter).all() for parameter in parameters]).tolist()
+        return next((name.rpartition(".")[0] for name, good in zip(names, finite, strict=True) if not good), None)
 
     def _require_finite_weights(self) -> None:
         if self.broken_weights():
