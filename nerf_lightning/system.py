@@ -230,10 +230,10 @@ class RadianceFieldSystem(LightningModule):
 
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
-        for name, parameter in self.model.named_parameters():
-            if not bool(torch.isfinite(parameter).all()):
-                return name.rpartition(".")[0]
-        return None
+        names, parameters = zip(*self.model.named_parameters(), strict=True)
+        # One read from the device for all.
+        finite = torch.stack([torch.isfinite(parameter).all() for parameter in parameters]).tolist()
+        return next((name.rpartition(".")[0] for name, good in zip(names, finite, strict=True) if not good), None)
 
     def _require_finite_weights(self) -> None:
         if self.broken_weights():
@@ -250,14 +250,16 @@ class RadianceFieldSystem(LightningModule):
         for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
             rendering = self._render(batch.rays[tile], None if background is None else background[tile])
             error = (rendering.rgb - target[tile]).square().mean(dim=-1)
-            self.squared_errors.append(error[batch.weight[tile] > 0])
+            self.squared_errors.append(torch.stack([error, batch.weight[tile]]))
 
     def on_validation_epoch_end(self) -> None:
         """Log the PSNR of the fixed rays and its standard error (delta method).
 
         Straight to the loggers, since Lightning would count the step before.
         """
-        error = torch.cat(self.squared_errors).double()
+        # Masked on the host: on XLA a size that depends on data stops the device.
+        error, weight = torch.cat(self.squared_errors, dim=-1).cpu()
+        error = error[weight > 0].double()
         self.squared_errors.clear()
         ones = torch.ones_like(error)
         count, first, second = ranks.total(torch.stack([ones.sum(), error.sum(), error.square().sum()]))

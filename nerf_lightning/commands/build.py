@@ -9,6 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.commands import xla
 from nerf_lightning.commands.plain_yaml import plain_yaml
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
@@ -53,11 +54,15 @@ def build_system(
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
     model: RadianceModel = build(config.model)
+    optimizer = build(config.optimizer)
+    if settings.device_type == "xla":
+        xla.require_static_shapes(model)
+        optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     model.place(scene)
     return RadianceFieldSystem(
         model=model,
         loss=build(config.loss),
-        optimizer=build(config.optimizer),
+        optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,
         num_steps=num_steps,

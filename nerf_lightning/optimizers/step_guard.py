@@ -57,7 +57,7 @@ class StepGuard:
 
     def state(self) -> list[int]:
         """What a checkpoint keeps."""
-        return [0, 0] if self.counts is None else [int(x) for x in self.counts]
+        return [0, 0] if self.counts is None else self.counts.tolist()
 
     def restore(self, state: list[int], device: torch.device) -> None:
         """Take the counts up again."""
