@@ -21,6 +21,6 @@ def without_floaters(
     large = num_faces >= least_share * num_faces.max()
     faces = faces[large[part]]
     used = np.unique(faces)
-    place = np.full(size, -1, np.int64)
+    place = np.full(size, -1, np.int32)
     place[used] = np.arange(len(used))
     return vertices[used], place[faces], int(((num_faces > 0) & ~large).sum())

@@ -61,7 +61,7 @@ class Lattice:
 
     def to_scene(self, index: Float[ndarray, "points 3"]) -> Float[ndarray, "points 3"]:
         """Return where fractional numbers (i, j, k) lie."""
-        return self.lower.numpy() + self.spacing * index
+        return (self.lower.numpy() + self.spacing * index).astype(np.float32)
 
     def chunks(self) -> Iterator[slice]:
         """Return parts of all points, of a handy size."""

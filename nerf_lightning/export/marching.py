@@ -22,18 +22,23 @@ def marching_cubes(
     """
     measure = require_library("skimage.measure")
     corners = list(product(*(range(0, size - 1, block) for size in density.shape)))
-    vertices, faces, shared, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, bool)], 0
+    vertices, faces, shared, count = (
+        [np.zeros((0, 3), np.float32)],
+        [np.zeros((0, 3), np.int32)],
+        [np.zeros(0, bool)],
+        0,
+    )
     for number, corner in enumerate(corners):
         part = density[tuple(slice(start, start + block + 1) for start in corner)]
         if part.min() < level < part.max():
             found, triangles, _, _ = measure.marching_cubes(part, level)
-            vertices.append(np.array(corner) + found.astype(np.float64))
+            vertices.append(np.array(corner, np.float32) + found)
             # scikit-image's run clockwise where what is dense lies inside.
-            faces.append(triangles[:, ::-1].astype(np.int64) + count)
+            faces.append(triangles[:, ::-1] + np.int32(count))
             shared.append(((found == 0) | (found == np.array(part.shape) - 1)).any(axis=1))
             count += len(found)
         report(stage, (number + 1) / len(corners))
-    return _joined(np.concatenate(vertices), np.concatenate(faces), np.concatenate(shared))
+    return _joined(*(_emptied(parts) for parts in (vertices, faces, shared)))
 
 
 def _joined(
@@ -42,9 +47,16 @@ def _joined(
     """Make one of the vertices that several blocks have, and drop the triangles that have no area then."""
     of_one, of_many = np.flatnonzero(~shared), np.flatnonzero(shared)
     once, place = np.unique(vertices[of_many], axis=0, return_inverse=True)
-    number = np.empty(len(vertices), np.int64)
+    number = np.empty(len(vertices), np.int32)
     number[of_one] = np.arange(len(of_one))
     number[of_many] = len(of_one) + place.reshape(-1)
     faces = number[faces]
     a, b, c = faces.T
     return np.concatenate([vertices[of_one], once]), faces[(a != b) & (b != c) & (a != c)]
+
+
+def _emptied(parts: list[ndarray]) -> ndarray:
+    # The parts would otherwise lie in memory beside the whole.
+    whole = np.concatenate(parts)
+    parts.clear()
+    return whole

@@ -68,7 +68,7 @@ class MeshExport(Export):
     def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
-        trimesh = require_library("trimesh")
+        require_library("trimesh")  # before the work, not after it
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
         with StageProgress(COSTS) as report:
             density = sample_density(model, lattice, tile_points, report)
@@ -82,14 +82,13 @@ class MeshExport(Export):
             if self.seen_only:
                 faces = seen_faces(model, record, vertices, faces, tile_points, report)
             vertices, faces = self._cleaned(vertices, faces)
-            normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
-            points, outward = (torch.from_numpy(each).float() for each in (vertices, normals))
+            normals = vertex_normals(vertices, faces)
+            points, outward = torch.from_numpy(vertices), torch.from_numpy(normals)
             # Two cells to each side: so far the surface may be off.
             reach = 2.0 * lattice.spacing
             colors = surface_colors(model, record, points, outward, reach, self.colors, tile_points, report)
         path, to_user = folder / f"mesh.{self.format}", record.to_user.double()
-        placed = points_to_user(torch.from_numpy(vertices), to_user)
-        turned = directions_to_user(torch.from_numpy(normals), to_user)
+        placed, turned = points_to_user(points.double(), to_user), directions_to_user(outward.double(), to_user)
         save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy())
         log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
         return [path]
@@ -121,8 +120,24 @@ class MeshExport(Export):
         if self.faces is None or len(faces) <= self.faces:
             return vertices, faces
         decimation = require_library("fast_simplification")
-        few, kept = decimation.simplify(vertices, faces.astype(np.int32), target_count=self.faces)
-        return np.asarray(few, np.float64), np.asarray(kept, np.int64)
+        few, kept = decimation.simplify(vertices, faces, target_count=self.faces)
+        return np.asarray(few, np.float32), np.asarray(kept, np.int32)
+
+
+def vertex_normals(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
+) -> Float[ndarray, "vertices 3"]:
+    """Return the mean normal of the faces around each vertex, by their areas, of unit length.
+
+    >>> vertex_normals(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))[0].round(4).tolist()
+    [0.5774000287055969, 0.5774000287055969, 0.5774000287055969]
+    """
+    a, b, c = (vertices[corner] for corner in faces.T)
+    twice_area = np.cross(b - a, c - a)
+    normals = np.empty_like(vertices)
+    for axis, part in enumerate(twice_area.T):
+        normals[:, axis] = sum(np.bincount(corner, part, len(vertices)) for corner in faces.T)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
 
 def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
