@@ -106,6 +106,7 @@ def test_an_ellipse_goes_through_the_cameras_at_one_speed():
     x, y = c * eyes[:, 0] + s * eyes[:, 1], c * eyes[:, 1] - s * eyes[:, 0]
     torch.testing.assert_close(eyes[:, 2], torch.ones(400, dtype=torch.float64))
     torch.testing.assert_close((x / 4) ** 2 + (y / 2) ** 2, torch.ones(400, dtype=torch.float64), rtol=0.05, atol=0)
+    assert float(x[0]) == pytest.approx(4.0, rel=0.02)  # from the long axis on
     steps = (eyes - eyes.roll(-1, dims=0)).norm(dim=-1)
     assert float(steps.max() / steps.min()) < 1.01
     assert float(torch.linalg.cross(eyes[0], eyes[1])[2]) > 0  # anticlockwise
@@ -166,6 +167,13 @@ def test_a_closed_path_is_smooth_where_it_closes():
     change = (velocity.roll(-1, dims=0) - velocity).norm(dim=-1)
     assert float(change[-2:].max()) <= float(change[:-2].max()) * 1.01
     assert float(velocity.norm(dim=-1).max() / velocity.norm(dim=-1).min()) < 2.5
+
+
+def test_a_far_photograph_takes_longer_to_reach():
+    eyes = MIDDLE + torch.tensor([[0.0, 9.0, 0.0], [1.0, 9.0, 0.0], [11.0, 9.0, 0.0]], dtype=torch.float64)
+    along_x = look_at(eyes, eyes - torch.tensor([0.0, 1.0, 0.0]).double(), UP)
+    x = Photographs(111).cameras(replace(frame(), poses=along_x)).c2w[:, 0, 3]
+    torch.testing.assert_close(x.diff(), torch.full((110,), 0.1, dtype=torch.float64))
 
 
 def test_fov_is_a_setting_of_every_path():
