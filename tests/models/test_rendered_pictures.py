@@ -93,6 +93,15 @@ def test_outside_of_the_box_nothing_is_shown():
     assert float(ball_picture(model, nothing).opacity.max()) == 0.0
 
 
+def test_rays_that_miss_the_box_are_not_rendered(monkeypatch):
+    model = RadianceModel({"only": Level(StratifiedSampler(10), Ball(1.0))})
+    asked = []
+    monkeypatch.setattr(Ball, "density", lambda self, positions: asked.append(positions) or positions[..., 0])
+    ball_picture(model, Clip(box=CropBox.from_user((-2.0, -2.0, -4.5), (0.0, 2.0, -3.5), torch.eye(4))))
+    assert 0 < sum(part.shape[0] for part in asked) < 60  # of 81
+    assert float(torch.cat(asked)[..., 0].max()) <= 0.0
+
+
 def test_a_later_near_looks_into_things():
     model = RadianceModel({"only": Level(StratifiedSampler(2000), Ball(1.0))})
     assert float(ball_picture(model).depth[4, 4]) == pytest.approx(3.0, abs=0.01)
