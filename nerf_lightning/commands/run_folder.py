@@ -28,7 +28,7 @@ from nerf_lightning.export.atomic import whole_file
 # Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
 NOT_IDENTITY = (
     *("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
-    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
+    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "viewer.", "scene.cache_dir", "scene.verify"),
 )
 IDENTITY = ("callbacks.collapse_guard.",)
 

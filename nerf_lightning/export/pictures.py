@@ -20,7 +20,7 @@ ERROR_SCALE = 0.25
 
 _PAPER = 255
 _INK = (64, 64, 64)
-_BACKDROP = 0.93
+BACKDROP = 0.93
 """Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far."""
 
 
@@ -88,7 +88,7 @@ def depth_picture(
     colors = color_map(depth, low=far, high=near)
     if opacity is not None:
         shown = opacity.detach().float().cpu().clamp(0, 1)[..., None]
-        colors = colors * shown + _BACKDROP * (1 - shown)
+        colors = colors * shown + BACKDROP * (1 - shown)
     return _with_scale(to_bytes(colors), top=near, bottom=far)
 
 

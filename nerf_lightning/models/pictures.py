@@ -38,27 +38,30 @@ def render_picture(
     tile_points: int,
 ) -> Picture:
     """Render one view with the last level, as at evaluation (no jitter)."""
-    device = next(model.parameters()).device
     pixels = all_pixels(cameras, view)
     shape = pixels.x.shape
     rays = rays_through_pixels(cameras, pixels.map(torch.flatten), near, far)
-    rgb, depth, opacity = _render_rays(model, rays, background, tile_points, device)
+    rgb, depth, opacity = render_rays(model, rays, background, tile_points)
     if cameras.ndc is not None:
         straight = rays_through_pixels(replace(cameras, ndc=None), pixels.map(torch.flatten), near, far)
         depth = world_distance(straight, depth / rays.far)
     return Picture(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape))
 
 
-def _render_rays(
-    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int, device: torch.device
-) -> tuple[Tensor, ...]:
+@torch.no_grad()
+def render_rays(
+    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Return colour, depth and opacity of rays on the CPU; where memory is short, fewer rays at once."""
+    device = next(model.parameters()).device
     at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
     while True:
         try:
             parts = [_render_tile(model, rays[p].to(device), background) for p in tiles(rays.near.numel(), at_once)]
-            return tuple(torch.cat(column) for column in zip(*parts, strict=True))
+            rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
+            return rgb, depth, opacity
         except RuntimeError as error:
             if at_once == 1 or not is_out_of_memory(error):
                 raise
