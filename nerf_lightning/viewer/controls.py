@@ -60,7 +60,7 @@ class Controls:
     def _add_photographs(self) -> None:
         names = self.session.photographs.record.view_names
         with self.gui.add_folder("Photographs"):
-            visible = self.gui.add_checkbox("Show cameras", True)
+            visible = self.gui.add_checkbox("Show cameras", False)
             number = self.gui.add_slider("View", 0, max(1, len(names) - 1), 1, 0)
             enter = self.gui.add_button("Look through it", hint="Or click a camera in the scene")
             self._name = self.gui.add_markdown("", visible=False)

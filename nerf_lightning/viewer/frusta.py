@@ -27,13 +27,16 @@ class Frusta:
         self.session, self.scene = session, session.client.scene
         self.size = SCALE * session.around.radius
         self.root = self.scene.add_frame(ROOT, show_axes=False)
-        self.cameras = self.scene.add_frame(CAMERAS, show_axes=False)
+        self.cameras = self.scene.add_frame(CAMERAS, show_axes=False, visible=False)
+        self.on_click, self.has_cameras = on_click, False
         self.box: Any = None
-        for view in session.photographs.shown:
-            self._add_camera(view, on_click)
 
     def show(self, visible: bool) -> None:
-        """Show or hide the cameras."""
+        """Show or hide the cameras of the photographs."""
+        if visible and not self.has_cameras:
+            self.has_cameras = True
+            for view in self.session.photographs.shown:
+                self._add_camera(view)
         self.cameras.visible = visible
 
     def hide_for_photograph(self, hidden: bool) -> None:
@@ -55,7 +58,7 @@ class Frusta:
         """Draw a keyframe's camera; return its handle."""
         return self._frustum(f"{KEYFRAMES}/{number}", c2w, fov, aspect, ORANGE, None)
 
-    def _add_camera(self, view: int, on_click: Callable[[int], None]) -> None:
+    def _add_camera(self, view: int) -> None:
         photographs = self.session.photographs
         cameras = photographs.record.cameras
         width, height = int(cameras.width[view]), int(cameras.height[view])
@@ -63,7 +66,7 @@ class Frusta:
         thumbnail = photographs.thumbnail(view)
         image = None if thumbnail is None else thumbnail.numpy()
         handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)
-        handle.on_click(lambda _: on_click(view))
+        handle.on_click(lambda _: self.on_click(view))
 
     def _frustum(
         self, name: str, c2w: Tensor, fov: float, aspect: float, color: tuple[int, int, int], image: np.ndarray | None

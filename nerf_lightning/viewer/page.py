@@ -60,6 +60,7 @@ class Page:
         self.around = frame_of(record.cameras, record.aabb)
         # A page that is closed amid a picture is nothing to speak of.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+        logging.getLogger("websockets").setLevel(logging.ERROR)
         with _quietly():
             self.server = viser.ViserServer(host, free_port(host, port), label="nerf_lightning", verbose=False)
         self._dress(record)

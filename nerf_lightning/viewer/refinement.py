@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.slices import SlicedRenderer, View
 
-# Each picture has so many times the height of the one before.
-FINER = 2
+# Each picture has so many times the height of the one before; the last one may have more.
+FINER, AT_MOST_FINER = 2, 3
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Refinement:
             return Job(look, height, True, renderer.slices(look, height))
         if self.shown_height >= full and not self.is_stale:
             return None
-        height = min(full, FINER * self.shown_height)
+        height = full if AT_MOST_FINER * self.shown_height >= full else FINER * self.shown_height
         if height == full:
             self.is_stale = False
         return Job(look, height, False, renderer.slices(look, height))
