@@ -5,7 +5,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.filming import film
-from nerf_lightning.commands.run_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.data.checks import known_background
 
 
