@@ -13,6 +13,7 @@ from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.scoring import Scoring
+from nerf_lightning.commands.shots import Subject
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.images import read_rgba
@@ -57,7 +58,8 @@ class Finish:
                 _log_metrics(trainer, metrics)
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
-                video, depth = film(model, scene_record(scene), self.path, scene.background, tile_points, folder)
+                subject = Subject(model, scene_record(scene), scene.background)
+                video, depth = film([subject], self.path, tile_points, folder)
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")

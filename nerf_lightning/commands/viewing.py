@@ -9,8 +9,8 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
-from nerf_lightning.commands.run_folder import beside_checkpoint, output_folder
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Scene

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.evaluation.geometry import normals_from_depth
-from nerf_lightning.export.pictures import BACKDROP, color_map, to_bytes, visible_range
+from nerf_lightning.export.pictures import color_map, faded, to_bytes, visible_range
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.viewer.slices import View
 
@@ -30,7 +30,7 @@ def _color(view: View) -> Float[Tensor, "height width 3"]:
 
 def _depth(view: View) -> Float[Tensor, "height width 3"]:
     near, far = visible_range(view.depth, view.opacity)
-    return _faded(color_map(view.depth, low=far, high=near), view.opacity)
+    return faded(color_map(view.depth, low=far, high=near), view.opacity)
 
 
 def _opacity(view: View) -> Float[Tensor, "height width 3"]:
@@ -41,12 +41,7 @@ def _normals(view: View) -> Float[Tensor, "height width 3"]:
     nothing = torch.zeros(1)
     rays = rays_through_pixels(replace(view.camera, ndc=None), all_pixels(view.camera, 0), nothing, nothing)
     normals = normals_from_depth(rays.origins + view.depth[..., None] * rays.directions)
-    return _faded(0.5 + 0.5 * normals, view.opacity)
-
-
-def _faded(colors: Float[Tensor, "height width 3"], opacity: Tensor) -> Float[Tensor, "height width 3"]:
-    shown = opacity.clamp(0, 1)[..., None]
-    return colors * shown + BACKDROP * (1 - shown)
+    return faded(0.5 + 0.5 * normals, view.opacity)
 
 
 CHANNELS: dict[str, Callable[[View], Tensor]] = {

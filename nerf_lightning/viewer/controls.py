@@ -6,7 +6,9 @@ from typing import Any
 
 import torch
 
+from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.pictures import save_png
+from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.free_name import free_name
 from nerf_lightning.viewer.frusta import Frusta
@@ -124,7 +126,7 @@ class Controls:
     def _add_crop(self) -> None:
         if self.session.photographs.record.space == "ndc":
             return
-        low, high = self.session.photographs.record.aabb.tolist()
+        low, high = in_user_frame(self.session.photographs.record)
         with self.gui.add_folder("Crop box", expand_by_default=False):
             on = self.gui.add_checkbox("Show only what is in the box", False)
             sliders = [
@@ -133,8 +135,9 @@ class Controls:
             ]
 
         def update(_: Any) -> None:
-            box = torch.tensor([slider.value for slider in sliders]).float().T
-            self.session.crop = box if on.value else None
+            lower, upper = zip(*(slider.value for slider in sliders), strict=True)
+            to_user = self.session.photographs.record.to_user
+            self.session.crop = CropBox.from_user(lower, upper, to_user) if on.value else None
             self.frusta.draw_box(self.session.crop)
             self.session.look()
 
@@ -149,3 +152,10 @@ class Controls:
         path = free_name(self.folder, "snapshot", ".png")
         save_png(path, picture)
         self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+
+
+def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
+    """Return the corners of the box along the user's axes that holds the scene's box."""
+    corners = torch.cartesian_prod(*record.aabb.unbind(dim=1)).double()
+    places = corners @ record.to_user[:3, :3].double().mT + record.to_user[:3, 3]
+    return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.viewer.session import Session
 
 ROOT, CAMERAS, KEYFRAMES, BOX = "/overlay", "/overlay/cameras", "/overlay/keyframes", "/overlay/crop"
@@ -43,16 +44,18 @@ class Frusta:
         """Hide everything: who looks through a photograph's camera compares pixels."""
         self.root.visible = not hidden
 
-    def draw_box(self, box: Tensor | None) -> None:
+    def draw_box(self, box: CropBox | None) -> None:
         """Draw the crop box, or take it away."""
         if self.box is not None:
             self.box.remove()
             self.box = None
         if box is not None:
-            low, high = box.double().numpy()
-            self.box = self.scene.add_box(
-                BOX, BLUE, tuple(high - low), wireframe=True, position=tuple((low + high) / 2)
-            )
+            from viser.transforms import SO3
+
+            turned = SO3.from_matrix(box.axes.mT.double().numpy()).wxyz
+            middle = (box.corner + 0.5 * box.size @ box.axes).double().numpy()
+            size = tuple(box.size.tolist())
+            self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
 
     def add_keyframe(self, number: int, c2w: Tensor, fov: float, aspect: float) -> Any:
         """Draw a keyframe's camera; return its handle."""

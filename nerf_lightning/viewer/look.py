@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras, resized
+from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.geometry.paths.base import frame_of
 from nerf_lightning.geometry.poses import rotation_from_quaternion
 from nerf_lightning.types import Cameras
@@ -27,7 +28,7 @@ class Look:
     width: int
     """The window in pixels."""
     height: int
-    crop: Float[Tensor, "2 3"] | None = None
+    crop: CropBox | None = None
     """Only what lies in this box is shown; None: all."""
     photograph: int | None = None
     """Look through the camera of this view, lens included, with its picture in the middle of the window."""

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.geometry.paths.keyframes import Keyframe, Point, write_keyframes
 from nerf_lightning.viewer.free_name import free_name
-from nerf_lightning.viewer.keyframes import Keyframe, keyframe_in_user_frame, write_keyframes
 from nerf_lightning.viewer.session import Session
 
 
@@ -25,18 +28,17 @@ class RecordedPath:
     def __init__(self, session: Session, folder: Path, draw: Callable[[int, Tensor, float, float], Any]):
         self.session, self.folder, self.draw = session, folder, draw
         self.keyframes: list[Keyframe] = []
+        self.times: list[float] = []
+        """Seconds from the first keyframe."""
         self.handles: list[Any] = []
 
     def add(self, seconds: float) -> str:
         """Add the camera as it is now, so many seconds after the one before; return what to say."""
         camera = self.session.client.camera
-        time = self.keyframes[-1].time + seconds if self.keyframes else 0.0
-        position, look_at, up = (
-            torch.tensor(value).float() for value in (camera.position, camera.look_at, camera.up_direction)
-        )
+        self.times.append(self.times[-1] + seconds if self.times else 0.0)
         record = self.session.photographs.record
-        frame = keyframe_in_user_frame(position, look_at, up, math.degrees(camera.fov), time, record.to_user)
-        self.keyframes.append(frame)
+        position, look_at, up = map(torch.tensor, (camera.position, camera.look_at, camera.up_direction))
+        self.keyframes.append(keyframe_in_user_frame(position, look_at, up, float(camera.fov), self.times[-1], record))
         self.handles.append(self.draw(len(self.keyframes), self.session.pose(), camera.fov, camera.aspect))
         return self._count()
 
@@ -44,6 +46,7 @@ class RecordedPath:
         """Take the last keyframe away; return what to say."""
         if self.keyframes:
             self.keyframes.pop()
+            self.times.pop()
             self.handles.pop().remove()
         return self._count()
 
@@ -51,11 +54,40 @@ class RecordedPath:
         """Write the yaml; return what to say."""
         if len(self.keyframes) < 2:
             return "A path needs two keyframes or more."
+        self.folder.mkdir(parents=True, exist_ok=True)
         path = free_name(self.folder, "camera_path", ".yaml")
         write_keyframes(path, self.keyframes)
-        return f"Saved as {path}"
+        return f"Saved. Film it: nerf render path=keyframes path.file={path}"
 
     def _count(self) -> str:
         if not self.keyframes:
             return "No keyframes yet."
-        return f"{len(self.keyframes)} keyframes, {self.keyframes[-1].time:.1f} s"
+        return f"{len(self.keyframes)} keyframes, {self.times[-1]:.1f} s"
+
+
+def keyframe_in_user_frame(
+    position: Float[Tensor, "3"],
+    look_at: Float[Tensor, "3"],
+    up: Float[Tensor, "3"],
+    fov: float,
+    time: float,
+    record: SceneRecord,
+) -> Keyframe:
+    """Return a keyframe of a camera in the model's frame.
+
+    `fov` is vertical, in radians. A film has the photographs' shape, not the window's, and keeps this field.
+    """
+    linear, offset = record.to_user[:3, :3].double(), record.to_user[:3, 3].double()
+    shape = float(record.cameras.width[0]) / float(record.cameras.height[0])
+    return Keyframe(
+        position=_rounded(linear @ position.double() + offset),
+        look_at=_rounded(linear @ look_at.double() + offset),
+        up=_rounded(normalize(linear @ up.double(), dim=0)),
+        fov=round(math.degrees(2 * math.atan(shape * math.tan(fov / 2))), 3),
+        time=round(time, 3),
+    )
+
+
+def _rounded(values: Tensor) -> Point:
+    x, y, z = (round(value, 6) for value in values.tolist())
+    return x, y, z

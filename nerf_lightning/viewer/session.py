@@ -7,6 +7,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.geometry.paths.base import PathFrame
 from nerf_lightning.viewer.channels import COLOR, picture_of
 from nerf_lightning.viewer.compare import in_window, wiped
@@ -39,7 +40,7 @@ class Session:
         self.client, self.studio, self.photographs, self.around = client, studio, photographs, around
         self.refinement = Refinement(self._show, most_height)
         self.channel, self.split = COLOR, 0.5
-        self.crop: Tensor | None = None
+        self.crop: CropBox | None = None
         self.photograph: int | None = None
         """The view whose camera is looked through."""
         self.on_finest: Callable[[], None] = lambda: None

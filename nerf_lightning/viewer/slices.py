@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.evaluation.geometry import surface_depth
-from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.clipping import Clip
 from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import render_rays
@@ -78,10 +78,8 @@ class SlicedRenderer:
         pixels = all_pixels(cameras, 0)
         shape, pixels = pixels.x.shape, pixels.map(torch.flatten)
         rays = rays_through_pixels(cameras, pixels, near, far)
-        if look.crop is not None and cameras.ndc is None:
-            enter, leave = distances_in_box(rays, look.crop)
-            # A ray that misses the box keeps an interval of next to no length, where nothing is seen.
-            rays = replace(rays, near=enter, far=torch.maximum(leave, enter + 1e-4))
+        if look.crop is not None:
+            rays = Clip(box=look.crop)(rays, rays, ndc=False)
         parts, start, total = [], 0, rays.near.numel()
         while start < total:
             stop = start + self._rays_in_a_slice(total - start)
@@ -91,7 +89,7 @@ class SlicedRenderer:
             self._learn(stop - start, time.perf_counter() - began)
             start = stop
             yield
-        rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
+        rgb, depth, opacity = (torch.cat(column) for column in list(zip(*parts, strict=True))[:3])
         depth = surface_depth(depth, opacity, rays.far)
         if cameras.ndc is not None:
             straight = rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)

@@ -8,6 +8,7 @@ from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.build import build
+from nerf_lightning.geometry.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = {
     "encoder": "encoder",
@@ -23,8 +24,12 @@ BUILT = {
 
 
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g in BUILT for o in options(g)])
-def test_every_component_builds(group, option):
-    assert build(composed("train", f"{group}={option}")[BUILT[group]]) is not None
+def test_every_component_builds(group, option, tmp_path):
+    config = composed("train", f"{group}={option}")[BUILT[group]]
+    if OmegaConf.is_missing(config, "file"):
+        write_keyframes(tmp_path / "keys.yaml", [Keyframe((x, 0.0, 0.0), look_at=(0.0, 1.0, 0.0)) for x in (0.0, 1.0)])
+        config.file = str(tmp_path / "keys.yaml")
+    assert build(config) is not None
 
 
 @pytest.mark.parametrize("option", options("experiment"))
