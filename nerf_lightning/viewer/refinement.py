@@ -7,7 +7,7 @@ from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.slices import SlicedRenderer, View
 
 # Each picture has so many times the height of the one before; the last one may have more.
-FINER, AT_MOST_FINER = 2, 3
+FINER, AT_MOST_FINER = 2, 2.5
 
 
 @dataclass(frozen=True)
