@@ -13,7 +13,7 @@ from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.errors import InputError
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.photographs import Photographs
-from nerf_lightning.viewer.ports import free_port
+from nerf_lightning.viewer.ports import require_address
 from nerf_lightning.viewer.slices import SlicedRenderer
 from nerf_lightning.viewer.studio import Studio
 
@@ -51,17 +51,13 @@ class LiveView(Callback):
         max_height: int = 480,
     ):
         require_viser()
+        require_address(host, port)
         if not 0 < share < 1:
             raise InputError(f"viewer.live_view.share={share}: give a part of the time between 0 and 1, like 0.15.")
         self.host, self.port = host, port
         self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
         self.page: Page | None = None
         self.credit, self.last, self.refreshed = 0.0, 0.0, 0.0
-
-    def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
-        """Refuse a place where nobody can listen before anything is computed."""
-        if trainer.is_global_zero:
-            free_port(self.host, self.port)
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Open the page, and say where it is."""

@@ -1,11 +1,12 @@
 """The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
 
-import logging
 import re
 import socket
+from types import SimpleNamespace
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
 from running import FAST, start
 from viser_client import ViserClient
 
@@ -78,7 +79,14 @@ def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(captu
         freed.bind(("127.0.0.1", port))
 
 
+@pytest.fixture
+def trainer():
+    return Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+
+
 class ClockedStudio(Studio):
+    """A clock in place of pictures: each slice takes a given time."""
+
     def __init__(self, clock, seconds):
         self.clock, self.seconds, self.slices = clock, seconds, 0
         self._refinements = {0: Refinement(lambda *_: None)}
@@ -108,31 +116,31 @@ class FakeSystem:
 
 
 @pytest.mark.parametrize("slice_seconds", [0.01, 0.2, 2.0])
-def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, slice_seconds):
+def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, trainer, slice_seconds):
     from nerf_lightning.callbacks import live_view
 
     clock = Clock()
     monkeypatch.setattr(live_view, "time", clock)
     callback = LiveView(share=0.2)
     studio = ClockedStudio(clock, slice_seconds)
-    monkeypatch.setattr(callback, "page", type("FakePage", (), {"studio": studio})())
+    monkeypatch.setattr(callback, "page", SimpleNamespace(studio=studio))
     spent = 0.0
     for _ in range(2000):
         clock.now += 0.05  # a step
         before = clock.now
-        callback.on_train_batch_end(None, FakeSystem(), None, None, 0)
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
         spent += clock.now - before
     assert spent / clock.now < 0.2 + 2 * slice_seconds / clock.now
     assert spent / clock.now > 0.1
 
 
-def test_nobody_looking_on_costs_nothing(monkeypatch):
+def test_nobody_looking_on_costs_nothing(trainer):
     callback = LiveView()
     studio = ClockedStudio(Clock(), 1.0)
     studio._refinements.clear()
-    callback.page = type("FakePage", (), {"studio": studio})()
+    callback.page = SimpleNamespace(studio=studio)
     for _ in range(10):
-        callback.on_train_batch_end(None, FakeSystem(), None, None, 0)
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
     assert studio.slices == 0
 
 
@@ -142,9 +150,8 @@ def test_a_share_that_leaves_nothing_is_refused(share):
         LiveView(share=share)
 
 
-def test_a_place_where_nobody_can_listen_is_refused_before_the_training(caplog):
-    from types import SimpleNamespace
-
-    callback = LiveView(host="192.0.2.1")
-    with caplog.at_level(logging.WARNING), pytest.raises(InputError, match="cannot listen there"):
-        callback.setup(SimpleNamespace(is_global_zero=True), None, "fit")
+def test_a_place_where_nobody_can_listen_is_refused_at_once():
+    with pytest.raises(InputError, match="cannot listen there"):
+        LiveView(host="192.0.2.1")
+    with pytest.raises(InputError, match="port=0"):
+        LiveView(port=0)
