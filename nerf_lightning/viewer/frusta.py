@@ -13,7 +13,7 @@ from nerf_lightning.viewer.session import Session
 ROOT, CAMERAS, KEYFRAMES, BOX = "/overlay", "/overlay/cameras", "/overlay/keyframes", "/overlay/crop"
 GREY, ORANGE, BLUE = (90, 90, 90), (240, 120, 20), (40, 110, 220)
 # Size of a frustum as a share of the photographs' distance.
-SCALE = 0.05
+SCALE = 0.03
 
 
 class Frusta:

@@ -17,7 +17,8 @@ from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.session import Session
 from nerf_lightning.viewer.studio import Studio
 
-log = logging.getLogger(__name__)
+# People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
+START = 1.4
 
 
 def require_viser() -> Any:
@@ -83,8 +84,11 @@ class Page:
         self.server.gui.configure_theme(show_share_button=False, show_logo=False)
         self.server.scene.set_up_direction(tuple(self.around.up.tolist()))
         start = self.server.initial_camera
-        start.position = tuple(record.cameras.c2w[0, :, 3].tolist())
-        start.look_at = tuple(self.around.center.tolist())
+        first, center = record.cameras.c2w[0, :, 3], self.around.center
+        # Forward-facing captures show nothing to who stands behind their near plane's cameras.
+        farther = START if record.space == "bounded" else 1.0
+        start.position = tuple((center + farther * (first - center)).tolist())
+        start.look_at = tuple(center.tolist())
         start.fov = 2 * float(torch.atan(0.5 * record.cameras.height[0] / record.cameras.focal[0, 1]))
         start.near, start.far = 0.01 * self.around.radius, 100 * self.around.radius
 

@@ -57,7 +57,7 @@ class RecordedPath:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = free_name(self.folder, "camera_path", ".yaml")
         write_keyframes(path, self.keyframes)
-        return f"Saved. Film it: nerf render path=keyframes path.file={path}"
+        return f"Saved. To film it, add to nerf render: path=keyframes path.file={path}"
 
     def _count(self) -> str:
         if not self.keyframes:
