@@ -40,8 +40,8 @@ class Controls:
 
     def _add_view(self) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
-        degrees = math.degrees(self.session.client.camera.fov)
-        fov = self.gui.add_slider("Field of view", 10.0, 120.0, 1.0, min(120.0, max(10.0, degrees)))
+        degrees = round(math.degrees(self.session.client.camera.fov))
+        fov = self.gui.add_slider("Field of view", 10.0, 120.0, 1.0, float(min(120, max(10, degrees))))
         snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
 
         @channel.on_update

