@@ -12,18 +12,20 @@ import zipfile
 import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning import __version__
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import Background, Cameras, LensModel, Scene, Space
+from nerf_lightning.record_checks import require_sound_scene
+from nerf_lightning.tensor_files import load_tensors
+from nerf_lightning.types import Background, Cameras, Scene, Space
 
 FORMAT = 1
 KEY = "nerf_lightning"
+PRECISIONS = ("32-true", "tf32", "bf16-mixed")
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
 
@@ -93,12 +95,16 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         )
     if record.get("format") != FORMAT:
         raise InputError(
-            f"{path} has checkpoint format {record.get('format')} (written by nerf_lightning {record.get('version')}), "
+            f"{path} has checkpoint format {_short(record.get('format'))} (written by nerf_lightning "
+            f"{_short(record.get('version'))}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )
     try:
         scene = dict(record["scene"])
-        scene["cameras"] = _cameras(scene["cameras"])
+        scene["cameras"] = _with_lens(scene["cameras"])
+        require_sound_scene(scene)
+        scene["cameras"] = Cameras(**scene["cameras"])
+        _require_sound_run(record, content["global_step"])
         prefix = "model."
         state = content["state_dict"]
         return Checkpoint(
@@ -107,12 +113,12 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
             choices=record["choices"],
             scene=SceneRecord(**scene),
             weights={key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)},
-            step=int(content["global_step"]),
+            step=content["global_step"],
             precision=record["precision"],
             tile_points=record["tile_points"],
             good=record.get("bad_steps", [0, 0])[1] == 0,
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged: its record lacks or garbles {error}. {_instead_of(path)}") from error
 
 
@@ -146,13 +152,27 @@ def last_good_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def _cameras(record: dict[str, Any]) -> Cameras:
+def _with_lens(cameras: dict[str, Any]) -> dict[str, Any]:
     # The first checkpoints knew pinholes only, and name no lens.
-    lens = {"lens": record["focal"].new_zeros(*record["focal"].shape[:-1], 6), "lens_model": "pinhole"}
-    content = lens | record
-    if content["lens_model"] not in get_args(LensModel):
-        raise ValueError(f"lens_model {content['lens_model']!r}")
-    return Cameras(**content)
+    lens = {"lens": cameras["focal"].new_zeros(*cameras["focal"].shape[:-1], 6), "lens_model": "pinhole"}
+    return lens | cameras
+
+
+def _require_sound_run(record: dict[str, Any], step: object) -> None:
+    config, choices, tile = record["config"], record["choices"], record["tile_points"]
+    if type(step) is not int or not (tile is None or (type(tile) is int and tile > 0)):
+        raise ValueError("global_step or tile_points")
+    if record["precision"] not in PRECISIONS:
+        raise ValueError(f"precision {_short(record['precision'])}")
+    if not isinstance(config, str) or not isinstance(choices, dict):
+        raise ValueError("config or choices")
+    if not all(isinstance(word, str) for pair in choices.items() for word in pair):
+        raise ValueError("choices")
+
+
+def _short(value: object) -> str:
+    # What nests itself a thousandfold is not written out.
+    return str(value)[:40] if isinstance(value, (str, int, float)) else type(value).__name__
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -163,7 +183,7 @@ def _load(path: Path) -> dict[str, Any]:
         )
     try:
         _require_checksums(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = load_tensors(path)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and nothing "
@@ -182,6 +202,8 @@ def _require_checksums(path: Path) -> None:
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            return  # refused below, without being unpacked
         damaged = archive.testzip()
     if damaged is not None:
         raise zipfile.BadZipFile(f"wrong checksum of {damaged}")

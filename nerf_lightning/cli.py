@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.conf_folder import conf_folder
-from nerf_lightning.sweep_arguments import sweep_arguments
+from nerf_lightning.sweep_arguments import is_sweep, sweep_arguments
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).parent
 USAGE_ERROR = 2
+MOST_LETTERS = 5000
 
 
 def main() -> None:
@@ -76,41 +77,46 @@ def _run(command: str, arguments: list[str]) -> None:
     # Hydra would print its own short traceback and exit with 1; we want the exceptions.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
     module = importlib.import_module(f"nerf_lightning.commands.{command}")
 
     def task(config: "DictConfig") -> Any:
-        # Caught inside the job as well: Hydra would print the overrides first, and run the next job of a sweep.
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            from nerf_lightning.commands.sweep_job import run_job
+
+            return run_job(module.run, config, command)
+        # Caught inside the job as well: Hydra would print the overrides first.
         with explained(command):
             return module.run(config)
 
     with explained(command):
         prepare = getattr(module, "prepare", list)
         sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
-        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)()
+        run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
+        if is_sweep(arguments):
+            from nerf_lightning.commands.sweep import watched
+
+            watched(run)
+        else:
+            run()
 
 
 @contextmanager
 def explained(command: str) -> Iterator[None]:
     """Turn bad input into one paragraph and exit code 2."""
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    from nerf_lightning.errors import InputError
-
     try:
         yield
-    except InputError as error:
-        _complain(str(error))
-    except (HydraException, OmegaConfBaseException) as error:
-        from nerf_lightning.commands.suggestions import explain
-
-        _complain(explain(error, command, conf_folder()))
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        _complain(f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left.")
     except KeyboardInterrupt:
         sys.exit(130)
+    except Exception as error:
+        from nerf_lightning.commands.suggestions import paragraph
+
+        message = paragraph(error, command, conf_folder())
+        if message is None:
+            raise
+        _complain(message)
 
 
 def _near(word: str, known: list[str]) -> str:
@@ -120,6 +126,12 @@ def _near(word: str, known: list[str]) -> str:
     return f" Did you mean {' or '.join(close)}?" if close else ""
 
 
+def _escaped(letter: str) -> str:
+    return " " if letter.isspace() else letter.encode("unicode_escape").decode("ascii")
+
+
 def _complain(message: str) -> None:
-    print(f"nerf: {message}", file=sys.stderr)
+    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
+    shown = "".join(letter if letter.isprintable() else _escaped(letter) for letter in message[:MOST_LETTERS])
+    print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -80,7 +80,7 @@ def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu", fi
     return RayRandom(key=torch.full_like(slots, key), slots=slots)
 
 
-def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
+def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:
     """Return where a keyed permutation of range(size) sends each index; nothing is stored, any size is allowed.
 
     An alternating Feistel network on a grid of about sqrt(size) x sqrt(size) cells: each round adds a keyed hash of
@@ -93,15 +93,17 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*n"]) -> Int[
     rows = max(1, int(size**0.5))
     columns = -(-size // rows)
     place = _feistel(index, rows, columns, key)
-    while bool((outside := place >= size).any()):
-        place = torch.where(outside, _feistel(place, rows, columns, key), place)
+    while (outside := (place >= size).nonzero(as_tuple=True))[0].numel():
+        place[outside] = _feistel(place[outside], rows, columns, key.expand(place.shape)[outside])
     return place
 
 
 def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
-    row, column = index // columns, index % columns
-    for number in range(FEISTEL_ROUNDS):
-        round_key = mix((key + number * 0x1B873593) & WORD)
+    row = index // columns
+    column = index - row * columns
+    # As many words as there are keys: a batch that lies in one epoch has one.
+    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
+    for number, round_key in enumerate(mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)):
         if number % 2:
             column = (column + mix(round_key ^ row)) % columns
         else:

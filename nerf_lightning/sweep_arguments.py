@@ -1,27 +1,115 @@
-"""The folders of a sweep: one per job, named by what differs."""
+"""The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.errors import InputError
+
+FLAGS = ("-m", "--multirun")
+FOLDER_KEYS = ("paths.output_dir", "hydra.sweep.dir")
+SUBDIR = "hydra.sweep.subdir='${hydra.job.num}"
+
+
+def is_sweep(arguments: list[str]) -> bool:
+    """Tell whether the arguments ask for many runs."""
+    return bool(set(FLAGS) & set(arguments))
 
 
 def sweep_arguments(arguments: list[str]) -> list[str]:
     """Return the arguments of a sweep with its folders named; those of a single run come back as they are.
 
     `paths.output_dir` names the folder of the whole sweep, and each job's folder says the values that are swept.
+    With `sweep.resume=true` what the sweep was started with comes first.
+
+    Raises:
+        InputError: it is not said which sweep to go on with.
 
     >>> sweep_arguments(["-m", "seed=0,1", "paths.output_dir=out"])
     ['-m', 'seed=0,1', 'hydra.sweep.dir=out', "hydra.sweep.subdir='${hydra.job.num}_seed=${seed}'"]
     """
-    if not {"-m", "--multirun"} & set(arguments):
+    resuming = (_value(arguments, "sweep.resume") or "").lower() == "true"
+    if not is_sweep(arguments):
+        if resuming:
+            raise InputError("sweep.resume=true goes on with a sweep: add -m. A single run goes on with resume=auto.")
         return arguments
+    # Hydra reads -m only before the overrides.
+    arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
     if any(argument.startswith("hydra.sweep.subdir=") for argument in arguments):
         return renamed
+    parts = ["${hydra.job.num}", *(f"{key}={_current_value(key)}" for key in _swept(arguments))]
+    return [*renamed, f"hydra.sweep.subdir='{'_'.join(parts)}'"]
+
+
+def _with_former(arguments: list[str], resuming: bool) -> list[str]:
+    """Put what the sweep was started with before the user's own."""
+    from nerf_lightning.commands.slurm import was_requeued
+
+    folder = _value(arguments, *FOLDER_KEYS)
+    if folder is None and not resuming:
+        found = _folder_of_this_slurm_job(arguments) if was_requeued() else None
+        return arguments if found is None else [*arguments, f"paths.output_dir='{found}'"]
+    if not resuming:
+        return arguments
+    if folder is None:
+        newest = next((str(folder) for folder, _ in _sweeps(arguments)), "DIR")
+        raise InputError(
+            "sweep.resume=true needs the folder of the sweep that it goes on with. Add paths.output_dir=DIR; the "
+            f"newest is paths.output_dir={newest}."
+        )
+    former = _read_arguments(Path(folder))
+    if not former and not _swept(arguments):
+        raise InputError(
+            f"sweep.resume=true: {folder} holds no sweep (no .hydra/sweep.yaml). Give the folder of one, or the whole "
+            "command with the values that are swept to begin one there."
+        )
+    given = {argument.partition("=")[0] for argument in arguments}
+    return [*(argument for argument in former if argument.partition("=")[0] not in given), *arguments]
+
+
+def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
+    from nerf_lightning.commands.slurm import slurm_job
+
+    asked = {argument for argument in arguments if not argument.startswith("-")}
+    same = (f for f, job in _sweeps(arguments) if job == slurm_job() and set(_read_arguments(f)) == asked)
+    return next(same, None)
+
+
+def _sweeps(arguments: list[str]) -> Iterator[tuple[Path, str | None]]:
+    """Yield the folders of former sweeps, the newest first, each with its Slurm job."""
+    root = Path(_value(arguments, "paths.root_dir") or "outputs") / "sweeps"
+    records = root.glob("*/.hydra/sweep.yaml")
+    for record in sorted(records, key=lambda file: file.stat().st_mtime, reverse=True):
+        yield record.parent.parent, _read(record).get("slurm_job")
+
+
+def _read_arguments(folder: Path) -> list[str]:
+    # What was made of the arguments, or belongs to one start, is made again.
+    made = ("hydra.mode=", "hydra.sweep.dir=", "sweep.", SUBDIR)
+    saved = _read(folder / ".hydra" / "sweep.yaml").get("arguments", [])
+    return [argument for argument in saved if not argument.startswith(made)]
+
+
+def _read(record: Path) -> dict[str, Any]:
+    import yaml
+
+    content = yaml.safe_load(record.read_text(encoding="utf-8")) if record.is_file() else None
+    return content if isinstance(content, dict) else {}
+
+
+def _value(arguments: list[str], *keys: str) -> str | None:
     pairs = [argument.partition("=") for argument in arguments]
-    swept = [
+    values = [value.strip("'\"") for key, _, value in pairs if key in keys]
+    return values[-1] if values else None
+
+
+def _swept(arguments: list[str]) -> list[str]:
+    pairs = [argument.partition("=") for argument in arguments]
+    return [
         key for key, _, values in pairs if ("," in values or "(" in values) and not set("/[{@~+") & set(key + values)
     ]
-    parts = ["${hydra.job.num}", *(f"{key}={_current_value(key)}" for key in swept)]
-    return [*renamed, f"hydra.sweep.subdir='{'_'.join(parts)}'"]
 
 
 def _current_value(key: str) -> str:

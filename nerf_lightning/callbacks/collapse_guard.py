@@ -97,6 +97,7 @@ def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:
 
     Rays of masked pixels do not count: nothing has told the field what lies there.
     """
+    last_step = {name: value.cpu() for name, value in last_step.items()}
     kept = last_step["weight"] > 0
     if int(kept.sum()) < 2:
         return False

@@ -56,6 +56,7 @@ class Monitor(Callback):
 
 def level_scalars(names: tuple[str, ...], losses: Tensor, pictures: tuple[str, ...]) -> dict[str, float]:
     """Return the loss of each level, the PSNR of those whose loss is of a picture, and the sum that is minimised."""
+    losses = losses.cpu()  # the device is read once
     values = {"train/loss": float(losses.sum())}
     for name, loss in zip(names, losses, strict=True):
         values[f"train/loss_{name}"] = float(loss)

@@ -63,7 +63,7 @@ class TrainingProgress(ProgressBar):
         # Negative after a restart, which counts anew.
         rays_per_second = max(0.0, (pl_module.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.progress.rays_seen
-        loss = pl_module.last_step["losses"]
+        loss = pl_module.last_step["losses"].cpu()
         text = (
             f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "
             f"{rays_per_second:,.0f} rays/s"

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: finish the step, save, stop; the run can go on to the last bit."""
+"""Ctrl-C, SIGTERM and the signals of schedulers: finish the step, save, stop; the run can go on to the last bit."""
 
 import os
 import signal
@@ -10,7 +10,21 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning import ranks
 
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
+
+def stop_signals() -> list[int]:
+    """Return the signals that ask a run to save and stop."""
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
+    numbers = [int(getattr(signal, name)) for name in names]
+    own = submitit_signal()
+    return numbers if own is None or own in numbers else [*numbers, own]
+
+
+def submitit_signal() -> int | None:
+    """Return the signal by which submitit tells its job that the time is up, or None outside of submitit."""
+    if "SUBMITIT_EXECUTOR" not in os.environ:
+        return None
+    found = getattr(signal, "SIG" + os.environ.get("SUBMITIT_PREEMPT_SIGNAL", "USR2"), None)
+    return None if found is None else int(found)
 
 
 class StopSignals(Callback):
@@ -26,7 +40,7 @@ class StopSignals(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remember the handlers from before Lightning's, which would keep a finished trainer alive and deaf."""
-        self.former = {number: signal.getsignal(number) for number in SIGNALS}
+        self.former = {number: signal.getsignal(number) for number in stop_signals()}
 
     def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Listen."""
@@ -55,7 +69,7 @@ class StopSignals(Callback):
         self.former.clear()
 
     def _listen(self) -> None:
-        for number in SIGNALS:
+        for number in stop_signals():
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -2,8 +2,9 @@
 
 Machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are compared round by
 round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32 without tiles,
-the machine's matrix product, loading a batch, and rendering. "Plain" is the same mathematics as one would first write
-it: float32, whole batches, torch around the same hash grid kernel, no screening of what lies behind opaque samples.
+the machine's matrix product, making a batch, the configured step with batches from the loader, and rendering. "Plain"
+is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid kernel, no
+screening of what lies behind opaque samples.
 """
 
 import json
@@ -20,6 +21,7 @@ from rich.progress import track
 from torch.utils.flop_counter import FlopCounterMode
 
 from nerf_lightning.commands.bench_kernels import kernel_ratios
+from nerf_lightning.commands.bench_loading import LoadedSteps
 from nerf_lightning.commands.bench_stages import seconds_to_psnr, stage_seconds
 from nerf_lightning.commands.bench_table import peak_memory, print_table, spread
 from nerf_lightning.commands.build import build, build_system
@@ -56,6 +58,14 @@ class Bench:
         """The batch that every kind gets, as large as batches are once the model has been trained."""
         return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
 
+    def train_on(self, batch: Batch, plain: bool = False) -> None:
+        """Compute gradients and update, and nothing else."""
+        optimizer = self.plain_optimizer if plain else self.optimizer
+        optimizer.zero_grad()
+        with nullcontext() if plain else self.settings.autocast():
+            self.system.accumulate_gradients(batch, lambda loss: loss.backward())
+        optimizer.step()
+
     def take_step(self) -> None:
         """Take one step of training, loading and all."""
         progress = self.batches.progress
@@ -68,11 +78,13 @@ def benchmark(config: DictConfig) -> float:
     """Measure as the config says."""
     bench = _prepare(config)
     reached = _train_first(bench, config)
-    kinds: dict[str, Callable[[], None]] = {
+    loaded_steps = LoadedSteps(bench.batches, bench.train_on, config.steps)
+    kinds: dict[str, Callable[[], Any]] = {
         "matrix": _multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
         "train_plain": lambda: _train(bench, config.steps, plain=True),
-        "load": lambda: _load(bench),
+        "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
+        "loaded": loaded_steps,
         "render": lambda: _render(bench, config.render_rays, plain=False),
         "render_plain": lambda: _render(bench, config.render_rays, plain=True),
     }
@@ -81,6 +93,7 @@ def benchmark(config: DictConfig) -> float:
     seconds = _interleaved(kinds, config.rounds)
     num_rays = bench.batch.rays.near.numel()
     flops = _flops_per_ray(bench)
+    seconds["wait"] = loaded_steps.waits[1:]
     per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
     result: dict[str, Any] = {name: spread([row[name] for row in per_round]) for name in per_round[0]}
     result |= {name: spread(values) for name, values in _stages(bench, seconds["train"], config.steps).items()}
@@ -122,17 +135,18 @@ def _prepare(config: DictConfig) -> Bench:
     num_steps = max(1, config.warmup_steps)
     system = build_system(config, settings, scene, progress, num_steps, {}).to(settings.device)
     system.initialize()
-    batches = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps).batches
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    data.settle(settings.device)
     if settings.measures_tile:
-        settings.tile_points = system.tile_points = measured_tile(settings, system, batches)
+        settings.tile_points = system.tile_points = measured_tile(settings, system, data.batches)
     optimizer, plain = system.configure_optimizers(), torch.optim.Adam(system.model.parameters(), lr=1e-6)
     # Stand-ins for what Lightning's trainer provides.
     setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
     setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
-    return Bench(settings, system, batches, optimizer, plain)
+    return Bench(settings, system, data.batches, optimizer, plain)
 
 
-def _interleaved(kinds: dict[str, Callable[[], None]], rounds: int) -> dict[str, list[float]]:
+def _interleaved(kinds: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
     seconds: dict[str, list[float]] = {name: [] for name in kinds}
     for number in range(rounds + 1):
         for name, work in kinds.items():
@@ -154,22 +168,19 @@ def _round(
         "training GFLOP/s": rate / 1e9,
         "matrix GFLOP/s": matrix_rate / 1e9,
         "training, share of the matrix rate": rate / matrix_rate,
-        "loading, share of a step": seconds["load"][i] * steps / seconds["train"][i],
+        "making a batch, milliseconds": 1e3 * seconds["load"][i],
+        "waiting for a batch, milliseconds": 1e3 * seconds["wait"][i],
+        "waiting, share of a step": seconds["wait"][i] * steps / seconds["train"][i],
         "rendering rays/s": render_rays / seconds["render"][i],
         "rendering, times plain float32": seconds["render_plain"][i] / seconds["render"][i],
     }
 
 
 def _train(bench: Bench, steps: int, plain: bool) -> None:
-    system, tile = bench.system, bench.settings.tile_points
-    optimizer = bench.plain_optimizer if plain else bench.optimizer
     with _plainly(bench) if plain else nullcontext():
         for _ in range(steps):
-            optimizer.zero_grad()
-            with nullcontext() if plain else bench.settings.autocast():
-                system.accumulate_gradients(bench.batch, lambda loss: loss.backward())
-            optimizer.step()
-    system.tile_points = tile
+            bench.train_on(bench.batch, plain)
+    bench.system.tile_points = bench.settings.tile_points
 
 
 @contextmanager
@@ -201,10 +212,6 @@ def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[fl
         for name, value in stage_seconds(bench.system, bench.batch, bench.optimizer).items():
             result.setdefault(f"{name}, share of a step", []).append(value * steps / one)
     return result
-
-
-def _load(bench: Bench) -> None:
-    bench.batches.at(0, bench.batches.crop_rays(0))
 
 
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:

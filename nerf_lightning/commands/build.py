@@ -3,11 +3,14 @@
 import importlib
 from typing import Any
 
-import yaml
+import torch
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.commands import xla
+from nerf_lightning.commands.plain_yaml import plain_yaml
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress
@@ -20,6 +23,8 @@ from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types import Scene
 
 CONTRACTS = (Encoder, Field, AnySampler, AnyLevel, RadianceModel)
+SPARE_NUMBERS = 1 << 24
+"""What a model may hold beside its weights."""
 ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
 
 
@@ -49,11 +54,15 @@ def build_system(
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
     model: RadianceModel = build(config.model)
+    optimizer = build(config.optimizer)
+    if settings.device_type == "xla":
+        xla.require_static_shapes(model)
+        optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     model.place(scene)
     return RadianceFieldSystem(
         model=model,
         loss=build(config.loss),
-        optimizer=build(config.optimizer),
+        optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,
         num_steps=num_steps,
@@ -75,16 +84,41 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     Raises:
         InputError: the config names anything else, or the weights do not fit.
     """
-    try:
-        config = yaml.safe_load(checkpoint.config)["model"]
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part ({error}).") from error
+    config = plain_yaml(checkpoint.config, f"The config in {checkpoint.path}")
+    if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
+        raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part. Use another one.")
+    config = config["model"]
     _require_our_own(config, str(checkpoint.path))
-    model = instantiate(config, _convert_="all")
-    if not isinstance(model, RadianceModel):
-        raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
+    # First without memory: sizes from a stranger must be those of the weights beside them.
+    with torch.device("meta"):
+        shapes = _built(config, checkpoint)
+    _require_fitting(shapes, checkpoint)
+    model = _built(config, checkpoint)
     load_weights(model, checkpoint)
     return model.eval()
+
+
+def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
+    try:
+        require_fitting_values(config, "model")
+        model = instantiate(config, _convert_="all")
+    except HydraException as error:
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise InputError(f"{checkpoint.path}: its model part cannot be built: {reason}. Use another one.") from error
+    if not isinstance(model, RadianceModel):
+        raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
+    return model
+
+
+def _require_fitting(model: RadianceModel, checkpoint: Checkpoint) -> None:
+    """Refuse a model that would take much more memory than its weights do."""
+    asked = sum(tensor.numel() for tensor in (*model.parameters(), *model.buffers()))
+    held = sum(tensor.numel() for tensor in checkpoint.weights.values())
+    if asked > held + SPARE_NUMBERS:
+        raise InputError(
+            f"{checkpoint.path} is damaged: its config describes a model of {asked:,} numbers, and its weights are "
+            f"{held:,}. Use another checkpoint."
+        )
 
 
 def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:

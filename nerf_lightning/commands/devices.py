@@ -5,14 +5,15 @@ from typing import Literal
 
 import torch
 
+from nerf_lightning.commands import xla
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
-Accelerator = Literal["auto", "cpu", "gpu", "mps"]
-DeviceType = Literal["cpu", "cuda", "mps"]
+Accelerator = Literal["auto", "cpu", "gpu", "mps", "tpu"]
+DeviceType = Literal["cpu", "cuda", "mps", "xla"]
 Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
-LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps"}
+LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps", "xla": "tpu"}
 
 
 def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
@@ -31,6 +32,8 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
             )
         log.warning("trainer=mps has never been tried: compare its first losses with those of trainer=cpu.")
         return "mps", "as asked, untested"
+    if accelerator == "tpu":
+        return "xla", f"{xla.require_device()}, as asked"
     if torch.cuda.is_available():
         return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
     if accelerator == "gpu":
@@ -65,7 +68,7 @@ def has_native_bfloat16(device_type: str) -> bool:
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type != "cpu":
-        return False
+        return device_type == "xla"
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     return any(getattr(torch.cpu, probe, bool)() for probe in probes)
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nerf_lightning.commands.build import build
-from nerf_lightning.commands.run_folder import output_folder
+from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.data.doctor.examine import examine
 from nerf_lightning.export.atomic import whole_file

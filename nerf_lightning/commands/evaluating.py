@@ -5,8 +5,8 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.finish import metric_lines
+from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
-from nerf_lightning.commands.run_folder import beside_checkpoint, output_folder
 
 
 def evaluate(config: DictConfig) -> float:

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import Trainer
 from omegaconf import DictConfig
-from PIL import Image
 
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
@@ -18,6 +16,7 @@ from nerf_lightning.commands.scoring import Scoring
 from nerf_lightning.commands.shots import Subject, lay_path
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.images import read_rgba
 from nerf_lightning.export.video import require_ffmpeg, write_video
 from nerf_lightning.geometry.paths.base import CameraPath
 from nerf_lightning.models.levels import RadianceModel
@@ -108,6 +107,6 @@ def _film_progress(folder: Path) -> list[str]:
     files = sorted((folder / "images" / "progress").glob("step_*.png"))
     if len(files) < 2:
         return []
-    frames = [torch.from_numpy(np.array(Image.open(file).convert("RGB"))) for file in files]
+    frames = [torch.from_numpy(read_rgba(file)[..., :3].copy()) for file in files]
     write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
     return [f"progress     {folder / 'progress.mp4'}"]

@@ -8,7 +8,9 @@ from typing import Any
 
 import torch
 
-ALL_THREADS = torch.get_num_threads()
+from nerf_lightning.cores import num_cores
+
+ALL_THREADS = min(torch.get_num_threads(), num_cores())
 M_MMAP_THRESHOLD = -3
 M_TRIM_THRESHOLD = -1
 

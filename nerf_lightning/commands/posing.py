@@ -38,7 +38,9 @@ def find_poses(config: DictConfig) -> int:
     if config.video is not None:
         model, matching = _from_video(Path(config.video), config.every, folder, settings)
     else:
-        model, matching = _from_photographs(Path(config.images), folder, settings)
+        if not isinstance(config.allow_outside, bool):
+            raise InputError(f"allow_outside={config.allow_outside} does not fit: it must be true or false.")
+        model, matching = _from_photographs(Path(config.images), folder, settings, config.allow_outside)
     print("\n".join(_summary(model, matching, config, folder, time.monotonic() - started)))
     return len(model.registered)
 
@@ -108,8 +110,10 @@ def _remove_content(work: Path) -> None:
             path.unlink()
 
 
-def _from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple[SparseModel, str]:
-    photographs = find_photographs(source)
+def _from_photographs(
+    source: Path, folder: Path, settings: SfmSettings, allow_outside: bool
+) -> tuple[SparseModel, str]:
+    photographs = find_photographs(source, allow_outside)
     in_place = (folder / "images").exists()
     turned = [photograph.path.name for photograph in photographs if not photograph.upright]
     if in_place and turned:

@@ -55,11 +55,13 @@ def on_all_processes(command: str, config: DictConfig, work: Callable[[DictConfi
 
 
 def num_processes(devices: int | str, device_type: str) -> int:
-    """Return how many processes to start: one per device.
+    """Return how many processes to start: one per device, and one for all cores of a TPU.
 
     Raises:
         InputError: there are fewer devices, or their number is left open on the CPU.
     """
+    if device_type == "xla":
+        return 1  # which drives all cores
     there = torch.cuda.device_count() if device_type == "cuda" else 1
     if devices == "auto" and device_type == "cpu":
         raise InputError(

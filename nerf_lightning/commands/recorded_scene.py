@@ -8,11 +8,14 @@ import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.overrides import quoted
+from nerf_lightning.commands.plain_yaml import plain_yaml, read_plain_yaml
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 
 # Settings of scenes that say where a capture lies.
 PLACES = ("root", "path")
+# Settings that say where to write, what to fetch and how far to trust: the user's alone.
+OF_THE_USER = ("download", "cache_dir", "allow_outside", "max_gigabytes")
 
 
 def scene_overrides(path: str) -> list[str]:
@@ -31,17 +34,22 @@ def scene_overrides(path: str) -> list[str]:
             f"{path} was trained on the scene '{name}', which conf/scene/ lacks. Name the scene: "
             f"nerf eval ckpt={path} scene=... ({', '.join(sorted(known))})."
         )
-    recorded = yaml.safe_load(checkpoint.config).get("scene", {})
+    config = plain_yaml(checkpoint.config, f"The config in {path}")
+    recorded = config.get("scene") if isinstance(config, dict) else None
+    if not isinstance(recorded, dict):
+        raise InputError(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
+    if ours.get("download") and not Path(str(values.get("path"))).exists():
+        values.pop("path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
     return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
 
 
 def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield what may be taken from a file: plain values of settings that we know, but no classes and no addresses."""
     for key, value in recorded.items():
-        if key not in ours or key.startswith("_") or key == "download":
+        if key not in ours or key.startswith("_") or key in OF_THE_USER:
             continue
         if isinstance(value, dict) and isinstance(ours[key], dict):
             yield from _plain_values(value, ours[key], f"{path}{key}.")
@@ -53,8 +61,8 @@ def _found(place: str, checkpoint: Path) -> str:
     try:
         if Path(place).expanduser().is_absolute() or Path(place).exists():
             return place
-        note = (checkpoint.parent.parent / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
-        there = Path(yaml.safe_load(note)["runtime"]["cwd"]) / place
+        note = read_plain_yaml(checkpoint.parent.parent / ".hydra" / "hydra.yaml")
+        there = Path(note["runtime"]["cwd"]) / place
         return str(there) if there.exists() else place
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError, yaml.YAMLError):
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, InputError):
         return place

@@ -9,7 +9,7 @@ from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.film_settings import film_settings, listed
 from nerf_lightning.commands.filming import film
-from nerf_lightning.commands.run_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.shots import Subject
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError

@@ -1,15 +1,15 @@
 """Run folders: chosen before anything is written, held by one process, never shared by two configs.
 
-A run folder has `run.json` (its config's fingerprint, and the step at which it finished), `.hydra/` (config and
-overrides), `checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
+A run folder has `run.json` (its config's fingerprint, and what it came to), `.hydra/` (config and overrides),
+`checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
 """
 
 import contextlib
-import hashlib
 import itertools
 import json
 import os
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,16 +21,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
-from nerf_lightning.commands.suggestions import flatten
+from nerf_lightning.commands.links import require_no_way_out
+from nerf_lightning.commands.plain_yaml import read_plain_yaml
+from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
+from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
-
-# Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
-NOT_IDENTITY = (
-    *("paths.", "resume", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
-    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
-)
-IDENTITY = ("callbacks.collapse_guard.",)
 
 
 @dataclass
@@ -41,6 +38,7 @@ class RunFolder:
     lock: FileLock
     named_checkpoint: Path | None
     """The checkpoint that the user named to go on from."""
+    began: float = field(default_factory=time.monotonic)
 
     def whole_checkpoint(self) -> Path | None:
         """Return where training goes on: the checkpoint that the user named, else the newest that is whole, if any.
@@ -62,14 +60,22 @@ class RunFolder:
         os.replace(folder / PREVIOUS, folder / LAST)
         return folder / LAST
 
-    def finish(self, step: int) -> None:
+    def finish(self, step: int, psnr: float | None = None) -> None:
         """Note that the run is complete."""
-        note = json.loads((self.path / "run.json").read_text())
-        _write_json(self.path / "run.json", note | {"finished_at_step": step})
+        self._note(finished_at_step=step, psnr=psnr)
+
+    def stop(self, restarted: bool) -> None:
+        """Note that the run was stopped; a `restarted` one is started again by its scheduler, and then goes on."""
+        self._note(**({"preempted": True} if restarted else {}))
 
     def release(self) -> None:
         """Let others have the folder."""
         self.lock.release()
+
+    def _note(self, **values: Any) -> None:
+        note = read_note(self.path)
+        seconds = round(note.get("seconds", 0.0) + time.monotonic() - self.began, 1)
+        _write_json(self.path / "run.json", note | {"seconds": seconds} | values)
 
 
 def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> RunFolder:
@@ -85,6 +91,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     """
     identity = run_identity(config)
     folder = _choose(config, identity, num_steps, job_folder)
+    require_no_way_out(folder)
     try:
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".hydra" / "lock")
@@ -98,9 +105,14 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
         raise InputError(
             f"The run folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
         ) from error
-    note = _read_note(folder)
-    started = note.get("started") or datetime.now().isoformat(timespec="seconds")
-    _write_json(folder / "run.json", {"fingerprint": _digest(identity), "started": started})
+    note = read_note(folder)
+    kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
+        key: note[key] for key in ("started", "seconds") if key in note
+    }
+    job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
+    _write_json(
+        folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings_digest(config)} | kept | job
+    )
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
@@ -125,23 +137,19 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
             OmegaConf.save(content, part)
 
 
-def run_identity(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    leaves = flatten(config)
-    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
-
-
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
         return _to_resume(Path(resume), identity)
     folder = job_folder or (Path(given) if given else None)
-    if folder is None and resume == "auto":
-        folder = _newest_unfinished(Path(config.paths.root_dir), _digest(identity), num_steps)
+    if folder is None and (resume == "auto" or was_requeued()):
+        of_job = None if resume == "auto" else slurm_job()
+        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), num_steps, of_job)
     if folder is None:
         return _fresh(Path(config.paths.root_dir) / config.scene.name)
     if (folder / "run.json").exists():
-        _refuse_other_run(folder, identity, resuming=resume == "auto")
+        resuming = resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
+        _refuse_other_run(folder, identity, resuming)
     return folder
 
 
@@ -159,7 +167,7 @@ def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
 
 
 def _refuse_other_run(folder: Path, identity: dict[str, Any], resuming: bool) -> None:
-    if _read_note(folder).get("fingerprint") == _digest(identity):
+    if read_note(folder).get("fingerprint") == fingerprint(identity):
         if resuming:
             return
         raise InputError(
@@ -176,17 +184,21 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     saved = folder / ".hydra" / "config.yaml"
     if not saved.is_file():
         return "its config was not kept"
-    other = run_identity(OmegaConf.load(saved))  # type: ignore[arg-type]
+    content = read_plain_yaml(saved)
+    if not isinstance(content, dict):
+        return "its config is damaged"
+    other = run_identity(OmegaConf.create(content))
     keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
     shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 
-def _newest_unfinished(root: Path, digest: str, num_steps: int) -> Path | None:
+def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
     notes = sorted(root.rglob("run.json"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in notes:
-        note = _read_note(file.parent)
-        if note.get("fingerprint") == digest and note.get("finished_at_step", -1) < num_steps:
+        note = read_note(file.parent)
+        ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
+        if ours and note.get("finished_at_step", -1) < num_steps:
             return file.parent
     return None
 
@@ -200,45 +212,6 @@ def _fresh(parent: Path) -> Path:
     raise AssertionError("unreachable: the names never end")
 
 
-def _read_note(folder: Path) -> dict[str, Any]:
-    try:
-        note = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return note if isinstance(note, dict) else {}
-
-
-def _digest(identity: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     with whole_file(path) as part:
         part.write_text(json.dumps(content, indent=2) + "\n")
-
-
-def beside_checkpoint(checkpoint: Path, name: str) -> Path:
-    """Return the folder of this name in the run folder that a checkpoint lies in."""
-    beside = checkpoint.absolute().parent
-    return (beside.parent if beside.name == "checkpoints" else beside) / name
-
-
-def output_folder(given: str | None, default: Path) -> Path:
-    """Return where a command that does not train writes: as given, else by default.
-
-    The jobs of a sweep have folders of their own.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-    """
-    folder = job_folder() or Path(given or default)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{os.getpid()}.probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
-        ) from error
-    return folder

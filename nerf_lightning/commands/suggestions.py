@@ -6,13 +6,35 @@ from pathlib import Path
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.errors import InputError
+
+
+def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | None:
+    """Return what a person is told of an error that bad input causes, or None for any other."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return _missing_plugin(str(error)) or explain(error, command, conf_folder)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
+    return None
+
+
+def _missing_plugin(message: str) -> str | None:
+    # Packages that are installed have told Hydra their names.
+    unknown = re.search(r"'hydra/(launcher|sweeper)/(joblib|submitit|optuna)(_local|_slurm)?'", message)
+    if unknown is None:
+        return None
+    kind, name = unknown.groups()[:2]
+    extra = "slurm" if name == "submitit" else "sweep"
+    return f"This {kind} needs {name}, which is not installed: pip install 'nerf-lightning[{extra}]'."
 
 
 def explain(error: BaseException, command: str, conf_folder: Path) -> str:

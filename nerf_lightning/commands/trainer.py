@@ -8,10 +8,12 @@ from typing import Any, Literal
 import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import distributed
 
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.commands import xla
 from nerf_lightning.commands.devices import LIGHTNING_NAMES, Accelerator, Precision, choose_device, choose_precision
 from nerf_lightning.commands.machine import prepare_machine
 from nerf_lightning.commands.strategy import Launcher, OneSumPerStep, cluster_environment, processes_here
@@ -35,10 +37,11 @@ class TrainerSettings:
             measured at the start of a run and kept; None trains a batch whole. The result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
         val_every_steps: steps between two looks at the validation rays.
-        num_threads: torch's threads on the CPU; None: one per core.
+        num_threads: torch's threads on the CPU; None: one per core of ours.
         compile: compile the levels that have static shapes (torch.compile).
         deterministic: refuse operations of GPUs whose sums depend on chance; the CPU's never do.
-        devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them.
+        devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
+            TPU the cores, of one process.
         launched_by: who starts the processes: nerf itself, torchrun, or Slurm's srun; then `devices` is theirs to say.
     """
 
@@ -66,9 +69,12 @@ class TrainerSettings:
             raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
         self.max_steps, self.max_epochs = max_steps, max_epochs
         self.device_type, self.device_reason = choose_device(accelerator)
+        if self.device_type == "xla":
+            xla.refuse(compile, launched_by)
         self.precision, self.reason = choose_precision(precision, self.device_type)
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
-        self.measures_tile = tile_points == "auto"
+        # On XLA each size would be compiled first.
+        self.measures_tile = tile_points == "auto" and self.device_type != "xla"
         self.tile_points = default_tile if tile_points == "auto" else tile_points
         self.clip_norm, self.val_every_steps = clip_norm, val_every_steps
         self.num_threads = num_threads
@@ -84,26 +90,21 @@ class TrainerSettings:
     def prepare_machine(self) -> None:
         """Set threads, the allocator and the kind of products, once per process."""
         prepare_machine(self.num_threads)
+        if self.device_type == "xla":
+            self.devices = xla.use_cores(self.devices)
         if self.device_type == "cuda":
             torch.set_float32_matmul_precision("high" if self.precision == "tf32" else "highest")
 
     def build(self, folder: Path, num_steps: int, callbacks: Sequence[Callback], loggers: Sequence[Logger]) -> Trainer:
         """Return Lightning's Trainer for this process's device, one of several where processes are joined."""
-        several = distributed.is_initialized()
-        environment = [cluster_environment()] if several else []
         return Trainer(
             default_root_dir=folder,
             max_steps=num_steps,
             max_epochs=-1,
-            accelerator=LIGHTNING_NAMES[self.device_type],
-            devices=processes_here() if several else 1,
-            num_nodes=distributed.get_world_size() // processes_here() if several else 1,
-            strategy=OneSumPerStep() if several else "auto",
-            precision="32-true" if self.precision == "tf32" else self.precision,
+            **self._placement(),
             deterministic=self.deterministic,
             callbacks=list(callbacks),
             logger=list(loggers) or False,
-            plugins=[AtomicCheckpointIO(), *environment],
             val_check_interval=min(self.val_every_steps, num_steps),
             check_val_every_n_epoch=None,
             num_sanity_val_steps=0,
@@ -112,6 +113,21 @@ class TrainerSettings:
             enable_progress_bar=any(type(callback).__name__ == "TrainingProgress" for callback in callbacks),
             log_every_n_steps=1,
         )
+
+    def _placement(self) -> dict[str, Any]:
+        if self.device_type == "xla":
+            return xla.trainer_arguments(self.precision, int(self.devices))
+        several = distributed.is_initialized()
+        # Else Lightning would find Slurm by itself, save in the midst of a step and requeue.
+        environment = [cluster_environment()] if several or SLURMEnvironment.detect() else []
+        return {
+            "accelerator": LIGHTNING_NAMES[self.device_type],
+            "devices": processes_here() if several else 1,
+            "num_nodes": distributed.get_world_size() // processes_here() if several else 1,
+            "strategy": OneSumPerStep() if several else "auto",
+            "precision": "32-true" if self.precision == "tf32" else self.precision,
+            "plugins": [AtomicCheckpointIO(), *environment],
+        }
 
     def keep_tile(self, measured: int | None) -> None:
         """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""

@@ -20,7 +20,10 @@ from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.former_overrides import to_give_again
+from nerf_lightning.commands.memory_plan import announce_memory
 from nerf_lightning.commands.overrides import to_type
+from nerf_lightning.commands.preemption import wants_restart
 from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.tile_choice import measured_tile
@@ -61,8 +64,12 @@ def train(config: DictConfig) -> float | None:
         with _log_file(path) if ranks.is_first() else nullcontext():
             psnr, last_step = _run(config, parts, path, checkpoint)
         for folder in held:
-            folder.finish(last_step)
+            folder.finish(last_step, psnr)
         return psnr
+    except SystemExit as stop:
+        for folder in held:
+            folder.stop(restarted=wants_restart(stop.code))
+        raise
     finally:
         for folder in held:
             folder.release()
@@ -113,6 +120,8 @@ def _run(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
         tile = ranks.from_first(lambda: measured_tile(parts.settings, parts.system, parts.data.batches))
         parts.system.tile_points = parts.settings.tile_points = tile
+    if ranks.is_first():
+        announce_memory(parts.settings, parts.system, parts.data)
     if parts.settings.compile:
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
     trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
@@ -154,7 +163,8 @@ def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> lis
 
 
 def _resume_command(folder: Path) -> str:
-    return f"nerf train {to_type('resume', str(folder))}"
+    again = to_give_again(HydraConfig.get().overrides.task)
+    return " ".join(["nerf train", to_type("resume", str(folder)), *again])
 
 
 @contextmanager

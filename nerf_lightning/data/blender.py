@@ -10,6 +10,7 @@ import torch
 
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.blender_frames import Frame, read_frames
+from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.checks import (
     check_bounds,
     check_divisible,
@@ -45,6 +46,7 @@ class BlenderReader(Reader):
         downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
         skip: per split, take every k-th frame, such as {"test": 8}; splits not named are taken whole.
         aabb_half: half the side of the box around the origin that holds the content, scene units.
+        allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         name: what the scene is called in reports.
     """
 
@@ -57,6 +59,7 @@ class BlenderReader(Reader):
         downscale: int = 1,
         skip: Mapping[str, int] | None = None,
         aabb_half: float = 1.5,
+        allow_outside: bool = False,
         name: str = "blender",
     ) -> None:
         self.root = Path(root)
@@ -66,6 +69,7 @@ class BlenderReader(Reader):
         self.downscale = downscale
         self.skip = dict(skip or {})
         self.aabb_half = aabb_half
+        self.allow_outside = allow_outside
         self.name = name
 
     def read(self) -> Scene:
@@ -123,6 +127,9 @@ class BlenderReader(Reader):
         frames = {
             split: read_frames(path, self.skip.get(split, 1)) if path.is_file() else [] for split, path in files.items()
         }
+        if not self.allow_outside:
+            for path in (*files.values(), *(frame.image for split in frames.values() for frame in split)):
+                require_inside(path, self.root)
         if not frames["train"]:
             raise InputError(f"{files['train']} has no frames, so there is nothing to learn from. Export it again.")
         return frames

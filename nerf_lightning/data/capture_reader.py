@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from nerf_lightning.data.base import Reader
+from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.capture import Capture, cameras_of, check_capture, filtered
 from nerf_lightning.data.checks import check_step, is_there, known_background, listed
 from nerf_lightning.data.extents import extent_of
@@ -42,6 +43,7 @@ class CaptureReader(Reader):
         far: distance at which content ends; null: from the capture.
         background: what lies behind transparent pixels or the end of the scene.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
+        allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         verify: compare the contents of all files with what was decoded, not their times alone.
         name: the scene's name in reports.
     """
@@ -56,6 +58,7 @@ class CaptureReader(Reader):
     far: float | None = None
     background: str = "black"
     cache_dir: str | None = None
+    allow_outside: bool = False
     verify: bool = False
     name: str = "capture"
 
@@ -129,6 +132,15 @@ class CaptureReader(Reader):
             raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder
 
+    def require_inside(self, path: Path, setting: str | None = None) -> None:
+        """Refuse what is really outside of the capture's folder, and of the one that a setting names, unless allowed.
+
+        Raises:
+            InputError: with where it leads, and the cure.
+        """
+        if not self.allow_outside:
+            require_inside(path, self.folder(), setting)
+
     def mask_of(self, name: str) -> Path | None:
         """Return the mask of the photograph `name`, where masks are used.
 
@@ -141,6 +153,7 @@ class CaptureReader(Reader):
         candidates = (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png"))
         for candidate in candidates:
             if is_there(candidate):
+                self.require_inside(candidate, self.masks)
                 return candidate
         raise InputError(
             f"scene.masks={self.masks} holds no mask for {name}: neither {listed(candidates)} exists. Add it "

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.data.capture import Capture, View, common_lens_model
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
 from nerf_lightning.data.checks import is_absolute, is_there, listed
-from nerf_lightning.data.colmap_model import find_model, read_model
+from nerf_lightning.data.colmap_model import find_model, model_files, read_model
 from nerf_lightning.data.colmap_records import ColmapCamera, ColmapImage
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
@@ -45,6 +45,8 @@ class ColmapReader(CaptureReader):
         """Return the registered photographs, in order of their names."""
         root = self.folder()
         folder = find_model(root)
+        for path in model_files(folder):
+            self.require_inside(path)
         model = read_model(folder)
         pictures = root / self.images
         if not pictures.is_dir():
@@ -52,6 +54,7 @@ class ColmapReader(CaptureReader):
                 f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
                 f"their folder below {root}."
             )
+        self.require_inside(pictures, self.images)
         lost = [image.name for image in model.images if not is_there(pictures / image.name)]
         if lost:
             raise InputError(_absent(lost, pictures, folder, len(model.images)))
@@ -70,6 +73,7 @@ class ColmapReader(CaptureReader):
         fx, fy, cx, cy = (camera.params[place] for place in pinhole)
         k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
         path = pictures / image.name
+        self.require_inside(path, self.images)
         return View(
             name=image.name,
             photograph=Photograph(path, self.mask_of(image.name)),

@@ -1,5 +1,7 @@
 """The binary files of a COLMAP model: little-endian records, each list after its length."""
 
+import mmap
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,8 +55,12 @@ class _Bytes:
 
     def __init__(self, path: Path):
         self.path, self.place = path, 0
+        self.data: bytes | mmap.mmap
         try:
-            self.data = path.read_bytes()
+            with path.open("rb") as file:
+                # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
+                empty = os.fstat(file.fileno()).st_size == 0
+                self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
 

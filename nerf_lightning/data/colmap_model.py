@@ -50,6 +50,12 @@ def find_model(root: Path) -> Path:
     )
 
 
+def model_files(folder: Path) -> list[Path]:
+    """Return the files of the model, of both kinds, that are there."""
+    paths = [folder / f"{name}{ending}" for name in FILES for ending in KINDS]
+    return [path for path in paths if path.is_file()]
+
+
 def read_model(folder: Path) -> ColmapModel:
     """Read a model, binary or text.
 

@@ -49,14 +49,15 @@ class TextFiles:
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     try:
-        text = path.read_text(encoding="utf-8")
+        # Line by line: a file of empty lines is small on the disk alone.
+        with path.open(encoding="utf-8", newline="\n") as file:
+            for number, line in enumerate(file, start=1):
+                if not line.startswith("#") and (keep_empty or line.strip()):
+                    yield number, line.strip()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {CURE}") from error
+        raise InputError(f"{path} is not a text file (it is not UTF-8). {CURE}") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
-    for number, line in enumerate(text.split("\n"), start=1):
-        if not line.startswith("#") and (keep_empty or line.strip()):
-            yield number, line.strip()
 
 
 def _check_features(words: list[str], where: str) -> None:

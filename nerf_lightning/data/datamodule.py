@@ -1,11 +1,15 @@
 """The LightningDataModule: flattens every picture of a scene into ray batches."""
 
 import logging
+from typing import Literal
 
+import psutil
+import torch
 from lightning.pytorch import LightningDataModule
 
 from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
+from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import Scene
 
@@ -27,6 +31,11 @@ class RayDataModule(LightningDataModule):
         crop_fraction: share of each side that the crop keeps.
         restart_crop_steps: the least crop after a restart by the collapse guard.
         val_rays: size of the validation subset.
+        device_budget: gigabytes of a GPU's memory that the pixels may take. Where they fit, they move there and
+            batches are made there; 0 leaves them on the host, auto takes half of what is free.
+        prefetch: make the next batch in a background thread while a step runs; auto does where that has been found to
+            help: pixels on the host and the model on a GPU, or a mapped file that memory cannot hold. The
+            batches are the same.
     """
 
     def __init__(
@@ -41,12 +50,14 @@ class RayDataModule(LightningDataModule):
         crop_fraction: float = 0.5,
         restart_crop_steps: int = 500,
         val_rays: int = 4096,
+        device_budget: int | float | Literal["auto"] = "auto",
+        prefetch: bool | Literal["auto"] = "auto",
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
-        least = batch_rays if sample_budget is None else batch_rays >> (BATCH_SIZES - 1)
+        least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
         if min(least, val_rays) < ranks.world_size():
             raise InputError(
                 f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "
@@ -57,20 +68,11 @@ class RayDataModule(LightningDataModule):
                 f"data.sample_budget={sample_budget} with data.crop_steps={crop_steps}: give a positive budget and no "
                 "crop (whose length is counted in batches of one size), or data.sample_budget=null."
             )
+        if device_budget != "auto" and device_budget < 0:
+            raise InputError(f"data.device_budget={device_budget}: give gigabytes, 0 for none of them, or auto.")
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
-        if scene.background == "none" and scene.pixels.has_transparency:
-            raise InputError(
-                f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
-                "scene.background=none would train on colours without their alpha. Use white, black or random."
-            )
-        if scene.background == "random" and not scene.pixels.has_transparency:
-            log.warning(
-                "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
-                "scene is part of them and is learnt as matter. Give the background's colour instead "
-                "(scene.background=black or white).",
-                scene.name,
-            )
+        _check_background(scene)
         for split in ("train", "val"):
             if not scene.splits.get(split):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
@@ -78,6 +80,26 @@ class RayDataModule(LightningDataModule):
         self.batches = RayBatches(scene, progress, seed, batch_rays, num_steps)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
+        self.device_budget, self.prefetch = device_budget, prefetch
+
+    def setup(self, stage: str) -> None:
+        """Bring the pixels to where this process trains."""
+        self.settle(self.trainer.strategy.root_device)  # type: ignore[union-attr]
+
+    def settle(self, device: torch.device) -> None:
+        """Move the pixels to the device if they fit the budget; else see whether batches are made ahead for it."""
+        if self.batches.scene is not self.scene:  # they have moved already
+            return
+        if self.fits(device):
+            self.batches.take_from(on_device(self.scene, device))
+            return
+        from_disk = num_bytes(self.scene.pixels) > psutil.virtual_memory().available
+        helps = device.type != "cpu" or from_disk
+        self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
+
+    def fits(self, device: torch.device) -> bool:
+        """Tell whether the pixels are to move to a device."""
+        return device.type != "cpu" and num_bytes(self.scene.pixels) <= budget_bytes(self.device_budget, device)
 
     def train_dataloader(self) -> RayBatches:
         """Return the training batches."""
@@ -86,3 +108,18 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> FixedRays:
         """Return the fixed validation rays."""
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
+
+
+def _check_background(scene: Scene) -> None:
+    if scene.background == "none" and scene.pixels.has_transparency:
+        raise InputError(
+            f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
+            "scene.background=none would train on colours without their alpha. Use white, black or random."
+        )
+    if scene.background == "random" and not scene.pixels.has_transparency:
+        log.warning(
+            "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
+            "scene is part of them and is learnt as matter. Give the background's colour instead "
+            "(scene.background=black or white).",
+            scene.name,
+        )

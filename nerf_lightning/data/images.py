@@ -1,5 +1,6 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
+import os
 import struct
 import threading
 import warnings
@@ -21,6 +22,8 @@ MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
+MOST_MEGAPIXELS = 178
+LIMIT_VARIABLE = "NERF_LIGHTNING_MAX_MEGAPIXELS"
 DECODER_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
 
 
@@ -141,18 +144,34 @@ def area_downscale(
     return small
 
 
+def most_megapixels() -> int:
+    """Return how large a picture may be: $NERF_LIGHTNING_MAX_MEGAPIXELS, else what the largest cameras make.
+
+    Raises:
+        InputError: the variable is no whole number above 0.
+    """
+    asked = os.environ.get(LIMIT_VARIABLE, "").strip()
+    if not asked:
+        return MOST_MEGAPIXELS
+    if not (asked.isdecimal() and len(asked) < 10 and int(asked) > 0):
+        raise InputError(f"The environment variable {LIMIT_VARIABLE} is {asked!r}: give a whole number above 0.")
+    return int(asked)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the file, read its header, and refuse what has no one plain reading."""
+    most = most_megapixels()
     try:
         with _filters, warnings.catch_warnings():
-            # PIL warns at 89 million pixels and fails at twice that; one limit is easier to explain than two.
+            # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            Image.MAX_IMAGE_PIXELS = most * 500_000
             image = Image.open(path, formats=FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{path} has more than {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels; more is not safe to decode. "
-            "Shrink it first."
+            f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can announce "
+            f"any number. Shrink it first, or, if you trust it, set the environment variable {LIMIT_VARIABLE}."
         ) from error
     except (UnidentifiedImageError, *DECODER_ERRORS) as error:
         raise InputError(_unreadable(path, error)) from error

@@ -1,33 +1,58 @@
 """Json files of captures: parsed, with their mistakes named."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
 
+MOST_BYTES = 1 << 26
+"""A hundred thousand frames take less."""
+MOST_DEPTH = 32
+CURE = "Export it again, or mend it with a json checker."
+
 
 def read_json(path: Path) -> Any:
     """Return the content of a json file.
 
     Raises:
-        InputError: it cannot be read, or is not json.
+        InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
     """
-    cure = "Export it again, or mend it with a json checker."
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{path} has {path.stat().st_size:,} bytes, and more than {MOST_BYTES:,} of json are not read. {CURE}"
+            )
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {cure}") from error
+        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
     except RecursionError as error:
-        raise InputError(f"{path} nests its brackets too deeply to be a capture. {cure}") from error
+        raise InputError(f"{path} nests its brackets too deeply to be a capture. {CURE}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
+        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {CURE}") from error
     except ValueError as error:  # a number of thousands of digits
-        raise InputError(f"{path} is not usable json: {error}. {cure}") from error
+        raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+    _require_flat(content, path)
+    return content
+
+
+def _require_flat(content: object, path: Path) -> None:
+    # What follows walks through the content, and prints parts of it, by recursion.
+    level = [content]
+    for _ in range(MOST_DEPTH):
+        level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
+        if not level:
+            return
+    raise InputError(f"{path} nests its brackets too deeply to be a capture (more than {MOST_DEPTH} deep). {CURE}")
+
+
+def _children(node: list[Any] | dict[str, Any]) -> Iterable[Any]:
+    return node.values() if isinstance(node, dict) else node
 
 
 def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:

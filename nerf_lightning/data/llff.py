@@ -12,6 +12,7 @@ from numpy import ndarray
 from nerf_lightning.data.capture import Capture, View
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
 from nerf_lightning.data.checks import contents, listed
+from nerf_lightning.data.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 
@@ -35,9 +36,13 @@ class LlffReader(CaptureReader):
         """Return all views with their bounds."""
         root = self.folder()
         path = root / "poses_bounds.npy"
+        self.require_inside(path)
         rows = _rows(path)
         pictures = self._pictures(root)
+        self.require_inside(pictures, self.images)
         names = picture_files(pictures)
+        for name in names:
+            self.require_inside(pictures / name, self.images)
         if len(names) != len(rows):
             raise InputError(
                 f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
@@ -75,6 +80,9 @@ def _array(path: Path) -> ndarray:
     try:
         # Read by its own format: np.load would open archives too, and unpickle what is neither.
         with path.open("rb") as file:
+            # Its size is known before memory is taken, and its header is short.
+            array_header(file.read(HEADER_BYTES), path.stat().st_size)
+            file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
         raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error

@@ -22,6 +22,7 @@ from nerf_lightning.data.checks import (
 )
 from nerf_lightning.data.download import fetch
 from nerf_lightning.data.images import area_downscale
+from nerf_lightning.data.numpy_files import ArrayHeader, archive_headers, check_unpacked, read_member
 from nerf_lightning.data.pixel_store import empty_store
 from nerf_lightning.data.splits import every_kth, in_order
 from nerf_lightning.errors import InputError
@@ -47,6 +48,7 @@ class NpzReader(Reader):
         downscale: whole factor by which the pictures shrink (area filter); the focal length follows.
         aabb_half: half the side of the box around the origin that holds the content, scene units.
         download: where to get an absent file: `url`, `bytes` and `sha256` (None: only its size is checked).
+        max_gigabytes: how much the file may unpack to; what is small on the disk may be made to fill the memory.
         name: what the scene is called in reports.
     """
 
@@ -61,6 +63,7 @@ class NpzReader(Reader):
         downscale: int = 1,
         aabb_half: float = 1.5,
         download: Mapping[str, Any] | None = None,
+        max_gigabytes: float = 2.0,
         name: str = "npz",
     ) -> None:
         self.path = Path(path)
@@ -72,6 +75,7 @@ class NpzReader(Reader):
         self.downscale = downscale
         self.aabb_half = aabb_half
         self.download = download
+        self.max_gigabytes = max_gigabytes
         self.name = name
 
     def read(self) -> Scene:
@@ -83,7 +87,7 @@ class NpzReader(Reader):
         self._check_settings()
         if self.download and not self.path.exists():
             fetch(self.download["url"], self.path, self.download["bytes"], self.download["sha256"])
-        arrays = _load(self.path)
+        arrays = _load(self.path, self.max_gigabytes)
         images, focal = (
             _checked_images(arrays["images"], self.path),
             _checked_focal(arrays["focal"], self.path),
@@ -134,30 +138,34 @@ class NpzReader(Reader):
         }
 
 
-def _load(path: Path) -> dict[str, np.ndarray]:
+def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
     """Return the three arrays; nothing in the file is executed (no pickles)."""
     if not path.is_file():
         raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
     try:
-        # Opened here, because numpy leaves the file open when the archive is broken.
-        with path.open("rb") as file:
-            return _arrays(np.load(file, allow_pickle=False), path)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."
-        ) from error
+        with zipfile.ZipFile(path) as archive:
+            headers = archive_headers(archive, KEYS)
+            _check_headers(headers, [Path(name).stem for name in archive.namelist()], path, max_gigabytes)
+            return {key: read_member(archive, key) for key in KEYS}
+    except zipfile.BadZipFile as error:
+        raise InputError(_damaged(path, error)) from error
+    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
+        raise InputError(_damaged(path, error)) from error
 
 
-def _arrays(content: object, path: Path) -> dict[str, np.ndarray]:
-    """Return the three arrays of an opened archive."""
-    if not isinstance(content, np.lib.npyio.NpzFile):
-        raise InputError(f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}")
-    with content:
-        missing = [key for key in KEYS if key not in content]
-        if missing:
-            present = listed(content.files) or "nothing"
-            raise InputError(f"{path} lacks {listed(missing)}; it has {present}. {LAYOUT}")
-        return {key: content[key] for key in KEYS}
+def _damaged(path: Path, error: Exception) -> str:
+    with path.open("rb") as file:
+        if file.read(6) == b"\x93NUMPY":
+            return f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}"
+    return f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."
+
+
+def _check_headers(headers: dict[str, ArrayHeader], present: list[str], path: Path, max_gigabytes: float) -> None:
+    missing = [key for key in KEYS if key not in headers]
+    if missing:
+        raise InputError(f"{path} lacks {listed(missing)}; it has {listed(present) or 'nothing'}. {LAYOUT}")
+    cure = "If you trust it, allow more with scene.max_gigabytes=N; else use another file."
+    check_unpacked(path, sum(header.num_bytes for header in headers.values()), 1e9 * max_gigabytes, cure)
 
 
 def _checked_images(images: Shaped[np.ndarray, "..."], path: Path) -> Shaped[np.ndarray, "n h w 3"]:

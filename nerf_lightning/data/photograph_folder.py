@@ -36,8 +36,12 @@ class FoundPhotograph:
         return self.width, self.height, self.lens
 
 
-def find_photographs(folder: Path) -> list[FoundPhotograph]:
+def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPhotograph]:
     """Return the photographs that lie in a folder, sorted by name; folders inside it are not searched.
+
+    Args:
+        folder: where they lie; it may be a link itself.
+        allow_outside: follow links that lead out of it.
 
     Raises:
         InputError: no such folder, fewer than three pictures in it, or one that cannot be read or is tiny.
@@ -52,6 +56,12 @@ def find_photographs(folder: Path) -> list[FoundPhotograph]:
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
+    outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
+    if outside and not allow_outside:
+        raise InputError(
+            f"images={folder}: {listed((path.name for path in outside), 4)} are symbolic links out of this folder. If "
+            "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
+        )
     return [_photograph(path) for path in pictures]
 
 

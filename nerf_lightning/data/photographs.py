@@ -68,7 +68,13 @@ def read_photographs(
     folder = default_folder("photographs") if cache_dir is None else cache_dir.expanduser()
     base = folder / _key(photographs, downscale)
     contents = _hash_of_contents(photographs, label) if verify else None
-    return stored(base, contents, partial(_write, list(photographs), downscale, contents, label))
+    store = stored(base, contents, partial(_write, list(photographs), downscale, contents, label))
+    if len(store.width) != len(photographs):
+        raise InputError(
+            f"{base}.pixels holds {len(store.width)} photographs where {len(photographs)} belong: somebody else wrote "
+            f"it. Remove {base}.json, and the photographs are read anew."
+        )
+    return store
 
 
 def _key(photographs: Sequence[Photograph], downscale: int) -> str:

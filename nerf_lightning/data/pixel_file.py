@@ -13,20 +13,23 @@ import shutil
 import sys
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from filelock import FileLock
 from jaxtyping import UInt8
 from torch import Tensor
 
+from nerf_lightning.data.json_files import read_json
 from nerf_lightning.data.pixel_store import layout
 from nerf_lightning.errors import InputError
 from nerf_lightning.types import PixelStore
 
 FORMAT = 1
 SPOTS, SPOT_BYTES = 64, 4096
+LONGEST_SIDE = 1 << 24
 GIGABYTE = 1e9
 
 log = logging.getLogger(__name__)
@@ -55,6 +58,18 @@ class Header:
     def num_bytes(self) -> int:
         """Size of the file."""
         return self.num_pixels * (5 if self.masked else 4)
+
+
+@dataclass(frozen=True)
+class MappedPixelStore(PixelStore):
+    """A store whose arrays are a file's. Pickled, it is a name: another process maps the same file."""
+
+    path: Path = field(kw_only=True)
+    header: Header = field(kw_only=True)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send the path, not the pixels, which may be more than memory holds."""
+        return _mapped, (self.path, self.header)
 
 
 def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> PixelStore:
@@ -104,8 +119,9 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
     """Write the pixels under another name, and the header once they have theirs."""
     part, note = base.with_suffix(".part"), base.with_suffix(".json.part")
     try:
-        # Under the lock, what lies there was left by a process that was killed.
+        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
         part.unlink(missing_ok=True)
+        note.unlink(missing_ok=True)
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part)}))
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
@@ -123,11 +139,14 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     """Return the header of a store that is whole and up to date, else None."""
     path = base.with_suffix(".pixels")
     try:
-        header = Header(**json.loads(base.with_suffix(".json").read_text(encoding="utf-8")))
+        if not base.with_suffix(".json").exists():
+            return None
+        header = Header(**read_json(base.with_suffix(".json")))
+        _require_numbers(header)
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, InputError) as error:
         log.warning("%s.json is damaged (%s); the photographs are read anew.", base, error)
         return None
     if not sound:
@@ -137,6 +156,15 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
         log.info("%s was made from other contents, or they were not compared then; it is made anew.", path)
         return None
     return header
+
+
+def _require_numbers(header: Header) -> None:
+    """Refuse sizes that are none: offsets into the file follow from them."""
+    sizes_fit = all(
+        len(size) == 2 and all(type(side) is int and 0 < side < LONGEST_SIDE for side in size) for size in header.sizes
+    )
+    if not sizes_fit or type(header.masked) is not bool or type(header.has_transparency) is not bool:
+        raise ValueError("sizes or switches that are none")
 
 
 def _spots(path: Path) -> int:
@@ -150,13 +178,23 @@ def _spots(path: Path) -> int:
     return checksum
 
 
-def _mapped(path: Path, header: Header) -> PixelStore:
+def _mapped(path: Path, header: Header) -> MappedPixelStore:
     """Return the store as views of the file; what is written to them stays in this process."""
     bytes_ = _mapped_bytes(path)
     rgba = bytes_[: 4 * header.num_pixels].view(-1, 4)
     sizes = [(width, height) for width, height in header.sizes]
     mask = bytes_[4 * header.num_pixels :] if header.masked else None
-    return PixelStore(rgba, *layout(sizes), has_transparency=header.has_transparency, mask=mask)
+    offset, width, height = layout(sizes)
+    return MappedPixelStore(
+        rgba=rgba,
+        offset=offset,
+        width=width,
+        height=height,
+        has_transparency=header.has_transparency,
+        mask=mask,
+        path=path,
+        header=header,
+    )
 
 
 def _mapped_bytes(path: Path) -> UInt8[Tensor, "bytes"]:

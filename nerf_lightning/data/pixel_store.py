@@ -1,19 +1,21 @@
 """Fill the pixel store from picture files: one array for all of them, decoded straight into place."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+import psutil
 import torch
 from jaxtyping import Int
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from torch import Tensor
 
+from nerf_lightning.cores import num_cores
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
+from nerf_lightning.errors import InputError
 from nerf_lightning.types import PixelStore
 
 # Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.
@@ -35,6 +37,12 @@ def layout(
 def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
     """Return a store with room for opaque pictures of these sizes (width, height), its pixels not yet written."""
     num_pixels = sum(width * height for width, height in sizes)
+    free = psutil.virtual_memory().available
+    if 4 * num_pixels > free:
+        raise InputError(
+            f"{len(sizes)} pictures of {num_pixels / 1e6:,.0f} megapixels in all need {4 * num_pixels / 1e9:.1f} GB of "
+            f"memory, and {free / 1e9:.1f} GB are free. Shrink them with scene.downscale, or read fewer."
+        )
     return PixelStore(torch.empty((num_pixels, 4), dtype=torch.uint8), *layout(sizes), has_transparency=False)
 
 
@@ -48,7 +56,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
         shown: whether there is a bar at all.
     """
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    threads = min(MAX_THREADS, os.cpu_count() or 1)
+    threads = min(MAX_THREADS, num_cores())
     with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
         return list(bar.track(pool.map(work, range(count)), total=count, description=label))
 

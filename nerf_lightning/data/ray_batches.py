@@ -12,6 +12,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerf_lightning import ranks
+from nerf_lightning.data.prefetch import made_ahead
+from nerf_lightning.data.residence import sent
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.randomness import fold, permute
@@ -67,22 +69,23 @@ class PixelDomain:
     """The pixels of some views, or of their centres, numbered from 0; row by row, view by view.
 
     Args:
-        scene: the views' sizes.
+        scene: the views' sizes, and where they lie.
         views: which views take part, in order.
         fraction: share of each side, around the centre, that takes part; 1 for the whole picture.
     """
 
     def __init__(self, scene: Scene, views: Sequence[int], fraction: float = 1.0):
-        self.views = torch.tensor(views, dtype=torch.int64)
+        self.views = torch.tensor(views, dtype=torch.int64, device=scene.pixels.width.device)
         width, height = scene.pixels.width[self.views], scene.pixels.height[self.views]
         self.width = (width * fraction).round().long().clamp(min=1)
         self.height = (height * fraction).round().long().clamp(min=1)
         self.left = (width - self.width) // 2
         self.top = (height - self.height) // 2
         self.ends = (self.width * self.height).cumsum(0)
+        self.num_pixels = int(self.ends[-1])
 
     def __len__(self) -> int:
-        return int(self.ends[-1])
+        return self.num_pixels
 
     def locate(self, number: Int[Tensor, "*rays"]) -> PixelIndex:
         """Return which pixel of which view each number stands for."""
@@ -100,7 +103,7 @@ def gather(scene: Scene, pixels: PixelIndex) -> Batch:
     return Batch(
         rays=rays_through_pixels(scene.cameras, pixels, scene.near, scene.far),
         rgba=scene.pixels.rgba[flat].to(torch.float32) / 255.0,
-        weight=torch.ones(flat.shape) if mask is None else mask[flat].to(torch.float32),
+        weight=torch.ones(flat.shape, device=flat.device) if mask is None else mask[flat].to(torch.float32),
     )
 
 
@@ -125,11 +128,19 @@ class RayBatches:
         batch_rays: int,
         num_steps: int,
     ):
-        self.scene, self.progress, self.seed = scene, progress, seed
+        self.progress, self.seed = progress, seed
         self.batch_rays, self.num_steps = batch_rays, num_steps
         progress.batch_rays = progress.largest_batch = batch_rays
+        self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
+        # The device that a background thread makes batches for; None: there is no such thread.
+        self.prefetch_for: torch.device | None = None
+        self.take_from(scene)
+
+    def take_from(self, scene: Scene) -> None:
+        """Make batches from this copy of the scene, where its pixels lie: in memory, a mapped file, or on a device."""
+        self.scene = scene
         self.whole = PixelDomain(scene, scene.splits["train"])
-        self.crop_to(1.0, 0, 0)
+        self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction)
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
         """See only the pictures' centres at first; without this, runs on white backgrounds may never start learning.
@@ -141,8 +152,8 @@ class RayBatches:
             steps: its length in the first attempt.
             restart_steps: its least length in later attempts.
         """
-        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
-        self.crop_steps, self.restart_crop_steps = steps, max(steps, restart_steps)
+        self.crop_fraction, self.crop_steps, self.restart_crop_steps = fraction, steps, max(steps, restart_steps)
+        self.take_from(self.scene)
 
     def crop_rays(self, restarts: int) -> int:
         """Return how many rays a run takes from the crop after so many restarts."""
@@ -152,24 +163,35 @@ class RayBatches:
         return self.num_steps
 
     def __iter__(self) -> Iterator[Batch]:
-        while True:
-            yield self.at(self.progress.attempt, self.progress.rays_seen)
+        device, progress = self.prefetch_for, self.progress
+        if device is None:
+            while True:
+                yield self.at(progress.attempt, progress.rays_seen)
 
-    def at(self, attempt: int, rays_seen: int) -> Batch:
-        """Return the batch that follows `rays_seen` rays of an attempt, as large as batches are now."""
-        return gather(self.scene, self.pixels_at(attempt, rays_seen))
+        def make(*place: int) -> Batch:
+            batch = self.at(*place)
+            return batch.map(Tensor.pin_memory) if device.type == "cuda" else batch
 
-    def pixels_at(self, attempt: int, rays_seen: int) -> PixelIndex:
+        for batch in made_ahead(make, lambda: (progress.attempt, progress.rays_seen, progress.batch_rays)):
+            yield batch.to(device, non_blocking=device.type == "cuda")
+
+    def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
+        """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
+        return gather(self.scene, self.pixels_at(attempt, rays_seen, batch_rays))
+
+    def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""
         crop_rays = self.crop_rays(attempt - self.progress.rollbacks)
         if rays_seen < crop_rays:
             domain, purpose, position = self.crop, "crop", rays_seen
         else:
             domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
-        place = position + torch.arange(self.progress.batch_rays)[ranks.share(self.progress.batch_rays)]
-        epochs, epoch = torch.unique(place // len(domain), return_inverse=True)
+        count = self.progress.batch_rays if batch_rays is None else batch_rays
+        place = position + torch.arange(count)[ranks.share(count)]
+        epochs, epoch = torch.unique_consecutive(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
-        return domain.locate(permute(place % len(domain), len(domain), keys[epoch]))
+        numbers = permute(place % len(domain), len(domain), keys if len(keys) == 1 else keys[epoch])
+        return domain.locate(sent(numbers, domain.ends.device))
 
 
 class FixedRays:
@@ -192,7 +214,8 @@ class FixedRays:
         domain = PixelDomain(scene, scene.splits[split])
         count = min(num_rays, len(domain))
         numbers = permute(torch.arange(count), len(domain), torch.full((count,), fold("validation")))
-        self.chunks = [domain.locate(part) for part in numbers[ranks.share(count)].split(chunk)]
+        mine = numbers[ranks.share(count)].split(chunk)
+        self.chunks = [domain.locate(sent(part, domain.ends.device)) for part in mine]
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "

@@ -1,9 +1,9 @@
 """Settings of structure from motion, and what its stages cost."""
 
-import os
 from dataclasses import dataclass
 from typing import Literal
 
+from nerf_lightning.cores import num_cores
 from nerf_lightning.data.image_pairs import Matching, image_pairs
 from nerf_lightning.data.photograph_folder import FoundPhotograph
 from nerf_lightning.errors import require_positive
@@ -46,7 +46,7 @@ class SfmSettings:
     @property
     def threads(self) -> int:
         """Return the number of threads to use."""
-        return self.num_threads or os.cpu_count() or 1
+        return self.num_threads or num_cores()
 
 
 def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings) -> dict[str, float]:

@@ -42,6 +42,7 @@ class TransformsReader(CaptureReader):
         path = self.folder() / self.file
         if not path.is_file():
             raise InputError(_absent(path))
+        self.require_inside(path, self.file)
         content = read_json(path)
         (frames,) = keys_of(content, ("frames",), str(path), FORMAT)
         if not isinstance(frames, list):
@@ -73,14 +74,18 @@ class TransformsReader(CaptureReader):
     def _view(self, path: Path, where: str, content: dict[str, Any], frame: Any) -> tuple[View, LensModel]:
         name, matrix = keys_of(frame, ("file_path", "transform_matrix"), where, FORMAT)
         picture = _picture(path, where, name)
+        self.require_inside(picture)
         where = f"{where} ({name})"
         settings = content | frame
         lens_model, lens = lens_of(settings, where)
         width, height = size_of(settings, where) or tuple(map(float, image_size(picture)))
+        mask = None if self.masks else _mask(path, where, frame)
+        if mask is not None:
+            self.require_inside(mask)
         named = picture.relative_to(path.parent).as_posix() if picture.is_relative_to(path.parent) else picture.name
         view = View(
             name=named,
-            photograph=Photograph(picture, self.mask_of(named) if self.masks else _mask(path, where, frame)),
+            photograph=Photograph(picture, self.mask_of(named) if self.masks else mask),
             c2w=pose_from_matrix(_four_rows(matrix), f"{where}: transform_matrix"),
             focal=focal_of(settings, width, height, where),
             center=(

@@ -8,11 +8,14 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from nerf_lightning.data.video_files import require_video
 from nerf_lightning.errors import InputError
 
 FRAMES_WANTED = 100
 SHARPNESS_SIDE = 480
 JPEG_QUALITY = 95
+# Nothing but the file itself is opened.
+INPUT = ["-protocol_whitelist", "file"]
 
 
 def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
@@ -41,6 +44,7 @@ def count_frames(path: Path) -> int:
 
     if not path.is_file():
         raise InputError(f"video={path}: there is no such file. Give a video, or a folder of photographs with images=.")
+    require_video(path)
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError as error:
@@ -91,7 +95,7 @@ def _write(folder: Path, group: list[tuple[float, int, np.ndarray]]) -> int:
 
 def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     try:
-        yield from iio.imiter(video, plugin="FFMPEG")
+        yield from iio.imiter(video, plugin="FFMPEG", input_params=INPUT)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise InputError(_not_a_video(video)) from error
 

@@ -12,6 +12,7 @@ from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 INITIAL_RANGE = 1e-4
 # Weights, gradients and Adam's two moments, in float32.
 BYTES_PER_PARAMETER = 16
+MOST_LEVELS = 64
 
 
 class HashGridEncoder(Encoder):
@@ -44,6 +45,8 @@ class HashGridEncoder(Encoder):
         super().__init__()
         if not 1 <= min_resolution <= max_resolution or num_levels < 1 or features_per_level < 1:
             raise ValueError("1 <= min_resolution <= max_resolution, and at least one level and feature are needed")
+        if num_levels > MOST_LEVELS:
+            raise ValueError(f"num_levels={num_levels}: give {MOST_LEVELS} at most")
         if not 1 <= log2_table_size <= 30:
             raise ValueError(f"log2_table_size={log2_table_size}: give 1 to 30")
         self.layout = hash_grid_layout(num_levels, log2_table_size, min_resolution, max_resolution)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.tensor_files import load_tensors
 
 LPIPS_HINT = (
     "it needs the weights of a backbone: where torchvision is installed, run "
@@ -86,7 +87,9 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
     if not Path(weights).is_file():
         raise InputError(f"evaluation.lpips_weights={weights}: there is no such file. To have LPIPS, {LPIPS_HINT}")
     try:
-        state = torch.load(weights, map_location="cpu", weights_only=True)
+        state = load_tensors(Path(weights))
+    except InputError:
+        raise
     except Exception as error:  # a file of another kind can fail in any way
         raise InputError(
             f"evaluation.lpips_weights={weights}: this is not a file of weights. To have LPIPS, {LPIPS_HINT}"

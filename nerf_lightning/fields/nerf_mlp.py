@@ -16,6 +16,7 @@ from nerf_lightning.types import FieldOutput, Scene
 
 # Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
 MOMENTUM, EPSILON = 0.01, 1e-3
+MOST_LAYERS = 100
 
 
 class NerfMLP(Field):
@@ -54,6 +55,8 @@ class NerfMLP(Field):
         contraction: bool | None = None,
     ):
         super().__init__()
+        if not 1 <= depth <= MOST_LAYERS:
+            raise ValueError(f"depth={depth}: give 1 to {MOST_LAYERS} layers")
         if skip is not None and not 0 < skip < depth:
             raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
         if position_encoder.needs_unit_cube:

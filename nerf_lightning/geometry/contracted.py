@@ -22,7 +22,7 @@ class Contracted(nn.Module):
         self.fixed = fixed
         self.register_buffer("switch", torch.tensor(bool(fixed)))
         # Reading the buffer stops a GPU, so it is read once.
-        self._known: bool | None = None
+        self._known: bool | None = bool(fixed)
 
     def place(self, scene: Scene) -> None:
         """Do as the scene says."""

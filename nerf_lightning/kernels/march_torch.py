@@ -18,14 +18,8 @@ def march_torch(
     capacity: int | None,
 ) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals and where each ray would go on."""
-    edges = lattice[:-1] + state.jitter[:, None] * (lattice[1:] - lattice[:-1])
-    midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
-    number = torch.arange(midpoints.shape[1], device=edges.device)
-    keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
-    floor = floor_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
-    keep &= floor >= 0
-    optical = torch.where(keep, floor * (edges[:, 1:] - edges[:, :-1]), 0.0)
-    keep &= optical.cumsum(dim=-1) - optical <= OPAQUE
+    keep, edges = occupied_intervals(rays, state, lattice, grid)
+    number = torch.arange(keep.shape[1], device=edges.device)
     following = torch.full_like(state.next, number.numel())
     if limit is not None:
         rank = keep.cumsum(dim=-1)
@@ -33,6 +27,23 @@ def march_torch(
         last = torch.where(keep & (rank == limit), number, number.numel() - 1).amin(dim=-1)
         following = torch.where(keep.sum(dim=-1) == limit, last + 1, following)
     return _packed(keep, edges, capacity), following
+
+
+def occupied_intervals(
+    rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells
+) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
+    """Tell which intervals of each ray may hold something that can be seen, and return the fenceposts of all.
+
+    The shapes are the same whatever the grid holds.
+    """
+    edges = lattice[:-1] + state.jitter[:, None] * (lattice[1:] - lattice[:-1])
+    midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
+    number = torch.arange(midpoints.shape[1], device=edges.device)
+    keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
+    floor = floor_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    keep &= floor >= 0
+    optical = torch.where(keep, floor * (edges[:, 1:] - edges[:, :-1]), 0.0)
+    return keep & (optical.cumsum(dim=-1) - optical <= OPAQUE), edges
 
 
 def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.geometry.spacing import spread
+from nerf_lightning.kernels.search import search
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.types import DenseRendering
 
@@ -60,8 +61,8 @@ def outer_weights(
     """
     total = torch.cat([torch.zeros_like(v[..., :1]), v.cumsum(dim=-1)], dim=-1)
     bins = v.shape[-1]
-    first = torch.searchsorted(u.contiguous(), t[..., :-1].contiguous(), right=True) - 1
-    last = torch.searchsorted(u.contiguous(), t[..., 1:].contiguous(), right=False)
+    first = search(u, t[..., :-1], right=True) - 1
+    last = search(u, t[..., 1:])
     return total.gather(-1, last.clamp(0, bins)) - total.gather(-1, first.clamp(0, bins))
 
 

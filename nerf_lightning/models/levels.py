@@ -20,6 +20,9 @@ class AnyLevel(nn.Module):
     has_color = True
     """Whether its rendering is a picture."""
 
+    has_static_shapes: bool = True
+    """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+
     @abstractmethod
     def forward(
         self,
@@ -142,6 +145,11 @@ class RadianceModel(nn.Module):
     def needs_whole_batch(self) -> bool:
         """Whether any field forbids tiles."""
         return any(level.field.needs_whole_batch for level in self._in_order())
+
+    @property
+    def has_static_shapes(self) -> bool:
+        """Whether no level's shapes depend on what it finds."""
+        return all(level.has_static_shapes for level in self._in_order())
 
     def points_per_ray(self, training: bool) -> float:
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""

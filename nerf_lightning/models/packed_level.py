@@ -25,6 +25,7 @@ ROUND_SAMPLES, MOST_ROUND_SAMPLES = 6, 64
 class PackedLevel(AnyLevel):
     """March, drop what lies behind opaque samples, ask the field, composite."""
 
+    has_static_shapes = False
     tally: Tensor
     measured: Tensor
 

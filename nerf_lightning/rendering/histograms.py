@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels.search import search
+
 
 def sample_histogram(
     edges: Float[Tensor, "*rays edges"],
@@ -31,7 +33,7 @@ def sample_histogram(
     mass = weights + floor
     cdf = torch.cumsum(mass / mass.sum(dim=-1, keepdim=True), dim=-1)
     cdf = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1)
-    bin_index = torch.searchsorted(cdf, u.contiguous(), right=True).sub_(1).clamp_(0, weights.shape[-1] - 1)
+    bin_index = (search(cdf, u, right=True) - 1).clamp(0, weights.shape[-1] - 1)
     below, above = cdf.gather(-1, bin_index), cdf.gather(-1, bin_index + 1)
     left, right = edges.gather(-1, bin_index), edges.gather(-1, bin_index + 1)
     span = above - below

@@ -88,7 +88,7 @@ class OccupancySampler(AnySampler):
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.register_buffer("range", torch.tensor([0.0, 1.0]))
         self._allocate()
-        # Made when first needed from what the buffers hold; reading them stops a GPU, so they are kept.
+        # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
 
@@ -185,13 +185,14 @@ class OccupancySampler(AnySampler):
     @property
     def lattice(self) -> Float[Tensor, "edges"]:
         """The distances that intervals begin at, from the scene's near to beyond its far."""
-        if self._lattice is None or self._lattice.device != self.aabb.device:
+        if self._lattice is None:
             near, far = self.range.tolist()
             edges, step = [near], self.step_size
             while edges[-1] <= far:
                 edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
             edges.append(2 * edges[-1] - edges[-2])
-            self._lattice = torch.tensor(edges, device=self.aabb.device)
+            self._lattice = torch.tensor(edges)
+        self._lattice = self._lattice.to(self.aabb.device)
         return self._lattice
 
     @torch.no_grad()
@@ -205,9 +206,9 @@ class OccupancySampler(AnySampler):
         """
         if step % self.update_every or step == 0:
             return
-        if self._numbers is None or self._numbers.device != self.possible.device:
-            self._numbers = self.possible.flatten().nonzero()[:, 0]
-        number = self._numbers
+        if self._numbers is None:
+            self._numbers = self.possible.flatten().cpu().nonzero()[:, 0]
+        number = self._numbers = self._numbers.to(self.possible.device)
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)

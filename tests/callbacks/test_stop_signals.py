@@ -5,7 +5,7 @@ import signal
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
-from nerf_lightning.callbacks.stop_signals import SIGNALS, StopSignals
+from nerf_lightning.callbacks.stop_signals import StopSignals, stop_signals
 
 
 class Line(LightningModule):
@@ -29,11 +29,11 @@ class Batches:
 
 
 def test_after_a_training_every_signal_does_what_it_did_before(tmp_path):
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before = {number: signal.getsignal(number) for number in stop_signals()}
     trainer = Trainer(
         default_root_dir=tmp_path, max_steps=2, accelerator="cpu", logger=False, callbacks=[StopSignals()],
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
     trainer.fit(Line(), Batches())
     assert trainer.global_step == 2
-    assert {number: signal.getsignal(number) for number in SIGNALS} == before
+    assert {number: signal.getsignal(number) for number in stop_signals()} == before

@@ -139,8 +139,8 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
     [
         ("scene.near=close", "scene.near=close does not fit: it must be a number"),
         ("seed=1.5", "seed=1.5 does not fit"),
-        ("trainer.precision=16-mixed", "it must be auto, 32-true, bf16-mixed"),
-        ("trainer.accelerator=tpu", "trainer.accelerator=tpu does not fit: it must be auto, cpu, gpu"),
+        ("trainer.precision=16-mixed", "it must be auto, 32-true, tf32, bf16-mixed"),
+        ("trainer.accelerator=quantum", "trainer.accelerator=quantum does not fit: it must be auto, cpu, gpu"),
         ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),

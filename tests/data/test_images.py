@@ -197,12 +197,14 @@ def test_refuses_formats_that_start_other_programs(tmp_path):
 
 
 def test_refuses_decompression_bombs(tmp_path, monkeypatch):
-    """PIL only warns up to twice its number, so it is that which we name."""
-    Image.fromarray(picture(0)).save(tmp_path / "a.png")
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 32)
-    assert image_size(tmp_path / "a.png") == (8, 8)
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 31)
-    with pytest.raises(InputError, match=r"a.png has more than 62 pixels"):
+    Image.new("1", (1200, 1000)).save(tmp_path / "a.png")
+    monkeypatch.setenv("NERF_LIGHTNING_MAX_MEGAPIXELS", "2")
+    assert image_size(tmp_path / "a.png") == (1200, 1000)
+    monkeypatch.setenv("NERF_LIGHTNING_MAX_MEGAPIXELS", "1")
+    with pytest.raises(InputError, match=r"a.png announces more than 1 megapixels; .*NERF_LIGHTNING_MAX_MEGAPIXELS"):
+        image_size(tmp_path / "a.png")
+    monkeypatch.setenv("NERF_LIGHTNING_MAX_MEGAPIXELS", "many")
+    with pytest.raises(InputError, match="NERF_LIGHTNING_MAX_MEGAPIXELS is 'many': give a whole number above 0"):
         image_size(tmp_path / "a.png")
 
 

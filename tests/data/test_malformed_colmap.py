@@ -215,7 +215,7 @@ def points_cut_short(root):
     edit_text(root, "points3D.txt", lambda text: text[: text.rindex("\n59 ") + 4])
 
 
-@case("text", r"images.txt is not a text file \(byte 0 is not UTF-8\)")
+@case("text", r"images.txt is not a text file \(it is not UTF-8\)")
 def text_that_is_binary(root):
     (root / MODEL / "images.txt").write_bytes(b"\xff\xfe\x00")
 

@@ -6,14 +6,17 @@ import logging
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from filelock import FileLock
 from jaxtyping import Float, UInt8
 from numpy import ndarray
+
+from nerf_lightning.data.numpy_files import archive_headers, read_member
 
 logger = logging.getLogger(__name__)
 
@@ -61,23 +64,21 @@ def _load(path: Path, pixels: int) -> Rendered | None:
     """Return a sound file's content, or None."""
     if not path.exists():
         return None
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            rendered = Rendered(**{field.name: stored[field.name] for field in fields(Rendered)})
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, error)
-        return None
-    sound = {
+    sound: dict[str, tuple[tuple[int, ...], str]] = {
         "rgba": ((pixels, 4), "uint8"),
         "depth": ((pixels,), "float32"),
         "normals": ((pixels, 3), "float32"),
     }
-    for name, (shape, dtype) in sound.items():
-        array = getattr(rendered, name)
-        if array.shape != shape or array.dtype != dtype:
-            logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, name)
-            return None
-    return rendered
+    try:
+        with zipfile.ZipFile(path) as archive:
+            headers = archive_headers(archive, list(sound))
+            for name, (shape, dtype) in sound.items():
+                if headers[name].shape != shape or headers[name].dtype != dtype:
+                    raise ValueError(f"{name} is {headers[name].shape} of {headers[name].dtype}")
+            return Rendered(**{name: read_member(archive, name) for name in sound})
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile) as error:
+        logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, error)
+        return None
 
 
 def _make_and_save(path: Path, make: Callable[[], Rendered]) -> Rendered:

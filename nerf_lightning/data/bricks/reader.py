@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from rich.progress import Progress
 
+from nerf_lightning.cores import num_cores
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
@@ -151,7 +152,7 @@ def render(cameras: Cameras) -> Rendered:
     step = max(1, CHUNK // (16 * resolution**2))
     chunks = [views[i : i + step] for i in range(0, len(views), step)]
     parts = []
-    with _progress() as progress, ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+    with _progress() as progress, ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
         task = progress.add_task("Rendering the bricks scene (once)", total=len(views))
         for chunk, part in zip(chunks, pool.map(lambda chunk: _render_chunk(tracer, chunk), chunks), strict=True):
             parts.append(part)

@@ -1,0 +1,38 @@
+"""Where a command that does not train writes: as the user says, or beside the checkpoint."""
+
+import os
+from pathlib import Path
+
+from nerf_lightning.commands.links import require_no_way_out
+from nerf_lightning.commands.run_folder import job_folder
+from nerf_lightning.errors import InputError
+
+
+def beside_checkpoint(checkpoint: Path, name: str) -> Path:
+    """Return the folder of this name in the run folder that a checkpoint lies in."""
+    beside = checkpoint.absolute().parent
+    return (beside.parent if beside.name == "checkpoints" else beside) / name
+
+
+def output_folder(given: str | None, default: Path) -> Path:
+    """Return where a command that does not train writes: as given, else by default.
+
+    The jobs of a sweep have folders of their own.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
+    folder = job_folder() or Path(given or default)
+    if given is None:
+        # Beside a checkpoint that may come from anybody.
+        require_no_way_out(default.parent if default.is_symlink() else default)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".{os.getpid()}.probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
+        ) from error
+    return folder

@@ -1,0 +1,73 @@
+"""Yaml from strangers: plain values, without references, of bounded size.
+
+`yaml.safe_load` makes no objects, but twelve lines of anchors and aliases become a billion entries as soon as somebody
+walks through them. No config that this program writes has any.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nerf_lightning.errors import InputError
+
+MOST_CHARACTERS = 1 << 20
+"""A hundred times what a run's config takes."""
+MOST_DEPTH = 50
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """A loader that refuses references and deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it holds references (*name), which are not read from files")
+        self.depth += 1
+        if self.depth > MOST_DEPTH:
+            raise yaml.YAMLError(f"it nests more than {MOST_DEPTH} deep")
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def plain_yaml(text: str, where: str) -> Any:
+    """Return what a yaml text holds.
+
+    Args:
+        text: from a file that anybody may have written.
+        where: file and place, for the message.
+
+    Raises:
+        InputError: it is no yaml, too long, or holds references.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise InputError(f"{where} has {len(text):,} characters of yaml, more than any config of this program. {CURE}")
+    try:
+        return yaml.load(text, Loader=_PlainLoader)
+    except yaml.YAMLError as error:
+        raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {CURE}") from error
+    except Exception as error:  # a date of the 99th month, a number of no digits: PyYAML lets many kinds through
+        raise InputError(f"{where} holds a value that cannot be read ({type(error).__name__}). {CURE}") from error
+
+
+def read_plain_yaml(path: Path) -> Any:
+    """Return what a yaml file holds.
+
+    Raises:
+        InputError: it cannot be read, or `plain_yaml` refuses it.
+    """
+    try:
+        size = path.stat().st_size
+        if size > 4 * MOST_CHARACTERS:
+            raise InputError(f"{path} has {size:,} bytes, more than any config of this program. {CURE}")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}. {CURE}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {CURE}") from error
+    return plain_yaml(text, str(path))
+
+
+CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."

@@ -1,0 +1,51 @@
+"""Which settings make a run what it is, and whether a run of given settings is already there."""
+
+import copy
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.suggestions import flatten
+
+# Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
+NOT_IDENTITY = (
+    *("paths.", "resume", "sweep.", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
+    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
+    *("scene.allow_outside", "scene.max_gigabytes"),
+)
+IDENTITY = ("callbacks.collapse_guard.",)
+# What may differ between two starts of which the second has nothing left to do.
+OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "scene.cache_dir")
+
+
+def run_identity(config: DictConfig) -> dict[str, Any]:
+    """Return the settings that make a run what it is: two of the same identity and length compute the same."""
+    leaves = flatten(config)
+    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
+
+
+def fingerprint(identity: dict[str, Any]) -> str:
+    """Return a short name of an identity."""
+    return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def settings_digest(config: DictConfig) -> str:
+    """Return a short name of everything that a run does, its length and its evaluation included."""
+    resolved = copy.deepcopy(config)
+    OmegaConf.resolve(resolved)
+    return fingerprint({key: value for key, value in flatten(resolved).items() if not key.startswith(OF_ONE_START)})
+
+
+def finished_run(folders: Iterable[Path], config: DictConfig) -> Path | None:
+    """Return the first folder whose run did all that this config asks for, or None."""
+    digest = settings_digest(config)
+    for folder in folders:
+        note = read_note(folder)
+        if note.get("settings") == digest and "finished_at_step" in note:
+            return folder
+    return None

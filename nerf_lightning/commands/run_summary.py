@@ -1,0 +1,71 @@
+"""What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.commands.plain_yaml import read_plain_yaml
+from nerf_lightning.data.json_files import read_json
+from nerf_lightning.errors import InputError
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """A run in one row; None where the folder does not say."""
+
+    folder: Path
+    overrides: dict[str, str]
+    """What was given on the command line, by key."""
+    psnr: float | None
+    ssim: float | None
+    steps: int | None
+    """The step at which the run finished."""
+    seconds: float | None
+    """Time in training, evaluation and film, of all starts but those that were killed."""
+
+
+def read_run(folder: Path) -> RunSummary:
+    """Return what a folder says, finished or not."""
+    note, metrics = read_note(folder), _read_json(folder / "metrics.json")
+    return RunSummary(
+        folder=folder,
+        overrides=by_key(_read_overrides(folder / ".hydra" / "overrides.yaml")),
+        psnr=_number(metrics.get("psnr", note.get("psnr"))),
+        ssim=_number(metrics.get("ssim")),
+        steps=note.get("finished_at_step"),
+        seconds=_number(note.get("seconds")),
+    )
+
+
+def read_note(folder: Path) -> dict[str, Any]:
+    """Return the content of `run.json`, empty where it is missing or damaged."""
+    return _read_json(folder / "run.json")
+
+
+def by_key(overrides: list[str]) -> dict[str, str]:
+    """Return overrides as a mapping; what is given twice holds as given last.
+
+    >>> by_key(["model=nerf_tiny", "seed=0", "seed=1"])
+    {'model': 'nerf_tiny', 'seed': '1'}
+    """
+    return {key: value for key, _, value in (override.partition("=") for override in overrides)}
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = read_json(path)
+    except InputError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _read_overrides(path: Path) -> list[str]:
+    try:
+        content = read_plain_yaml(path)
+    except InputError:
+        return []
+    return [str(override) for override in content] if isinstance(content, list) else []
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None

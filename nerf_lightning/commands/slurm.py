@@ -1,0 +1,36 @@
+"""What Slurm says about this job, and putting the job back into its queue."""
+
+import logging
+import os
+import subprocess
+
+log = logging.getLogger(__name__)
+
+TIMEOUT_SECONDS = 60
+
+
+def slurm_job() -> str | None:
+    """Return the number of the Slurm job that this process belongs to, which stays the same when it is requeued."""
+    array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
+    return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
+
+
+def was_requeued() -> bool:
+    """Tell whether Slurm has started this job before."""
+    return slurm_job() is not None and os.environ.get("SLURM_RESTART_COUNT", "0") not in ("", "0")
+
+
+def requeue() -> None:
+    """Ask Slurm to start this job again; the first of a job's processes asks for all of them."""
+    job = slurm_job()
+    # torchrun numbers its processes itself.
+    if job is None or os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) != "0":
+        return
+    command = ["scontrol", "requeue", job]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=TIMEOUT_SECONDS)
+    except (OSError, subprocess.SubprocessError) as error:
+        reason = getattr(error, "stderr", None) or error
+        log.error("%s failed: %s. Submit the job again by hand; it will go on.", " ".join(command), str(reason).strip())
+    else:
+        log.info("Slurm job %s is queued again and will go on from here", job)

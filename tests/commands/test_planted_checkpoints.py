@@ -1,0 +1,282 @@
+"""Checkpoints from strangers: nothing in them runs, nothing is written where they say, and they fill no memory."""
+
+import os
+import sys
+
+import pytest
+import torch
+import yaml
+from planted import Payload, compress, in_config, many_bytes, peak_of, replace_pickle, write_checkpoint
+from running import said
+
+MEGABYTE = 2**20
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    return write_checkpoint(tmp_path_factory.mktemp("sound") / "last.ckpt")
+
+
+def commands(file, tmp_path, capture):
+    """Every way by which a checkpoint is read."""
+    out = f"paths.output_dir={tmp_path}/out"
+    yield "render", f"ckpt={file}", out
+    yield "eval", f"ckpt={file}", out
+    yield "eval", f"ckpt={file}", "scene=npz", f"scene.path={capture}", out
+    yield "train", "scene=npz", f"scene.path={capture}", "model=nerf_tiny", f"init_from={file}", out
+
+
+def test_a_sound_one_is_rendered(nerf, sound, tmp_path):
+    result = nerf(
+        "render", f"ckpt={sound}", "path.num_frames=1", "path.width=8", "format=frames", f"paths.output_dir={tmp_path}"
+    )
+    assert result.code == 0, result.err
+
+
+PICKLED = [
+    lambda content, payload: content.update(more=payload),
+    lambda content, payload: content["state_dict"].update({"model.x": payload}),
+    lambda content, payload: content["nerf_lightning"].update(config=payload),
+    lambda content, payload: content["nerf_lightning"]["scene"].update(name=payload),
+]
+
+
+@pytest.mark.parametrize("place", PICKLED)
+def test_pickled_calls_do_not_run(nerf, capture, tmp_path, place):
+    mark = tmp_path / "ran"
+    file = write_checkpoint(tmp_path / "a.ckpt", lambda content: place(content, Payload(os.system, f"touch {mark}")))
+    every = list(commands(file, tmp_path, capture))
+    for command in every if place is PICKLED[0] else every[:1]:
+        said(nerf(*command), "a.ckpt", "nothing from a file is executed")
+    assert not mark.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_lpips_weights_does_not_run(nerf, sound, capture, tmp_path):
+    mark, weights = tmp_path / "ran", tmp_path / "weights.pth"
+    for legacy in (False, True):
+        torch.save(
+            {"features.0.weight": Payload(os.system, f"touch {mark}")},
+            weights,
+            _use_new_zipfile_serialization=not legacy,
+        )
+        result = nerf("eval", f"ckpt={sound}", "scene=npz", f"scene.path={capture}",
+                      f"evaluation.lpips_weights={weights}", f"paths.output_dir={tmp_path}/out")  # fmt: skip
+        said(result, "this is not a file of weights")
+    assert not mark.exists()
+
+
+TARGETS = [
+    "builtins.exec",
+    "torch.hub.load",
+    "lightning.pytorch.loggers.csv_logs.os.system",
+    "hydra.utils.instantiate",
+    "nerf_lightning.models.levels.torch.hub.load",
+    "nerf_lightning.encoders.../../evil.Class",
+    "nerf_lightning.commands.train.run",
+    ["os.system"],
+    {"_target_": "os.system"},
+]
+
+
+PLACES = [
+    lambda model, evil: model.update(evil),
+    lambda model, evil: model["levels"].update(extra=evil),
+    lambda model, evil: model["levels"]["fine"]["field"].update(position_encoder=evil),
+    lambda model, evil: model["levels"]["fine"]["field"].update(depth=[1, {"deep": [evil]}]),
+]
+
+
+@pytest.mark.parametrize(
+    ("target", "place"), [*(("os.system", place) for place in PLACES), *((target, PLACES[2]) for target in TARGETS)]
+)
+def test_only_our_own_model_parts_are_built(nerf, sound, tmp_path, target, place):
+    mark = tmp_path / "ran"
+    evil = {"_target_": target, "command": f"touch {mark}"}
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda config: place(config["model"], evil)))
+    said(
+        nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "which is not a model part of this program"
+    )
+    assert not mark.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_lies_beside_the_model_is_not_built(nerf, tmp_path):
+    """Callbacks, loggers and the rest of a recorded config are text."""
+    mark = tmp_path / "ran"
+    evil = {"_target_": "os.system", "command": f"touch {mark}"}
+
+    def plant(config):
+        config |= {part: {"x": dict(evil)} for part in ("callbacks", "logger", "trainer", "path", "data", "loss")}
+        config["scene"] |= evil
+
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(plant))
+    result = nerf(
+        "render",
+        f"ckpt={file}",
+        "path.num_frames=1",
+        "path.width=8",
+        "format=frames",
+        f"paths.output_dir={tmp_path}/out",
+    )
+    assert result.code == 0, result.err
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("value", ["${oc.env:HOME}", "a${oc.env:HOME}", "${oc.create:{}}", "\\${x}"])
+def test_the_environment_is_not_looked_up(nerf, tmp_path, value):
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: c["model"]["levels"]["fine"].update(note=value)))
+    result = nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out")
+    said(result, "holds an interpolation", "which is not read from files")
+    assert os.environ["HOME"] not in result.err.replace(str(tmp_path), "")
+
+
+BAD_YAML = {
+    "aliases": "a: &a [x, x]\n"
+    + "".join(f"{n}: &{n} [*{p}, *{p}]\n" for p, n in zip("abcdefgh", "bcdefghi", strict=True)),
+    "depth": "model: " + "[" * 900 + "]" * 900,
+    "length": "model: '" + "x" * 2_000_000 + "'",
+    "python": "model: !!python/object/apply:os.system ['touch ran']",
+    "date": "model: 2001-99-99",
+    "number": "model: !!int ''",
+    "digits": "model: " + "9" * 10_000,
+    "no mapping": "[1, 2]",
+    "not yaml": "model: [",
+}
+
+
+@pytest.mark.parametrize("text", BAD_YAML.values(), ids=BAD_YAML)
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_a_config_that_is_no_config(nerf, tmp_path, command, text):
+    file = write_checkpoint(tmp_path / "a.ckpt", lambda content: content["nerf_lightning"].update(config=text))
+    words = "it holds references" if "&a" in text else "The config in" if "model" in text else "damaged"
+    said(nerf(command, f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", words)
+    assert not (tmp_path / "out").exists()
+
+
+def camera(**changed):
+    return lambda content: content["nerf_lightning"]["scene"]["cameras"].update(changed)
+
+
+def recorded(**changed):
+    return lambda content: content["nerf_lightning"]["scene"].update(changed)
+
+
+def state(**changed):
+    return lambda content: content["nerf_lightning"].update(changed)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (camera(c2w=torch.zeros(3, 4)), "c2w"),
+        (camera(width=torch.full((6,), 1 << 40)), "width"),
+        (camera(height=torch.full((6,), 1 << 27), width=torch.full((6,), 1 << 27)), "pixels"),
+        (camera(focal=torch.full((6, 2), float("nan"))), "focal, which holds NaN"),
+        (camera(lens="pinhole"), "lens"),
+        (recorded(near=1.0), "near"),
+        (recorded(aabb=torch.zeros(3)), "aabb"),
+        (recorded(background="\x1b[2Jwhite"), "background"),
+        (recorded(space="hyper"), "space"),
+        (recorded(view_names=tuple("abc")), "c2w"),
+        (recorded(splits={"train": (0, 99)}), "splits"),
+        (recorded(splits=[1]), "splits"),
+        (state(precision="transformer-engine"), "precision"),
+        (state(tile_points=-1), "tile_points"),
+        (state(choices=["scene"]), "choices"),
+        (state(config=3), "config"),
+        (state(format=[[["1"]]]), "format list"),
+    ],
+)
+def test_a_garbled_record_is_named(nerf, tmp_path, change, words):
+    file = write_checkpoint(tmp_path / "a.ckpt", change)
+    for command in ("render", "eval"):
+        said(nerf(command, f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_far_to_trust(
+    nerf, tmp_path, monkeypatch
+):
+    def no_way_out(*arguments, **options):
+        raise AssertionError("nothing is fetched")
+
+    monkeypatch.setattr("urllib.request.urlopen", no_way_out)
+    scene = {"cache_dir": f"{tmp_path}/planted", "download": {"url": "https://x/y", "bytes": 3, "sha256": None}}
+    scene |= {"allow_outside": True, "path": f"{tmp_path}/planted/file", "root": f"{tmp_path}/none"}
+    for name in ("bricks", "lego_tiny", "colmap", "transforms", "blender"):
+        file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": name}), scene=scene)
+        result = nerf("eval", f"ckpt={file}", "--cfg=job")
+        assert result.code == 0, result.err
+        (found,) = [yaml.safe_load(result.out)["scene"]]
+        assert "planted" not in str(found), found
+        assert found.get("allow_outside") in (None, False)
+        assert "https://x/y" not in str(found)
+    assert not (tmp_path / "planted").exists()
+
+
+def test_links_beside_a_checkpoint_do_not_lead_out(nerf, sound, tmp_path):
+    outside, run = tmp_path / "outside", tmp_path / "run"
+    outside.mkdir()
+    (run / "checkpoints").mkdir(parents=True)
+    file = run / "checkpoints" / "last.ckpt"
+    file.write_bytes(sound.read_bytes())
+    short = ("path.num_frames=1", "path.width=8", "format=frames")
+    (run / "render").symlink_to(outside)
+    said(nerf("render", f"ckpt={file}", *short), "render is a symbolic link to", "paths.output_dir=DIR")
+    (run / "render").unlink()
+    (run / "render").mkdir()
+    (run / "render" / "video").symlink_to(outside)
+    said(nerf("render", f"ckpt={file}", *short), "video is a symbolic link to", "paths.output_dir=DIR")
+    assert list(outside.iterdir()) == []
+
+
+def bombs(folder):
+    """Small files that ask for much memory, each with words of its refusal."""
+    write_checkpoint(folder / "deflated.ckpt", lambda content: content.update(zeros=torch.zeros(50 * MEGABYTE // 4)))
+    compress(folder / "deflated.ckpt")
+    write_checkpoint(folder / "bytes.ckpt")
+    replace_pickle(folder / "bytes.ckpt", many_bytes(2_000 * MEGABYTE))
+    write_checkpoint(
+        folder / "wide.ckpt", in_config(lambda c: c["model"]["levels"]["fine"]["field"].update(width=30_000))
+    )
+    write_checkpoint(
+        folder / "deep.ckpt", in_config(lambda c: c["model"]["levels"]["fine"]["field"].update(depth=10**7, skip=None))
+    )
+    write_checkpoint(
+        folder / "repeated.ckpt",
+        lambda content: content["state_dict"].update({"model.x": torch.zeros(1).expand(10**9)}),
+    )
+    write_checkpoint(folder / "described.ckpt")
+    replace_pickle(folder / "described.ckpt", b"\x80\x02" + b"]" * 17 * MEGABYTE + b".")
+    return {
+        "deflated": "was made to fill the memory",
+        "bytes": "nothing from a file is executed",
+        "wide": "its config describes a model of",
+        "deep": "give 1 to 100 layers",
+        "repeated": "repeats few numbers",
+        "described": "describes its tensors in",
+    }
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.slow
+def test_bombs_stay_small(tmp_path):
+    expected = bombs(tmp_path)
+    code = (
+        "from nerf_lightning.checkpoints import read_checkpoint\n"
+        "from nerf_lightning.commands.build import load_model\n"
+        "from nerf_lightning.errors import InputError\n"
+        "load_model(read_checkpoint(sys.argv[1]))\n"
+        "# begin\n"
+        "for path in sys.argv[2:]:\n"
+        "    try:\n"
+        "        load_model(read_checkpoint(path))\n"
+        "    except InputError as error:\n"
+        "        print(path.rpartition('/')[2], error)\n"
+    )
+    sound = write_checkpoint(tmp_path / "sound.ckpt")
+    grown, lines = peak_of(code, sound, *[tmp_path / f"{name}.ckpt" for name in expected])
+    for name, words in expected.items():
+        assert [line for line in lines if line.startswith(f"{name}.ckpt") and words in line], (name, lines)
+    assert grown < 100 * MEGABYTE, grown

@@ -1,0 +1,202 @@
+"""Run folders from strangers: what they would repeat, and where their links would make a resumed run write."""
+
+import sys
+
+import pytest
+from omegaconf import OmegaConf
+from running import FAST, said
+
+from nerf_lightning.commands.former_overrides import former_overrides, to_give_again
+from nerf_lightning.commands.links import require_no_way_out
+from nerf_lightning.commands.run_folder import open_run
+from nerf_lightning.errors import InputError
+
+
+@pytest.fixture
+def run(tmp_path):
+    (tmp_path / "run" / ".hydra").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints").mkdir()
+    (tmp_path / "run" / "run.json").write_text('{"fingerprint": "0"}')
+    return tmp_path / "run"
+
+
+def write_overrides(run, *lines):
+    OmegaConf.save(OmegaConf.create(list(lines)), run / ".hydra" / "overrides.yaml")
+
+
+HARMLESS = [
+    "model=fast",
+    "scene=colmap",
+    "+experiment=lego_article",
+    "sampler@model.levels.fine.sampler=occupancy",
+    "scene.root='my data/it\\'s'",
+    "scene.root=../captures/fox",
+    "scene.skip={train:1,val:1,test:8}",
+    "scene.name=null",
+    "optimizer.lr=2e-3",
+    "callbacks=[default]",
+    "~callbacks.monitor",
+    "logger=none",
+    "trainer.max_steps=100",
+    "++data.batch_rays=64",
+    "model.levels.fine.field.skip=null",
+]
+
+
+def test_ordinary_overrides_are_repeated(run):
+    write_overrides(run, *HARMLESS)
+    assert former_overrides(run, [f"resume={run}"]) == HARMLESS
+    assert to_give_again(HARMLESS) == []
+
+
+PLANTED = [
+    "scene._target_=os.system",
+    "+scene._target_=os.system",
+    "++callbacks.evil={_target_:os.system,command:'touch ran'}",
+    "callbacks={evil:{deep:[{_target_:os.system}]}}",
+    "+trainer._args_=[1]",
+    "scene={_target_:os.system}",
+    "hydra.run.dir=/tmp",
+    "hydra.job_logging.formatters.simple={'()':os.system}",
+    "hydra/launcher=evil",
+    "hydra={run:{dir:x}}",
+    "--config-dir=/tmp/evil",
+    "-m",
+    "--multirun",
+    "model=../../../tmp/evil",
+    "scene=/tmp/evil",
+    "+experiment=[fern,../evil]",
+    "encoder@direction_encoder=../evil",
+    "scene.root=${oc.env:HOME}",
+    "scene.root='${oc.env:HOME}'",
+    "seed=1,2",
+    "seed=range(1,9)",
+    "scene.cache_dir=/tmp/elsewhere",
+    "scene.allow_outside=true",
+    "+scene.max_gigabytes=1000",
+    "scene.download.url=https://x/y",
+    "scene={download:{url:https://x/y}}",
+    "scene.path=not_there.npz",
+    "logger.tensorboard.name=../../elsewhere",
+    "not an override",
+    "=",
+    "",
+]
+
+
+@pytest.mark.parametrize("line", PLANTED)
+def test_a_planted_override_is_not_repeated(run, line):
+    write_overrides(run, "seed=0", line)
+    with pytest.raises(InputError, match=r"overrides.yaml holds .* which is not repeated from a file.*type it again"):
+        former_overrides(run, [f"resume={run}"])
+
+
+@pytest.mark.parametrize(
+    "line", ["paths.output_dir=/x", "++paths.root_dir=/x", "resume=auto", "+init_from=/x.ckpt", "paths={root_dir:/x}"]
+)
+def test_what_belongs_to_one_start_is_left_out(run, line):
+    write_overrides(run, line, "seed=1")
+    assert former_overrides(run, []) == ["seed=1"]
+
+
+def test_what_the_user_types_again_is_the_users(run):
+    write_overrides(run, "scene.cache_dir=/x", "seed=1")
+    assert former_overrides(run, [f"resume={run}", "scene.cache_dir=/y"]) == ["seed=1"]
+
+
+def test_the_printed_command_repeats_what_the_folder_does_not(run):
+    lines = ["seed=1", "scene.cache_dir=/x y", "paths.root_dir=/z", "scene.root='${oc.env:HOME}'"]
+    assert to_give_again(lines) == ["'scene.cache_dir=/x y'", """'scene.root='"'"'${oc.env:HOME}'"'"''"""]
+
+
+FILES = {
+    "aliases": "a: &a [x, x]\nb: [*a, *a]\n",
+    "a mapping": "scene: bricks\n",
+    "numbers": "[1, 2]\n",
+    "not yaml": "[",
+    "objects": "!!python/object/apply:os.system ['touch ran']\n",
+    "deep": "[" * 900 + "]" * 900,
+    "long": "- x\n" * 2_000_000,
+    "binary": b"\xff\xfe\x00",
+}
+
+
+@pytest.mark.parametrize("content", FILES.values(), ids=FILES)
+def test_a_file_that_is_no_list_of_overrides(nerf, run, content):
+    (run / ".hydra" / "overrides.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
+    said(nerf("train", f"resume={run}"), "overrides.yaml")
+
+
+@pytest.mark.parametrize("line", ["+callbacks.evil={_target_:os.system,command:'touch MARK'}", "model=../../evil"])
+def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_path, line):
+    mark = tmp_path / "ran"
+    write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST, line.replace("MARK", str(mark)))
+    said(nerf("train", f"resume={run}"), "is not repeated from a file")
+    assert not mark.exists()
+    assert sorted(path.name for path in run.iterdir()) == [".hydra", "checkpoints", "run.json"]
+
+
+@pytest.mark.parametrize(
+    "note", ["[" * 100_000, "{" * 5, '{"fingerprint": ' + "[" * 900 + "]" * 900 + "}", "[1]", "9" * 9999]
+)
+def test_a_garbled_note_is_another_run(nerf, capture, run, note):
+    (run / "run.json").write_text(note)
+    write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
+    said(nerf("train", f"resume={run}"), "is occupied by a run of another config")
+
+
+@pytest.mark.parametrize("content", ["a: &a [x, x]\nb: [*a, *a]\n", "[1]\n", "x: ${oc.env:HOME}\nscene: 3\n"])
+def test_a_garbled_config_is_compared_as_text(nerf, capture, run, content):
+    (run / ".hydra" / "config.yaml").write_text(content)
+    write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
+    said(nerf("train", f"resume={run}"), "run")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
+@pytest.mark.parametrize(
+    "name", ["train.log", "checkpoints", "tensorboard", ".hydra/lock", "images/progress", "metrics.json"]
+)
+def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path, name):
+    victim = tmp_path / "victim"
+    if name in ("checkpoints", "tensorboard", "images/progress"):
+        victim.mkdir()
+    else:
+        victim.write_text("precious")
+    if name == "checkpoints":
+        (run / name).rmdir()
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).symlink_to(victim)
+    with pytest.raises(InputError, match=r"is a symbolic link to .*victim.*Remove the link"):
+        require_no_way_out(run)
+
+
+def test_links_within_a_run_folder_are_fine(run, tmp_path):
+    (run / "checkpoints" / "last.ckpt").write_text("")
+    (run / "checkpoints" / "best.ckpt").symlink_to("last.ckpt")
+    (tmp_path / "link").symlink_to(run)
+    require_no_way_out(tmp_path / "link")
+
+
+def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
+    from configs import composed
+
+    config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
+    open_run(config, 100, None).release()
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "here" / "train.log").symlink_to(tmp_path / "victim")
+    for resume in ("auto", f"{tmp_path}/here"):
+        with pytest.raises(InputError, match="symbolic link"):
+            open_run(composed("train", f"paths.output_dir={tmp_path}/here", f"resume={resume}"), 100, None)
+    assert (tmp_path / "victim").read_text() == "precious"
+
+
+def test_pictures_in_a_run_folder_start_no_program(tmp_path):
+    """PIL's own choice of a decoder would take this for EPS, and start Ghostscript."""
+    from nerf_lightning.commands.finish import _film_progress
+
+    for step in (1, 2):
+        path = tmp_path / "images" / "progress" / f"step_{step}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n(ran) (w) file closefile\nshowpage\n")
+    with pytest.raises(InputError, match=r"step_1.png is not an image that can be read"):
+        _film_progress(tmp_path)

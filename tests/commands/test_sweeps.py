@@ -1,0 +1,165 @@
+"""Sweeps by every launcher and sweeper: what their table says, and how they go on after a stop."""
+
+import csv
+import json
+import os
+import signal
+import time
+
+import pytest
+import torch
+from running import FAST, start
+
+QUICK = (*FAST, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
+
+
+def arguments(capture, folder, *more):
+    return ("train", "-m", "scene=npz", f"scene.path={capture}", *QUICK, f"paths.output_dir={folder}", *more)
+
+
+def finish(process):
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output
+
+
+def run(*words, **options):
+    return finish(start(*words, **options))
+
+
+def table(folder):
+    return list(csv.DictReader((folder / "sweep.csv").read_text().splitlines()))
+
+
+def wait_for_step(folder, step, process):
+    last = folder / "checkpoints" / "last.ckpt"
+    while process.poll() is None:
+        if last.exists() and torch.load(last, weights_only=True)["global_step"] >= step:
+            return
+        time.sleep(0.05)
+    raise AssertionError(process.communicate()[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "parallel", "joblib", "slurm_here"])
+def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, launcher):
+    code, output = run(*arguments(capture, tmp_path, f"hydra/launcher={launcher}", "seed=0,1"))
+    assert code == 0, output
+    assert "Warning" not in output
+    rows = table(tmp_path)
+    psnr = [float(row["PSNR"]) for row in rows]
+    assert psnr == sorted(psnr, reverse=True)
+    assert {row["folder"] for row in rows} == {"0_seed=0", "1_seed=1"}
+    assert list(rows[0]) == ["job", "seed", "PSNR", "SSIM", "steps", "seconds", "state", "folder"]
+    for row in rows:
+        metrics = json.loads((tmp_path / row["folder"] / "metrics.json").read_text())
+        assert (float(row["PSNR"]), float(row["SSIM"])) == (metrics["psnr"], metrics["ssim"])
+        assert (row["steps"], row["state"]) == ("4", "finished")
+        assert float(row["seconds"]) > 0
+    lines = (tmp_path / "sweep.md").read_text().splitlines()
+    assert len(lines) == 4
+    assert f"{psnr[0]:.2f}" in lines[2]
+    assert f"{psnr[0]:.2f}" in output
+
+
+@pytest.mark.slow
+def test_parallel_jobs_share_the_cores(capture, tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cores = len(os.sched_getaffinity(0))
+    code, output = run(*arguments(capture, tmp_path, "hydra/launcher=parallel", "seed=0,1"))
+    assert code == 0, output
+    assert output.count(f"cpu, {max(1, cores // 2)} threads") == 2
+    folder = tmp_path / "slurm"
+    one_core = {"SLURM_CPUS_PER_TASK": "1"}
+    code, output = run(*arguments(capture, folder, "hydra/launcher=parallel", "seed=0,1"), env=one_core)
+    assert output.count("cpu, 1 threads") == 2, output
+
+
+@pytest.mark.slow
+def test_a_search_maximises_the_psnr_and_goes_on_where_it_was(capture, tmp_path):
+    search = ("hydra/sweeper=search", "optimizer.lr=tag(log, interval(1e-4, 1e-2))")
+    code, output = run(*arguments(capture, tmp_path, *search, "hydra.sweeper.n_trials=2"))
+    assert code == 0, output
+    first = table(tmp_path)
+    assert len(first) == 2
+    best = (tmp_path / "optimization_results.yaml").read_text()
+    assert f"best_value: {first[0]['PSNR']}" in best
+    code, output = run("train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "hydra.sweeper.n_trials=3")
+    assert code == 0, output
+    again = table(tmp_path)
+    assert sorted(row["state"] for row in again) == ["finished", "finished before", "finished before"]
+    assert {row["optimizer.lr"] for row in first} < {row["optimizer.lr"] for row in again}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "parallel"])
+def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
+    code, output = run(
+        *arguments(capture, tmp_path, f"hydra/launcher={launcher}", "data.batch_rays=-1,64", "optimizer.lr=1e-3")
+    )
+    assert code == 2, output
+    assert "Traceback" not in output
+    complaint = "1 of 2 jobs failed. 0_data.batch_rays=-1: data.batch_rays=-1: at least one ray is needed."
+    assert complaint in output
+    assert [(row["data.batch_rays"], row["state"]) for row in table(tmp_path)] == [("64", "finished"), ("-1", "failed")]
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
+    longer = ("seed=0,1", "trainer.max_steps=150")
+    process = start(*arguments(capture, tmp_path, *longer))
+    wait_for_step(tmp_path / "1_seed=1", 10, process)
+    process.kill()
+    code, output = finish(process)
+    assert code == -signal.SIGKILL
+    told = next(line for line in output.splitlines() if "after a stop, go on with" in line)
+    command = told.partition("go on with: nerf ")[2].split()
+    assert command == ["train", "-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"]
+    before = json.loads((tmp_path / "0_seed=0" / "run.json").read_text())
+    code, output = run(*command)
+    assert code == 0, output
+    assert "job 0 has finished before" in output
+    assert "going on from step" in output
+    assert json.loads((tmp_path / "0_seed=0" / "run.json").read_text()) == before
+    assert {row["state"] for row in table(tmp_path)} == {"finished before", "finished"}
+    assert {row["steps"] for row in table(tmp_path)} == {"150"}
+
+
+@pytest.mark.slow
+def test_ctrl_c_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
+    longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
+    process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)
+    for folder in ("0_seed=0", "1_seed=1"):
+        wait_for_step(tmp_path / folder, 10, process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    code, output = finish(process)
+    assert code == 130, output
+    assert [row["state"] for row in table(tmp_path)] == ["stopped", "stopped"]
+    assert output.count("stopped at step") == 2
+    assert f"go on with   nerf train -m sweep.resume=true paths.output_dir={tmp_path}" in output
+    assert not (tmp_path / "2_seed=2" / "run.json").exists()
+
+
+@pytest.mark.slow
+def test_sigterm_stops_the_sweep_and_not_only_its_job(capture, tmp_path):
+    process = start(*arguments(capture, tmp_path, "seed=0,1", "trainer.max_steps=100000"))
+    wait_for_step(tmp_path / "0_seed=0", 10, process)
+    process.terminate()
+    code, output = finish(process)
+    assert code == 143, output
+    assert [row["state"] for row in table(tmp_path)] == ["stopped"]
+    assert not (tmp_path / "1_seed=1").exists()
+
+
+@pytest.mark.slow
+def test_a_sweep_is_not_begun_where_one_has_been_but_can_be_extended(nerf, capture, tmp_path):
+    assert nerf(*arguments(capture, tmp_path, "seed=0")).code == 0
+    refused = nerf(*arguments(capture, tmp_path, "seed=0,1"))
+    assert refused.code == 2
+    assert "already holds runs of a sweep. Add sweep.resume=true" in refused.err
+    done = nerf("train", "-m", "seed=1,0", "sweep.resume=true", f"paths.output_dir={tmp_path}")
+    assert done.code == 0, done.err
+    states = {row["seed"]: row["state"] for row in table(tmp_path)}
+    assert states == {"0": "finished before", "1": "finished"}
+    other = nerf("train", "-m", "seed=0", "evaluation.max_views=1", "sweep.resume=true", f"paths.output_dir={tmp_path}")
+    assert other.code == 0, other.err
+    assert table(tmp_path)[0]["state"] == "finished", "another evaluation is not the same job"
