@@ -13,7 +13,7 @@ from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.scoring import Scoring
-from nerf_lightning.commands.shots import Subject
+from nerf_lightning.commands.shots import Subject, lay_path
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.images import read_rgba
@@ -43,6 +43,15 @@ class Finish:
         if config.final.video:
             require_ffmpeg()
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
+
+    def require_film(self, scene: Scene) -> None:
+        """Refuse a path that cannot be laid around the scene.
+
+        Raises:
+            InputError: why not.
+        """
+        if self.path is not None:
+            lay_path(self.path, scene_record(scene))
 
     def __call__(
         self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path

@@ -110,7 +110,7 @@ def make_shots(
         InputError: a camera stands inside of the box, or the path cannot be laid around this capture.
     """
     first = subjects[0].scene
-    cameras = path.cameras(frame_of(first.cameras, first.aabb, to_user=first.to_user, view_names=first.view_names))
+    cameras = lay_path(path, first)
     shots = []
     for subject in subjects:
         scene = subject.scene
@@ -135,6 +135,15 @@ def make_shots(
             )
         )
     return shots
+
+
+def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:
+    """Return the cameras of a path around a scene.
+
+    Raises:
+        InputError: the path cannot be laid there: it names a photograph that is not there, or has no up.
+    """
+    return path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
 
 
 def depth_range(shots: list[Shot]) -> tuple[float, float]:

@@ -77,7 +77,7 @@ class KeyframePath(CameraPath):
         if not times:
             return even_speed(keys, around.radius, self.closed)
         back = [times[-1] + (times[-1] - times[0]) / (len(times) - 1)] if self.closed else []
-        return torch.tensor(times + back).to(keys)
+        return torch.tensor(times + back, dtype=keys.dtype)
 
     def _count(self, knots: Float[Tensor, "knots"]) -> int:
         if self.asked_frames is not None:
@@ -88,7 +88,7 @@ class KeyframePath(CameraPath):
 
     def _zoomed(self, cameras: Cameras, knots: Tensor, at: Tensor, around: PathFrame) -> Cameras:
         """Return the cameras with the keyframes' focal lengths, between them even in ratio."""
-        logs = torch.tensor([[math.log(_focal(each, around))] for each in self.keyframes]).to(knots)
+        logs = torch.tensor([[math.log(_focal(each, around))] for each in self.keyframes], dtype=knots.dtype)
         scale = cameras.width[0] / around.width
         return replace(cameras, focal=(scale * along(knots, logs, at).exp()).expand(-1, 2).contiguous())
 
