@@ -102,7 +102,7 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, *build(config.callbacks).values(), *build(config.viewer).values()]
     if config.budget.seconds is not None:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.

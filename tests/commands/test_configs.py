@@ -17,6 +17,7 @@ BUILT = {
     "loss": "loss",
     "scheduler": "scheduler",
     "callbacks": "callbacks",
+    "viewer": "viewer",
     "path": "path",
     "evaluation": "evaluation",
     "optimizer": "optimizer",
@@ -52,7 +53,7 @@ def test_every_trainer_builds(option):
     assert build(composed("train", f"trainer={option}").trainer).max_steps > 0
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "view"])
 def test_every_command_composes(command):
     assert "trainer" in composed(command)
 
