@@ -19,8 +19,8 @@ COLUMNS = ("name", *METRICS, "seconds")
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return mean, median and worst of each metric, the speed of rendering, and the rows themselves.
 
-    `frames_per_second` is that of the median picture in one process; `peak_memory_gigabytes` the most that a process has
-    held since it began, on a GPU the GPU's.
+    `frames_per_second` is that of the median picture in one process; `peak_memory_gigabytes` the most that a process
+    has held since it began, on a GPU the GPU's.
     """
     values = [{metric: row[metric] for metric in METRICS} for row in rows]
     worst = {

@@ -1,7 +1,7 @@
 """How a number was measured, and of what: stamped into every result, so that only equals are compared.
 
-`measured_how` is the protocol: two results may stand in one table where theirs agree. `measured_of` names the weights and
-the program; it differs from run to run, and tells where a number came from.
+`measured_how` is the protocol: two results may stand in one table where theirs agree. `measured_of` names the weights
+and the program; it differs from run to run, and tells where a number came from.
 """
 
 import hashlib
@@ -124,7 +124,7 @@ def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:
 
 
 def commit() -> str | None:
-    """Return the commit that this program runs from, with `-dirty` where files were changed; None where it is installed."""
+    """Return the commit that this program runs from, `-dirty` where files were changed; None where it is installed."""
     if not (REPOSITORY / ".git").exists():
         return None
     command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
