@@ -69,7 +69,8 @@ class Finish:
 
 
 def _origin(trainer: Trainer, model: RadianceModel, settings: TrainerSettings) -> dict[str, Any]:
-    record = trainer.lightning_module.record
+    system: Any = trainer.lightning_module
+    record = system.record
     return measured_of(model, record["config"], record["choices"], settings.device, settings.precision)
 
 

@@ -2,7 +2,6 @@
 
 import statistics
 from collections.abc import Sequence
-from typing import Literal
 
 from nerf_lightning.commands.protocol import differences
 from nerf_lightning.commands.run_results import RunResult
@@ -11,10 +10,11 @@ from nerf_lightning.commands.table_files import Row
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 
-Order = Literal[
+ORDERS = (
     *("psnr", "ssim", "lpips", "depth_error", "normal_error"),
     *("minutes", "parameters", "megabytes", "frames_per_second", "model"),
-]
+)
+"""What rows may be sorted by."""
 SPREAD = {
     "psnr": "PSNR",
     "ssim": "SSIM",
@@ -82,7 +82,7 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
     return [list(seeds.values()) for seeds in groups.values()], left_out
 
 
-def group_rows(groups: Sequence[Group], order: Order) -> list[Row]:
+def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
     """Return a row per group, by scene and then the best first; settings that all share are left out."""
     keys = dict.fromkeys(key for group in groups for key in group[0].settings)
     shown = [key for key in keys if len({group[0].settings.get(key) for group in groups}) > 1]
@@ -118,7 +118,7 @@ def _spread(group: Group, key: str) -> tuple[float | None, float | None]:
     return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
 
 
-def _rank(group: Group, order: Order) -> tuple[str, bool, float, str]:
+def _rank(group: Group, order: str) -> tuple[str, bool, float, str]:
     first = group[0]
     value = None if order == "model" else _spread(group, order)[0]
     sign = -1.0 if order in HIGH_FIRST else 1.0

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import get_args
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.commands.run_results import FILES, RunResult, find_runs, read_result
 from nerf_lightning.commands.run_table import (
-    Order,
+    ORDERS,
     group_rows,
     group_seeds,
     noted_origins,
@@ -35,7 +34,7 @@ class Gathered:
 
 def tabulate(config: DictConfig) -> int:
     """Do what the config says; return the number of rows."""
-    for key, options in (("measured", tuple(FILES)), ("sort", get_args(Order))):
+    for key, options in (("measured", tuple(FILES)), ("sort", ORDERS)):
         if config[key] not in options:
             raise InputError(f"{key}={config[key]}: choose one of {', '.join(options)}.")
     folders = [Path(str(folder)) for folder in _listed(config.runs)]
