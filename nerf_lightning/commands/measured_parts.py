@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.commands.kept_views import picture_name
 from nerf_lightning.commands.metrics_files import COLUMNS
 from nerf_lightning.commands.run_summary import number
 from nerf_lightning.errors import InputError
@@ -19,7 +20,6 @@ FORMATS = {
     "seconds": "{:.3f}",
 }
 LABELS = {
-    "psnr": "PSNR, mean",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "depth_error": "depth error, scene units",
@@ -32,9 +32,13 @@ MOST_PAIRS = 60
 
 def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     """Return the numbers on top of a page."""
-    shown = [(label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()]
     median, worst = _mapping(metrics.get("median")), _mapping(_mapping(metrics.get("worst")).get("psnr"))
-    shown += [("PSNR, median", _shown("psnr", median.get("psnr"))), ("PSNR, worst", _shown("psnr", worst.get("value")))]
+    shown = [
+        ("PSNR, mean", _shown("psnr", metrics.get("psnr"))),
+        ("PSNR, median", _shown("psnr", median.get("psnr"))),
+        ("PSNR, worst", _shown("psnr", worst.get("value"))),
+        *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
+    ]
     origin = _mapping(metrics.get("origin"))
     for label, value, form in (
         ("frames per second", metrics.get("frames_per_second"), "{:.3g}"),
@@ -68,10 +72,11 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
     rows = {row.get("name"): row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)}
     worst = [str(name) for name in _sequence(metrics.get("worst_views"))][:MOST_VIEWS]
     named = [(f"worst_{place}", name) for place, name in enumerate(worst, start=1)]
-    spread = [str(name) for name in _sequence(metrics.get("pictures"))][:MOST_VIEWS]
+    split = str(_mapping(metrics.get("protocol")).get("split"))
+    spread = [(picture_name(split, name), name) for name in map(str, _sequence(metrics.get("pictures")))][:MOST_VIEWS]
     missing: list[str] = []
     pages: list[list[ViewOnPage]] = []
-    for folders in (named, [(name, name) for name in spread]):
+    for folders in (named, spread):
         pages.append([])
         for folder, name in folders:
             try:
@@ -107,7 +112,9 @@ def _pairs(values: dict[str, Any]) -> Pairs:
 
 
 def _said(value: Any) -> str:
-    return "not known" if value is None else str(value)[:300]
+    if isinstance(value, list):
+        return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)[:300]
+    return "none" if value is None else str(value)[:300]
 
 
 def _mapping(value: object) -> dict[str, Any]:

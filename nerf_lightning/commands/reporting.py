@@ -93,7 +93,7 @@ class Gathering:
         self._try("Config", self._add_config)
 
     def _add_step(self, file: Path) -> None:
-        self.report.steps.append((file.stem.replace("_", " "), embedded_file(file)))
+        self.report.steps.append((f"step {file.stem.partition('_')[2].lstrip('0')}", embedded_file(file)))
 
     def _add_config(self) -> None:
         read_plain_yaml(self.run / ".hydra" / "config.yaml")  # bounded, and a config at all

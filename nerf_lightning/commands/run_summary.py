@@ -31,12 +31,13 @@ class RunSummary:
 def read_run(folder: Path) -> RunSummary:
     """Return what a folder says, finished or not."""
     note, metrics = read_note(folder), read_json_object(folder / "metrics.json")
+    steps = number(note.get("finished_at_step"))
     return RunSummary(
         folder=folder,
         overrides=by_key(_read_overrides(folder / ".hydra" / "overrides.yaml")),
         psnr=number(metrics.get("psnr", note.get("psnr"))),
         ssim=number(metrics.get("ssim")),
-        steps=note.get("finished_at_step"),
+        steps=None if steps is None else int(steps),
         seconds=number(note.get("seconds")),
         started=str(note["started"]) if "started" in note else None,
     )

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 from nerf_lightning.commands.protocol import differences
 from nerf_lightning.commands.run_results import RunResult
-from nerf_lightning.commands.run_summary import number
 from nerf_lightning.commands.table_files import Row
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
@@ -105,7 +104,7 @@ def _row(group: Group, shown: list[str]) -> Row:
     for metric, column in SPREAD.items():
         mean, deviation = _spread(group, metric)
         row |= {column: mean, f"{column} std": deviation}
-    row["steps"] = number(first.summary.steps)
+    row["steps"] = first.summary.steps
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
     return row | {"time": None, "source": None}
 

@@ -9,7 +9,7 @@ from rich.progress import track
 from nerf_lightning import ranks
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.environment import environment
-from nerf_lightning.commands.kept_views import KeptViews, picture_name
+from nerf_lightning.commands.kept_views import KeptViews
 from nerf_lightning.commands.metrics_files import summary, write_metrics
 from nerf_lightning.commands.protocol import measured_how
 from nerf_lightning.errors import InputError
@@ -87,7 +87,7 @@ class Scoring:
                 kept.save(row["name"], shown)
         rows = ranks.in_turn(rows)
         result = summary(rows) | {
-            "pictures": [picture_name(self.split, scene.view_names[view]) for view in dict.fromkeys(spread)],
+            "pictures": [scene.view_names[view] for view in dict.fromkeys(spread)],
             "worst_views": kept.finish(rows),
             "protocol": self.protocol(scene, views, background),
             "origin": origin or {},
