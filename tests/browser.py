@@ -10,9 +10,15 @@ import pytest
 from PIL import Image
 
 FLAGS = (
-    "--headless=new --no-sandbox --disable-dev-shm-usage --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--ignore-gpu-blocklist --no-first-run --disable-background-networking --disable-component-update"
-).split()
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--no-first-run",
+    "--disable-background-networking",
+)
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

@@ -1,7 +1,7 @@
 """One page that holds all of a run and loads nothing: pictures, films, curves and texts, opened from the disk.
 
-All texts may come from anybody's run folder. They are escaped, and the page's policy lets no script run but its own, and
-nothing be fetched.
+All texts may come from anybody's run folder. They are escaped, and the page's policy lets no script run but its own,
+and nothing be fetched.
 """
 
 import base64
