@@ -1,6 +1,7 @@
 """Keyframe files and the curves through them."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -40,20 +41,25 @@ GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
     [
         ("", "has no list of keyframes"),
         ("keyframes: 3", "has no list of keyframes"),
-        ("keyframes: [", "is not valid yaml"),
+        ("keyframes: [", "is not usable yaml"),
         (f"- {GOOD}", r"has 1 keyframe\(s\), and a path needs two"),
         (f"- {GOOD}\n- 7", "keyframe 2 is 7, but must name a position"),
         (f"- {GOOD}\n- {{position: [1, 0]}}", "keyframe 2: position is .1, 0., but must be three finite numbers"),
         (f"- {GOOD}\n- {{position: [1, 0, .nan]}}", "keyframe 2: position is"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], target: [0, 0, 0]}}", "keyframe 2 has the unknown key target"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], target: [0, 0, 0]}}", "keyframe 2 has the unknown key 'target'"),
         (f"- {GOOD}\n- {{position: [1, 0, 0]}}", "keyframe 2 must have a position, and one of look_at and direction"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [1, 0, 0]}}", "keyframe 2 looks nowhere"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: wide}}", "keyframe 2: fov is wide"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: wide}}", "keyframe 2: fov is 'wide'"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 18, focal: 9}}", "both fov and focal"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
-        ("- !!python/object/apply:os.system [ls]", "is not valid yaml"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "keyframe 2: position is"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}", "is not usable yaml"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}", "is not usable yaml"),
+        ("[" * 5000, "is not usable yaml"),
+        ("- &a [x, x]\n" + "".join(f"- &{n} [{', '.join(9 * [f'*{m}'])}]\n" for m, n in pairwise("abcdefghijk")), "is"),
+        ("- !!python/object/apply:os.system [ls]", "is not usable yaml"),
     ],
 )
 def test_a_bad_file_is_named(tmp_path, text, words):
@@ -62,6 +68,7 @@ def test_a_bad_file_is_named(tmp_path, text, words):
         read_keyframes(tmp_path / "keys.yaml")
     assert "keys.yaml" in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1500
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -22,6 +22,8 @@ from nerf_lightning.types import Cameras
 
 # What a camera in front of a scene looks at, in units of the near plane's distance.
 NDC_FOCUS = 5.0
+# Larger numbers overflow when they are squared.
+LARGEST = 1e15
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,12 @@ def is_point(given: object) -> bool:
     >>> is_point([0, 1.5, -2]), is_point([0, 1]), is_point("top")
     (True, False, False)
     """
-    if not isinstance(given, (list, tuple)) or len(given) != 3:
-        return False
-    numbers = [each for each in given if isinstance(each, (int, float)) and not isinstance(each, bool)]
-    return len(numbers) == 3 and all(math.isfinite(number) for number in numbers)
+    return isinstance(given, (list, tuple)) and len(given) == 3 and all(map(is_number, given))
+
+
+def is_number(given: object) -> bool:
+    """Tell whether something is a number that a path can have: finite, and not astronomical."""
+    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) < LARGEST
 
 
 def check_setting(name: str, value: object, good: bool, rule: str) -> None:

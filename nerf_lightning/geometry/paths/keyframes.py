@@ -10,22 +10,23 @@
 `focal` is that of a picture as wide as the photographs, so that it does not depend on the size of the film.
 """
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import yaml
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.paths.base import is_point
+from nerf_lightning.geometry.paths.base import is_number, is_point
 
 Point = tuple[float, float, float]
 POINTS = ("position", "look_at", "direction", "up")
 NUMBERS = ("fov", "focal", "time")
+MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -77,21 +78,16 @@ def read_keyframes(path: Path) -> list[Keyframe]:
         InputError: it cannot be read, is not yaml, has fewer than two keyframes, or one that is no camera.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path} has more than {MOST_BYTES:,} bytes, which is no keyframe file. Check path.file.")
+        keyframes = _keyframes(yaml.safe_load(path.read_text(encoding="utf-8")), path)
     except OSError as error:
         raise InputError(f"The keyframe file {path} cannot be read: {error.strerror}. Check path.file.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:300]
         raise InputError(
-            f"{path} is not valid yaml: {reason}. Mend it; a keyframe file is a list of cameras."
+            f"{path} is not usable yaml: {reason}. Mend it; a keyframe file is a list of cameras."
         ) from error
-    listed = content.get("keyframes") if isinstance(content, dict) else content
-    if not isinstance(listed, list):
-        raise InputError(
-            f"{path} has no list of keyframes. Write `keyframes:` and under it one `- position: [x, y, z]` "
-            "with a look_at or direction for each camera."
-        )
-    keyframes = [_keyframe(each, f"{path}, keyframe {number}") for number, each in enumerate(listed, start=1)]
     if len(keyframes) < 2:
         raise InputError(
             f"{path} has {len(keyframes)} keyframe(s), and a path needs two to lie between. Add more, or use "
@@ -101,18 +97,28 @@ def read_keyframes(path: Path) -> list[Keyframe]:
     return keyframes
 
 
+def _keyframes(content: Any, path: Path) -> list[Keyframe]:
+    found = content.get("keyframes") if isinstance(content, dict) else content
+    if not isinstance(found, list):
+        raise InputError(
+            f"{path} has no list of keyframes. Write `keyframes:` and under it one `- position: [x, y, z]` "
+            "with a look_at or direction for each camera."
+        )
+    return [_keyframe(each, f"{path}, keyframe {number}") for number, each in enumerate(found, start=1)]
+
+
 def _keyframe(content: Any, where: str) -> Keyframe:
     known = (*POINTS, *NUMBERS)
     if not isinstance(content, dict) or not content:
-        raise InputError(f"{where} is {content!r}, but must name a position and a look_at or direction.")
-    unknown = [str(key) for key in content if key not in known]
+        raise InputError(f"{where} is {brief(content)}, but must name a position and a look_at or direction.")
+    unknown = [key for key in content if key not in known]
     if unknown:
-        raise InputError(f"{where} has the unknown key {unknown[0]}. It may have {', '.join(known)}.")
+        raise InputError(f"{where} has the unknown key {brief(unknown[0])}. It may have {', '.join(known)}.")
     for key, value in content.items():
         if key in POINTS and not is_point(value):
-            raise InputError(f"{where}: {key} is {value}, but must be three finite numbers, [x, y, z].")
-        if key in NUMBERS and not _is_number(value):
-            raise InputError(f"{where}: {key} is {value}, but must be a finite number.")
+            raise InputError(f"{where}: {key} is {brief(value)}, but must be three finite numbers, [x, y, z].")
+        if key in NUMBERS and not is_number(value):
+            raise InputError(f"{where}: {key} is {brief(value)}, but must be a finite number.")
     if "position" not in content or ("look_at" in content) == ("direction" in content):
         raise InputError(f"{where} must have a position, and one of look_at and direction.")
     if "fov" in content and "focal" in content:
@@ -125,10 +131,6 @@ def _keyframe(content: Any, where: str) -> Keyframe:
     if found.ahead == (0, 0, 0) or found.up == (0, 0, 0):
         raise InputError(f"{where} looks nowhere: its direction or up has no length, or look_at is its position.")
     return found
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _check_times(path: Path, keyframes: Sequence[Keyframe]) -> None:
