@@ -25,8 +25,12 @@ OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "scene.cache_dir")
 
 def run_identity(config: DictConfig) -> dict[str, Any]:
     """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    leaves = flatten(config)
-    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
+    return {key: value for key, value in flatten(config).items() if is_identity(key)}
+
+
+def is_identity(key: str) -> bool:
+    """Tell whether a setting makes a run what it is."""
+    return key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)
 
 
 def fingerprint(identity: dict[str, Any]) -> str:
