@@ -53,12 +53,8 @@ class PackedLevel(AnyLevel):
         self.sampler.place(scene)
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
-        kept = self.sampler.occupied(positions).nonzero()[:, 0]
-        density = torch.zeros_like(positions[:, 0])
-        if kept.numel():
-            density[kept] = super().density(positions[kept])
-        return density
+        """Return the density in the cells where rays look for it."""
+        return self.sampler.density_in_cells(self.field.density, positions)
 
     def reset_parameters(self) -> None:
         """Draw the field anew and empty the grid."""

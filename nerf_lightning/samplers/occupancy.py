@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
@@ -178,9 +178,13 @@ class OccupancySampler(AnySampler):
         """What is occupied now."""
         return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
 
-    def occupied(self, positions: Float[Tensor, "*points 3"]) -> Bool[Tensor, "*points"]:
-        """Tell which positions lie in occupied cells."""
-        return floor_of_cells(positions, self.grid) >= 0
+    def density_in_cells(self, density_fn: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
+        kept = (floor_of_cells(positions, self.grid) >= 0).nonzero()[:, 0]
+        density = torch.zeros_like(positions[:, 0])
+        if kept.numel():
+            density[kept] = density_fn(positions[kept]).float()
+        return density
 
     @property
     def step_size(self) -> float:

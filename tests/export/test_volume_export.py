@@ -11,11 +11,14 @@ from known_fields import INSIDE, ball, solid
 from scenes import ball_scene, some_rays
 
 from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.volume import VolumeExport
 from nerf_lightning.fields.hash_field import HashField
 from nerf_lightning.geometry.frames import similarity
 from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.masked_level import MaskedLevel
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.samplers.occupancy import OccupancySampler
 
@@ -45,14 +48,13 @@ def test_the_grid_lies_where_the_json_says_in_the_users_units(tmp_path):
     assert (rgb[distance > 1.0] == 0).all()
 
 
-def test_what_rays_pass_by_has_no_density():
+@pytest.mark.parametrize("kind", [PackedLevel, MaskedLevel])
+def test_what_rays_pass_by_has_no_density(kind):
     torch.manual_seed(0)
-    from nerf_lightning.encoders.hash_grid import HashGridEncoder
-    from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 
     encoder = HashGridEncoder(num_levels=2, log2_table_size=8, min_resolution=4, max_resolution=8)
     field = HashField(encoder, SphericalHarmonicsEncoder(), density_bias=3.0)
-    level = PackedLevel(OccupancySampler(resolution=8), field)
+    level = kind(OccupancySampler(resolution=8), field)
     model, points = RadianceModel({"fine": level}).eval(), some_rays(500).origins / 4
     with torch.no_grad():
         assert bool((model.last.density(points) > 0).all())
