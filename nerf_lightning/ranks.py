@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, distributed
+from torch import Tensor, distributed, nn
 
 from nerf_lightning.errors import InputError
 
@@ -60,6 +60,26 @@ def add_up(tensors: Iterable[Tensor]) -> None:
     if world_size() > 1:
         for pending in [distributed.all_reduce(tensor, async_op=True) for tensor in tensors]:
             pending.wait()
+
+
+def add_up_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Replace the gradients by their sums over the ranks, once a step."""
+    if world_size() == 1:
+        return
+    trained = [parameter for parameter in parameters if parameter.requires_grad]
+    for parameter in trained:
+        # Every rank must send the same ones; what no ray of this rank has reached has none yet.
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+    add_up([parameter.grad for parameter in trained if parameter.grad is not None])
+
+
+def average(tensors: Sequence[Tensor]) -> None:
+    """Replace each tensor by its mean over the ranks."""
+    if world_size() > 1:
+        add_up(tensors)
+        for tensor in tensors:
+            tensor /= world_size()
 
 
 def total(tensor: Tensor) -> Tensor:

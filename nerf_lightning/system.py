@@ -1,7 +1,6 @@
 """The one LightningModule: it wires model, loss, optimizer and schedule together, and holds no mathematics."""
 
 import logging
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,10 +14,11 @@ from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import Progress, batch_size
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.ray_errors import RayErrors
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
-from nerf_lightning.optimizers.step_guard import StepGuard
+from nerf_lightning.optimizers.step_guard import StepGuard, first_not_finite
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors, blend
 from nerf_lightning.schedules.base import Schedule
@@ -96,7 +96,7 @@ class RadianceFieldSystem(LightningModule):
             )
         self.guard = StepGuard()
         self.last_step: dict[str, Tensor] = {}
-        self.squared_errors: list[Tensor] = []
+        self.val_errors = RayErrors()
 
     def initialize(self) -> None:
         """Draw the weights of this attempt, a function of (seed, attempt), or take those it starts from."""
@@ -130,12 +130,13 @@ class RadianceFieldSystem(LightningModule):
         num_rays = progress.batch_rays
         share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
         self.last_step = self.accumulate_gradients(batch, self.manual_backward, share)
-        ranks.add_up([self.last_step["losses"], *self._gradients()])
+        ranks.add_up([self.last_step["losses"]])
+        ranks.add_up_gradients(self.model.parameters())
         if self.guard.allows(self.last_step["losses"], self.model.named_parameters()):
             self._update(optimizer)
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
-            self._agree_on_measurements()
+            ranks.average(self.model.measurements())
         if self.sample_budget is not None and (progress.step == 1 or progress.step % BATCH_STEPS == 0):
             points = self.model.points_per_ray(training=True)
             progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
@@ -199,22 +200,6 @@ class RadianceFieldSystem(LightningModule):
             "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
         )
 
-    def _gradients(self) -> list[Tensor]:
-        # Every rank must send the same ones; a parameter that no ray of this rank has reached has none yet.
-        if ranks.world_size() == 1:
-            return []
-        for parameter in self.model.parameters():
-            if parameter.requires_grad and parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-        return [parameter.grad for parameter in self.model.parameters() if parameter.grad is not None]
-
-    def _agree_on_measurements(self) -> None:
-        if ranks.world_size() > 1:
-            measured = self.model.measurements()
-            ranks.add_up(measured)
-            for value in measured:
-                value /= ranks.world_size()
-
     def learn_points_per_ray(self) -> None:
         """Take over how many samples the rays rendered so far have had, where a level measures it."""
         self.model.update(0, 0)
@@ -230,10 +215,7 @@ class RadianceFieldSystem(LightningModule):
 
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
-        names, parameters = zip(*self.model.named_parameters(), strict=True)
-        # One read from the device for all.
-        finite = torch.stack([torch.isfinite(parameter).all() for parameter in parameters]).tolist()
-        return next((name.rpartition(".")[0] for name, good in zip(names, finite, strict=True) if not good), None)
+        return first_not_finite(self.model)
 
     def _require_finite_weights(self) -> None:
         if self.broken_weights():
@@ -249,26 +231,11 @@ class RadianceFieldSystem(LightningModule):
         target = blend(batch.rgba, background)
         for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
             rendering = self._render(batch.rays[tile], None if background is None else background[tile])
-            error = (rendering.rgb - target[tile]).square().mean(dim=-1)
-            self.squared_errors.append(torch.stack([error, batch.weight[tile]]))
+            self.val_errors.add(rendering.rgb, target[tile], batch.weight[tile])
 
     def on_validation_epoch_end(self) -> None:
-        """Log the PSNR of the fixed rays and its standard error (delta method).
-
-        Straight to the loggers, since Lightning would count the step before.
-        """
-        # Masked on the host: on XLA a size that depends on data stops the device.
-        error, weight = torch.cat(self.squared_errors, dim=-1).cpu()
-        error = error[weight > 0].double()
-        self.squared_errors.clear()
-        ones = torch.ones_like(error)
-        count, first, second = ranks.total(torch.stack([ones.sum(), error.sum(), error.square().sum()]))
-        mean = first / count
-        standard_error = ((second / count - mean.square()).clamp(min=0) / (count - 1).clamp(min=1)).sqrt()
-        values = {
-            "val/psnr": float(-10.0 * torch.log10(mean)),
-            "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean),
-        }
+        """Log the PSNR of the fixed rays; straight to the loggers, since Lightning would count the step before."""
+        values = self.val_errors.summary()
         self.log("val/psnr", values["val/psnr"], logger=False, sync_dist=True)
         for logger in self.trainer.loggers:
             logger.log_metrics(values, self.trainer.global_step)

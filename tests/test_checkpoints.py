@@ -42,7 +42,7 @@ def test_an_unknown_lens_is_refused(tmp_path):
 
 def keep_two(folder, bad_steps=(0, 0)):
     """The last two checkpoints of a run, of steps 8 and 7, and the best."""
-    record = make_record(ball_scene(), config="", choices={}) | {"precision": "32", "tile_points": None}
+    record = make_record(ball_scene(), config="", choices={}) | {"precision": "32-true", "tile_points": None}
     for name, step, in_row in (("last", 8, bad_steps[0]), ("previous", 7, bad_steps[1]), ("best", 5, 0)):
         state = {"state_dict": {"model.weight": torch.full((1000,), float(step))}, "global_step": step}
         torch.save(state | {"nerf_lightning": record | {"bad_steps": [in_row, in_row]}}, folder / f"{name}.ckpt")

@@ -55,6 +55,4 @@ def seconds_to_psnr(
 def _psnr(system: RadianceFieldSystem, rays: FixedRays) -> float:
     for number, batch in enumerate(rays):
         system.validation_step(batch.to(system.device), number)
-    error = torch.cat(system.squared_errors).mean()
-    system.squared_errors.clear()
-    return float(-10 * torch.log10(error))
+    return system.val_errors.summary()["val/psnr"]

@@ -14,6 +14,7 @@ from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.protocol import measured_of
 from nerf_lightning.commands.scoring import Scoring
+from nerf_lightning.commands.shots import Subject, lay_path
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.images import read_rgba
@@ -44,6 +45,15 @@ class Finish:
             require_ffmpeg()
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
 
+    def require_film(self, scene: Scene) -> None:
+        """Refuse a path that cannot be laid around the scene.
+
+        Raises:
+            InputError: why not.
+        """
+        if self.path is not None:
+            lay_path(self.path, scene_record(scene))
+
     def __call__(
         self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
     ) -> float | None:
@@ -59,7 +69,8 @@ class Finish:
                 _log_metrics(trainer, metrics)
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
-                video, depth = film(model, scene_record(scene), self.path, scene.background, tile_points, folder)
+                subject = Subject(model, scene_record(scene), scene.background)
+                video, depth = film([subject], self.path, tile_points, folder)
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")

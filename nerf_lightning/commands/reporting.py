@@ -1,6 +1,7 @@
 """`nerf report`: gather what a run folder holds, leave out what cannot be read and say so, write the page."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -89,7 +90,7 @@ class Gathering:
             files if len(files) <= MOST_STEPS else [files[-1 - i * len(files) // MOST_STEPS] for i in range(MOST_STEPS)]
         )
         for file in sorted(chosen):
-            self._try("A picture of the validation", lambda file=file: self._add_step(file))
+            self._try("A picture of the validation", partial(self._add_step, file))
         self._try("Config", self._add_config)
 
     def _add_step(self, file: Path) -> None:
@@ -111,7 +112,7 @@ class Gathering:
         most = int(self.config.max_megabytes * 1e6)
         for name, label in VIDEOS.items():
             if (self.run / name).is_file():
-                self._try("Film", lambda name=name, label=label: self._add_film(name, label, most))
+                self._try("Film", partial(self._add_film, name, label, most))
 
     def _add_film(self, name: str, label: str, most_bytes: int) -> None:
         self.report.videos.append((label, embedded_video(self.run / name, most_bytes)))

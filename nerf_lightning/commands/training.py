@@ -91,6 +91,7 @@ def _build_parts(config: DictConfig) -> Parts:
     settings.prepare_machine()
     finish = Finish.from_config(config)
     scene: Scene = build(config.scene).read()
+    finish.require_film(scene)
     num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
     num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
@@ -104,7 +105,7 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, *build(config.callbacks).values(), *build(config.viewer).values()]
     if config.budget.seconds is not None:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.

@@ -57,7 +57,7 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
-        least = batch_rays if sample_budget is None else batch_rays >> (BATCH_SIZES - 1)
+        least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
         if min(least, val_rays) < ranks.world_size():
             raise InputError(
                 f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "

@@ -17,6 +17,8 @@ class AnyLevel(nn.Module):
     """The contract of a level: one round of sampling and rendering."""
 
     field: Field
+    has_color = True
+    """Whether its rendering is a picture."""
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
@@ -38,6 +40,10 @@ class AnyLevel(nn.Module):
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
         self.field.place(scene)
+
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as rendering sees it."""
+        return self.field.density(positions).float()
 
     def counts(self) -> list[Tensor]:
         """Return the buffers in which a training step counts, to put them back where a step is repeated."""
@@ -134,6 +140,12 @@ class RadianceModel(nn.Module):
         return tuple(self.levels)
 
     @property
+    def first_picture(self) -> int | None:
+        """The number of the first level whose rendering is a picture, where it is not the last one."""
+        numbers = [number for number, level in enumerate(self._in_order()) if level.has_color]
+        return numbers[0] if len(numbers) > 1 else None
+
+    @property
     def needs_whole_batch(self) -> bool:
         """Whether any field forbids tiles."""
         return any(level.field.needs_whole_batch for level in self._in_order())
@@ -149,6 +161,11 @@ class RadianceModel(nn.Module):
         for level in self._in_order():
             counts.append(level.points_per_ray(counts[-1], training))
         return max(counts)
+
+    @property
+    def last(self) -> AnyLevel:
+        """The level whose picture counts."""
+        return self._in_order()[-1]
 
     def forward(
         self,

@@ -52,6 +52,14 @@ class PackedLevel(AnyLevel):
         super().place(scene)
         self.sampler.place(scene)
 
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
+        kept = self.sampler.occupied(positions).nonzero()[:, 0]
+        density = torch.zeros_like(positions[:, 0])
+        if kept.numel():
+            density[kept] = super().density(positions[kept])
+        return density
+
     def reset_parameters(self) -> None:
         """Draw the field anew and empty the grid."""
         super().reset_parameters()

@@ -62,3 +62,11 @@ class StepGuard:
     def restore(self, state: list[int], device: torch.device) -> None:
         """Take the counts up again."""
         self.counts = torch.tensor(state, device=device)
+
+
+def first_not_finite(model: nn.Module) -> str | None:
+    """Return the first module whose weights are not all finite numbers, or None."""
+    names, parameters = zip(*model.named_parameters(), strict=True)
+    # One read from the device for all.
+    finite = torch.stack([torch.isfinite(parameter).all() for parameter in parameters]).tolist()
+    return next((name.rpartition(".")[0] for name, good in zip(names, finite, strict=True) if not good), None)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
@@ -13,6 +13,7 @@ from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
+from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
@@ -176,6 +177,10 @@ class OccupancySampler(AnySampler):
     def grid(self) -> OccupancyCells:
         """What is occupied now."""
         return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
+
+    def occupied(self, positions: Float[Tensor, "*points 3"]) -> Bool[Tensor, "*points"]:
+        """Tell which positions lie in occupied cells."""
+        return floor_of_cells(positions, self.grid) >= 0
 
     @property
     def step_size(self) -> float:

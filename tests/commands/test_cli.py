@@ -30,7 +30,7 @@ def test_help_of_a_command_lists_groups_and_examples(nerf, command):
     assert result.code == 0
     assert "Examples:" in result.out
     assert f"nerf {command}" in result.out
-    assert "trainer: auto, cpu, gpu" in result.out
+    assert "trainer: auto, cpu, ddp, gpu" in result.out
 
 
 def test_an_unknown_command_has_a_near_match(nerf):
