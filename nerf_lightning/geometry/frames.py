@@ -107,6 +107,18 @@ def points_from_user(points: Float[Tensor, "points 3"], to_user: Float[Tensor, "
     return (points - to_user[:3, 3]) @ rotation / unit_of(to_user)
 
 
+def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "*points 3"]:
+    """Return points of the working frame in the user's frame."""
+    return points @ to_user[:3, :3].mT + to_user[:3, 3]
+
+
+def directions_to_user(
+    directions: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]
+) -> Float[Tensor, "*points 3"]:
+    """Return directions of the working frame in the user's frame, of the same length."""
+    return directions @ to_user[:3, :3].mT / unit_of(to_user)
+
+
 def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
     """Return how many of the user's units make one of the scene's."""
     return float(torch.linalg.det(to_user[:3, :3])) ** (1 / 3)

@@ -30,14 +30,14 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*views 4"]) -> Float[Ten
 
 
 def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Tensor, "*views 4"]:
-    """Return the unit quaternion w, x, y, z of a rotation; of either sign.
+    """Return the unit quaternion w, x, y, z (w not negative) of a rotation; the inverse of `rotation_from_quaternion`.
 
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), so no case is special.
+    It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (AIAA 00-4101, 2000), so no case is special.
 
-    >>> quaternion_from_rotation(torch.eye(3)).abs().tolist()
-    [1.0, 0.0, 0.0, 0.0]
+    >>> quaternion_from_rotation(torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])).abs()  # a quarter turn around z
+    tensor([0.7071, 0.0000, 0.0000, 0.7071])
     """
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(dim=-1) for row in rotation.unbind(dim=-2))
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(dim=-1) for row in rotation.double().unbind(dim=-2))
     rows = [
         [a + e + i, h - f, c - g, d - b],
         [h - f, a - e - i, b + d, c + g],
@@ -45,7 +45,8 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Ten
         [d - b, c + g, f + h, i - a - e],
     ]
     matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    return torch.linalg.eigh(matrix)[1][..., -1]
+    vector = torch.linalg.eigh(matrix)[1][..., -1]
+    return torch.where(vector[..., :1] < 0, -vector, vector).to(rotation)
 
 
 def look_at(

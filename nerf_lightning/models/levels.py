@@ -41,6 +41,10 @@ class AnyLevel(nn.Module):
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
         self.field.place(scene)
 
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as rendering sees it."""
+        return self.field.density(positions).float()
+
     def counts(self) -> list[Tensor]:
         """Return the buffers in which a training step counts, to put them back where a step is repeated."""
         return []
@@ -157,6 +161,11 @@ class RadianceModel(nn.Module):
         for level in self._in_order():
             counts.append(level.points_per_ray(counts[-1], training))
         return max(counts)
+
+    @property
+    def last(self) -> AnyLevel:
+        """The level whose picture counts."""
+        return self._in_order()[-1]
 
     def forward(
         self,

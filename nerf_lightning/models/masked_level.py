@@ -34,6 +34,10 @@ class MaskedLevel(AnyLevel):
         super().place(scene)
         self.sampler.place(scene)
 
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in the cells where rays look for it."""
+        return self.sampler.density_in_cells(self.field.density, positions)
+
     def reset_parameters(self) -> None:
         """Draw the field anew and empty the grid."""
         super().reset_parameters()

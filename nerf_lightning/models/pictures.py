@@ -55,14 +55,10 @@ def render_picture(
         clip: what of the scene is shown; None: all.
         seen_from: cameras from whose directions the colour is looked up, in place of the view's own.
     """
-    device = next(model.parameters()).device
     rays, straight = view_rays(cameras, view, near, far, clip)
     if seen_from is not None:
         rays = replace(rays, view_directions=view_rays(seen_from, view, near, far)[1].view_directions)
-    if clip is None:
-        columns = _render_rays(model, rays.map(_flat), background, tile_points, device)
-    else:
-        columns = _render_shown(model, rays.map(_flat), background, tile_points, device)
+    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
     shape = rays.near.shape
     rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
     if cameras.ndc is not None:
@@ -91,10 +87,12 @@ def _flat(picture: Tensor) -> Tensor:
     return picture.flatten(0, 1)
 
 
-def _render_shown(
-    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int, device: torch.device
-) -> list[Tensor]:
-    """Render the rays of which something is left; behind the others is the background."""
+@torch.no_grad()
+def render_rays(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+    """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
+
+    Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
+    """
     count = rays.near.numel()
     behind = background_colors(background, count, torch.device("cpu"), random=None)
     empty = torch.zeros(count, 3) if behind is None else behind
@@ -103,15 +101,14 @@ def _render_shown(
         columns.append(empty.clone())
     shown = (rays.far > rays.near).nonzero()[:, 0]
     if shown.numel():
-        rendered = _render_rays(model, rays[shown], background, tile_points, device)
+        rendered = _render_all(model, rays[shown], background, tile_points)
         for column, part in zip(columns, rendered, strict=True):
             column[shown.cpu()] = part.to(column)
     return columns
 
 
-def _render_rays(
-    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int, device: torch.device
-) -> list[Tensor]:
+def _render_all(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+    device = next(model.parameters()).device
     at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)

@@ -13,6 +13,7 @@ from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
+from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
@@ -176,6 +177,14 @@ class OccupancySampler(AnySampler):
     def grid(self) -> OccupancyCells:
         """What is occupied now."""
         return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
+
+    def density_in_cells(self, density_fn: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
+        kept = (floor_of_cells(positions, self.grid) >= 0).nonzero()[:, 0]
+        density = torch.zeros_like(positions[:, 0])
+        if kept.numel():
+            density[kept] = density_fn(positions[kept]).float()
+        return density
 
     @property
     def step_size(self) -> float:

@@ -8,6 +8,7 @@ from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.build import build
+from nerf_lightning.export.base import Export
 from nerf_lightning.geometry.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = {
@@ -17,6 +18,7 @@ BUILT = {
     "loss": "loss",
     "scheduler": "scheduler",
     "callbacks": "callbacks",
+    "viewer": "viewer",
     "path": "path",
     "evaluation": "evaluation",
     "optimizer": "optimizer",
@@ -52,7 +54,12 @@ def test_every_trainer_builds(option):
     assert build(composed("train", f"trainer={option}").trainer).max_steps > 0
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench"])
+@pytest.mark.parametrize("option", options("what"))
+def test_every_export_builds(option):
+    assert isinstance(build(composed("export", f"what={option}").what), Export)
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view"])
 def test_every_command_composes(command):
     assert "trainer" in composed(command)
 
@@ -67,7 +74,7 @@ def targets(node, path=""):
 
 
 @pytest.mark.parametrize(
-    "group", ["encoder", "field", "sampler", "loss", "scheduler", "scene", "path", "evaluation", "trainer"]
+    "group", ["encoder", "field", "sampler", "loss", "scheduler", "scene", "path", "evaluation", "trainer", "what"]
 )
 def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
     """The signature is the schema: a setting that exists can be seen in the yaml, and no key is read by nobody."""

@@ -1,0 +1,40 @@
+"""The contract of an export: a model in, files out, in the user's own frame."""
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.errors import InputError
+from nerf_lightning.models.levels import RadianceModel
+
+
+class Export(ABC):
+    """Write what a model has learnt as files for other programs."""
+
+    @abstractmethod
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write files into `folder` and return where they are.
+
+        Args:
+            model: in evaluation mode.
+            record: the scene that it was trained on.
+            folder: is there, and can be written.
+            tile_points: most points that go through a field at once.
+
+        Raises:
+            InputError: a setting that makes no sense, or a model in which there is nothing to export.
+        """
+
+
+def refuse_ndc(record: SceneRecord, what: str) -> None:
+    """Refuse a scene whose field lives in normalised device coordinates.
+
+    Raises:
+        InputError: it does.
+    """
+    if record.space == "ndc":
+        raise InputError(
+            f"what={what}: {record.name} was trained in normalised device coordinates (scene.space=ndc), where the "
+            "density of a place depends on how far away it is, and far things have no box. Use what=points or "
+            "what=images, which take the depth back to the world, or train again with scene.space=contracted."
+        )

@@ -1,0 +1,86 @@
+"""The cameras, in the user's frame, as other programs read them."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.base import Export
+from nerf_lightning.export.colmap_files import beyond_colmap, colmap_files
+from nerf_lightning.geometry.frames import poses_from_user
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.types import Cameras, LensModel
+
+CAMERA_MODELS: dict[LensModel, str] = {
+    "pinhole": "PINHOLE",
+    "radial_tangential": "OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+}
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+log = logging.getLogger(__name__)
+
+
+class CamerasExport(Export):
+    """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the pictures of the training.
+
+    Args:
+        images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
+    """
+
+    def __init__(self, images: str | None = None):
+        self.images = images
+
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the files."""
+        cameras = in_user_frame(record)
+        transforms = folder / "transforms.json"
+        with whole_file(transforms) as part:
+            part.write_text(json.dumps(self._transforms(record, cameras), indent=2) + "\n", encoding="utf-8")
+        reason = beyond_colmap(cameras)
+        if reason:
+            log.warning("%s No COLMAP model is written, only transforms.json.", reason)
+            return [transforms]
+        sparse = folder / "sparse" / "0"
+        for name, text in colmap_files(cameras, record.view_names).items():
+            with whole_file(sparse / name) as part:
+                part.write_text(text, encoding="utf-8")
+        return [transforms, sparse]
+
+    def _transforms(self, record: SceneRecord, cameras: Cameras) -> dict[str, Any]:
+        prefix = f"{self.images.rstrip('/')}/" if self.images else ""
+        names = [prefix + name for name in record.view_names]
+        frames = [_frame(cameras, view, name) for view, name in enumerate(names)]
+        content: dict[str, Any] = {"camera_model": CAMERA_MODELS[cameras.lens_model], "frames": frames}
+        if record.splits.get("train") and (record.splits.get("val") or record.splits.get("test")):
+            for split, views in record.splits.items():
+                content[f"{split}_filenames"] = [names[view] for view in views]
+        return content
+
+
+def in_user_frame(record: SceneRecord) -> Cameras:
+    """Return the cameras as the user's frame has them, in float64."""
+    cameras = record.cameras.map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
+    back = torch.linalg.inv(record.to_user.double())
+    changed = dict(vars(cameras)) | {"c2w": poses_from_user(cameras.c2w, back), "ndc": None}
+    return Cameras(**changed)
+
+
+def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
+    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
+    bent = {} if cameras.lens_model == "pinhole" else dict(zip(COEFFICIENTS, cameras.lens[view].tolist(), strict=True))
+    return {
+        "file_path": name,
+        "w": int(cameras.width[view]),
+        "h": int(cameras.height[view]),
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        **bent,
+        "transform_matrix": [*cameras.c2w[view].tolist(), [0.0, 0.0, 0.0, 1.0]],
+    }

@@ -1,0 +1,114 @@
+"""Depth, opacity and normals of the views, as pictures and arrays."""
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+from torch import Tensor
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.data.images import ENDINGS
+from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.base import Export
+from nerf_lightning.export.pictures import save_png, to_bytes
+from nerf_lightning.export.seen_views import SeenView, see, spread
+from nerf_lightning.geometry.cameras import camera_coordinates
+from nerf_lightning.geometry.frames import directions_to_user, unit_of
+from nerf_lightning.models.levels import RadianceModel
+
+DepthKind = Literal["distance", "z"]
+Split = Literal["train", "val", "test", "all"]
+# Pixels that stop less light have no depth.
+OPAQUE = 0.5
+LARGEST = 65_535
+
+
+class ImagesExport(Export):
+    """Write folders of pictures: `depth` (16-bit PNG, and float32 .npy), `opacity`, `normals`, and `images.json`.
+
+    Args:
+        split: the views.
+        max_views: most of them, spread over all; None: all.
+        depth: `distance` along the pixel's ray, or `z` along the camera's axis.
+    """
+
+    def __init__(self, split: Split = "test", max_views: int | None = None, depth: DepthKind = "distance"):
+        if max_views is not None and max_views < 1:
+            raise InputError(f"what.max_views={max_views}: give at least one view, or null for all.")
+        self.split, self.max_views, self.depth = split, max_views, depth
+
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
+        views = self._views(record)
+        names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
+        farthest = 0.0
+        with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
+            for number, view in enumerate(views):
+                seen = see(model, record, record.cameras, view, tile_points)
+                depth = self._depth(seen, record, view)
+                with whole_file(folder / "depth" / f"{names[view]}.npy") as part:
+                    np.save(part, depth)
+                farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
+                _save_opacity(folder / "opacity" / f"{names[view]}.png", seen.opacity)
+                normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
+                save_png(folder / "normals" / f"{names[view]}.png", to_bytes(normals))
+                report("pictures", (number + 1) / len(views))
+            scale = farthest / LARGEST or 1.0
+            for number, view in enumerate(views):
+                _save_depth(folder / "depth", names[view], scale)
+                report("depth", (number + 1) / len(views))
+        about = folder / "images.json"
+        with whole_file(about) as part:
+            part.write_text(json.dumps(self._described(record, names, scale), indent=2) + "\n", encoding="utf-8")
+        return [*(folder / name for name in ("depth", "opacity", "normals")), about]
+
+    def _views(self, record: SceneRecord) -> list[int]:
+        everything = tuple(range(len(record.view_names)))
+        views = everything if self.split == "all" else record.splits.get(self.split, ())
+        if not views:
+            raise InputError(f"{record.name} has no {self.split} views. Choose another split with what.split=...")
+        return spread(views, self.max_views or len(views))
+
+    def _depth(self, seen: SeenView, record: SceneRecord, view: int) -> Float[ndarray, "height width"]:
+        depth = seen.depth
+        if self.depth == "z":
+            depth = -camera_coordinates(record.cameras, view, seen.points)[..., 2]
+        opaque = (seen.opacity > OPAQUE) & depth.isfinite()
+        return torch.where(opaque, unit_of(record.to_user.double()) * depth.double(), torch.nan).float().numpy()
+
+    def _described(self, record: SceneRecord, names: dict[int, str], scale: float) -> dict[str, Any]:
+        along = "along the pixel's ray" if self.depth == "distance" else "along the camera's axis"
+        return {
+            "scene": record.name,
+            "depth": f"{along}, from the camera, in the capture's units; .npy: NaN where nothing is; .png: times "
+            "depth_scale, 0 where nothing is",
+            "depth_scale": scale,
+            "opacity": "8 bits, 255 is opaque",
+            "normals": "8 bits, (n + 1) / 2, in the capture's axes, facing the camera",
+            "views": {record.view_names[view]: name for view, name in names.items()},
+        }
+
+
+def _plain(name: str) -> str:
+    # A name comes from a file: no folders in it, and no ending of a photograph.
+    plain = name.replace("/", "_").replace("\\", "_")
+    return plain[: -len(Path(plain).suffix)] if Path(plain).suffix.lower() in ENDINGS else plain
+
+
+def _save_opacity(path: Path, opacity: Float[Tensor, "height width"]) -> None:
+    grey = to_bytes(opacity[..., None].expand(-1, -1, 3))[..., 0]
+    with whole_file(path) as part:
+        Image.fromarray(grey.contiguous().numpy()).save(part, format="PNG")
+
+
+def _save_depth(folder: Path, name: str, scale: float) -> None:
+    depth = np.nan_to_num(np.load(folder / f"{name}.npy"), nan=0.0)
+    with whole_file(folder / f"{name}.png") as part:
+        Image.fromarray(np.rint(depth / scale).astype(np.uint16)).save(part, format="PNG")

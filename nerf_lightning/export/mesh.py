@@ -1,0 +1,139 @@
+"""A mesh of the surface: marching cubes on the density, cleaned, coloured, in the user's frame."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.base import Export, refuse_ndc
+from nerf_lightning.export.components import without_floaters
+from nerf_lightning.export.lattice import require_resolution, sample_density
+from nerf_lightning.export.marching import marching_cubes
+from nerf_lightning.export.mesh_files import MeshFormat, save_mesh
+from nerf_lightning.export.mesh_libraries import require_library
+from nerf_lightning.export.seen_faces import seen_faces
+from nerf_lightning.export.surface_colors import SeenFrom, surface_colors
+from nerf_lightning.export.surface_level import surface_level
+from nerf_lightning.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.models.levels import RadianceModel
+
+# The density's grid, and as much again for the mesh.
+BYTES_PER_POINT = 8
+# So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
+RATIO = 10.0
+# A guess at how the time is shared; the bar corrects itself.
+COSTS = {"density": 6.0, "surface": 2.0, "views": 6.0, "colours": 4.0}
+
+log = logging.getLogger(__name__)
+
+
+class MeshExport(Export):
+    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box.
+
+    Args:
+        resolution: cells along the longest side of the box.
+        threshold: density per scene unit at the surface; None: where rendering sees it (`surface_level`).
+        colors: seen from the nearest cameras, or along the surface's normal.
+        min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
+        seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
+        faces: most faces, reached by decimation; None keeps all.
+        format: of the file.
+    """
+
+    def __init__(
+        self,
+        resolution: int = 256,
+        threshold: float | None = None,
+        colors: SeenFrom = "cameras",
+        min_share: float = 0.01,
+        seen_only: bool = True,
+        faces: int | None = None,
+        format: MeshFormat = "ply",
+    ):
+        if threshold is not None and not threshold > 0:
+            raise InputError(f"what.threshold={threshold}: give a density above 0, or null to take it from the data.")
+        if not 0 <= min_share <= 1:
+            raise InputError(f"what.min_share={min_share}: give a share from 0 (all is kept) to 1 (the largest part).")
+        if faces is not None and faces < 4:
+            raise InputError(f"what.faces={faces}: a closed mesh has 4 or more; null keeps all.")
+        self.resolution, self.threshold, self.colors = resolution, threshold, colors
+        self.min_share, self.seen_only, self.faces, self.format = min_share, seen_only, faces, format
+
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the mesh."""
+        refuse_ndc(record, "mesh")
+        trimesh = require_library("trimesh")
+        lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
+        with StageProgress(COSTS) as report:
+            density = sample_density(model, lattice, tile_points, report)
+            if record.space == "bounded":
+                _close(density)
+            level = self._level(model, record, density, tile_points)
+            _to_log_ratio(density, level)
+            vertices, faces = marching_cubes(density, 0.0, report)
+            del density
+            vertices = lattice.to_scene(vertices)
+            if self.seen_only:
+                faces = seen_faces(model, record, vertices, faces, tile_points, report)
+            vertices, faces = self._cleaned(vertices, faces)
+            normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
+            points, outward = (torch.from_numpy(each).float() for each in (vertices, normals))
+            # Two cells to each side: so far the surface may be off.
+            reach = 2.0 * lattice.spacing
+            colors = surface_colors(model, record, points, outward, reach, self.colors, tile_points, report)
+        path, to_user = folder / f"mesh.{self.format}", record.to_user.double()
+        placed = points_to_user(torch.from_numpy(vertices), to_user)
+        turned = directions_to_user(torch.from_numpy(normals), to_user)
+        save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy())
+        log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
+        return [path]
+
+    def _level(
+        self, model: RadianceModel, record: SceneRecord, density: Float[ndarray, "x y z"], tile_points: int
+    ) -> float:
+        level = self.threshold or surface_level(model, record, tile_points)
+        lowest, highest = float(density.min()), float(density.max())
+        if level is not None and lowest < level < highest:
+            return level
+        found = f"the densities of its box go from {lowest:.3g} to {highest:.3g} per scene unit"
+        if level is None:
+            raise InputError(
+                f"There is no surface to export: {found}, and no training view of {record.name} sees anything opaque "
+                "there. Train longer, or say with what.threshold=DENSITY what counts as the surface."
+            )
+        raise InputError(
+            f"There is no surface in {record.name} where the density is {level:.3g}: {found}. Give what.threshold="
+            "DENSITY between the two, or train longer."
+        )
+
+    def _cleaned(
+        self, vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
+    ) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"]]:
+        vertices, faces, removed = without_floaters(vertices, faces, self.min_share)
+        if removed:
+            log.info("%d floaters removed, each below %g of the largest part", removed, self.min_share)
+        if self.faces is None or len(faces) <= self.faces:
+            return vertices, faces
+        decimation = require_library("fast_simplification")
+        few, kept = decimation.simplify(vertices, faces.astype(np.int32), target_count=self.faces)
+        return np.asarray(few, np.float64), np.asarray(kept, np.int64)
+
+
+def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
+    """Replace densities by log(density / level), bounded: they grow by factors, and so their logarithm is straight."""
+    density /= level
+    np.clip(density, 1.0 / RATIO, RATIO, out=density)
+    np.log(density, out=density)
+
+
+def _close(density: Float[ndarray, "x y z"]) -> None:
+    """Empty the outermost points: nothing lies outside of a bounded scene's box, and the surface is closed there."""
+    for axis in range(3):
+        faces = np.moveaxis(density, axis, 0)
+        faces[0] = faces[-1] = 0.0

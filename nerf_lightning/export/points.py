@@ -1,0 +1,114 @@
+"""A coloured point cloud with normals, from the rendered depth of the training views."""
+
+import logging
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.base import Export
+from nerf_lightning.export.pictures import to_bytes
+from nerf_lightning.export.point_file import save_points
+from nerf_lightning.export.seen_views import SeenView, at_most, nearest_views, num_agreeing, see, spread
+from nerf_lightning.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.models.levels import RadianceModel
+
+# So many of the nearest other views are asked whether they agree.
+NEIGHBOURS = 8
+COSTS = {"depth": 10.0, "agreement": 1.0}
+
+log = logging.getLogger(__name__)
+
+
+class PointsExport(Export):
+    """Write `points.ply`: a point per pixel of the training views, those removed that other views do not confirm.
+
+    Args:
+        num_points: most points; of more, some are drawn.
+        max_views: most training views that are rendered.
+        longest: pixels of the longer side of what is rendered, at most.
+        min_opacity: share of the light that a pixel must stop.
+        agreement: so many of the nearest 8 other views must see the same surface.
+        tolerance: share of the distance by which their depths may differ.
+    """
+
+    def __init__(
+        self,
+        num_points: int = 1_000_000,
+        max_views: int = 100,
+        longest: int = 400,
+        min_opacity: float = 0.9,
+        agreement: int = 2,
+        tolerance: float = 0.01,
+    ):
+        for name, value, least in (
+            ("num_points", num_points, 1),
+            ("max_views", max_views, 1),
+            ("longest", longest, 2),
+            ("agreement", agreement, 0),
+        ):
+            if value < least:
+                raise InputError(f"what.{name}={value}: give {least} or more.")
+        if agreement > NEIGHBOURS:
+            raise InputError(f"what.agreement={agreement}: {NEIGHBOURS} other views are asked, so give at most that.")
+        if not 0 <= min_opacity < 1:
+            raise InputError(f"what.min_opacity={min_opacity}: give a share of the light, from 0 to below 1.")
+        if not tolerance > 0:
+            raise InputError(f"what.tolerance={tolerance}: give a share of the distance, above 0.")
+        self.num_points, self.max_views, self.longest = num_points, max_views, longest
+        self.min_opacity, self.agreement, self.tolerance = min_opacity, agreement, tolerance
+
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the cloud."""
+        cameras = at_most(record.cameras, self.longest)
+        views = spread(record.splits["train"], self.max_views)
+        with StageProgress(COSTS) as report:
+            seen: dict[int, SeenView] = {}
+            for number, view in enumerate(views):
+                seen[view] = see(model, record, cameras, view, tile_points)
+                report("depth", (number + 1) / len(views))
+            opaque = {view: (each.opacity > self.min_opacity) & each.depth.isfinite() for view, each in seen.items()}
+            depths = {view: torch.where(opaque[view], each.depth, torch.inf) for view, each in seen.items()}
+            least = min(self.agreement, len(views) - 1)
+            found = []
+            for number, view in enumerate(views):
+                cloud = _cloud(seen[view], opaque[view])
+                others = nearest_views(cameras, view, views, NEIGHBOURS)
+                count = num_agreeing(cloud[:, :3], cameras, depths, others, self.tolerance)
+                found.append(cloud[count >= least])
+                report("agreement", (number + 1) / len(views))
+        cloud = torch.cat(found)
+        if not len(cloud):
+            raise InputError(self._nothing(record, seen, sum(int(mask.sum()) for mask in opaque.values())))
+        candidates = sum(int(mask.sum()) for mask in opaque.values())
+        log.info("%d of %d points are confirmed by other views", len(cloud), candidates)
+        if len(cloud) > self.num_points:
+            cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[: self.num_points]]
+        to_user, path = record.to_user.double(), folder / "points.ply"
+        points = points_to_user(cloud[:, :3].double(), to_user)
+        normals = directions_to_user(cloud[:, 3:6].double(), to_user)
+        save_points(path, points.numpy(), normals.numpy(), to_bytes(cloud[:, 6:]).numpy())
+        return [path]
+
+    def _nothing(self, record: SceneRecord, seen: dict[int, SeenView], candidates: int) -> str:
+        if candidates:
+            return (
+                f"{candidates} pixels of {record.name} are opaque, but no point is confirmed by {self.agreement} other "
+                "views. Train longer, or give a smaller what.agreement or a larger what.tolerance."
+            )
+        lowest = min(float(each.opacity.min()) for each in seen.values())
+        highest = max(float(each.opacity.max()) for each in seen.values())
+        return (
+            f"There is no surface to export: the opacities of {record.name}'s training views go from {lowest:.3g} to "
+            f"{highest:.3g}, and what.min_opacity={self.min_opacity:g}. Train longer, or lower it."
+        )
+
+
+def _cloud(view: SeenView, kept: Tensor) -> Float[Tensor, "points 9"]:
+    """Return places, normals and colours of the pixels that are kept and have a normal."""
+    kept = kept & (view.normals.norm(dim=-1) > 0.5)
+    return torch.cat([view.points[kept], view.normals[kept], view.rgb[kept]], dim=-1)

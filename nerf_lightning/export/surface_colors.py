@@ -1,0 +1,77 @@
+"""Colours of points on a surface: a short ray through each is rendered."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.export.lattice import Report
+from nerf_lightning.export.pictures import to_bytes
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.tiles import tiles
+from nerf_lightning.rendering.quadrature import composite
+from nerf_lightning.types import RayBundle, RaySamples
+
+SeenFrom = Literal["cameras", "normal"]
+# Of a short ray.
+SAMPLES = 8
+# Cameras whose views of a point are averaged.
+NEAREST = 3
+
+
+def surface_colors(
+    model: RadianceModel,
+    record: SceneRecord,
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    reach: float,
+    seen_from: SeenFrom,
+    tile_points: int,
+    report: Report,
+    stage: str = "colours",
+) -> UInt8[Tensor, "points 3"]:
+    """Return the colour of each point.
+
+    Args:
+        model: its last level is asked.
+        record: of the scene.
+        points: on the surface, scene frame.
+        normals: unit, outward.
+        reach: half the length of a ray, scene units.
+        seen_from: `normal` looks straight at the surface; `cameras` from the training cameras that face it most
+            squarely, and so along directions that were learnt.
+        tile_points: most points that go through the field at once.
+        report: told how much is done.
+        stage: under this name.
+    """
+    device = next(model.parameters()).device
+    eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    for part in tiles(len(points), max(1, tile_points // SAMPLES)):
+        at, normal = points[part], normals[part]
+        looks = [-normal] if seen_from == "normal" else _from_cameras(at, normal, eyes)
+        rgb = [_short_rays(model, at.to(device), look.to(device), reach) for look in looks]
+        colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
+        report(stage, part.stop / max(1, len(points)))
+    return colors
+
+
+def _from_cameras(at: Tensor, normal: Tensor, eyes: Float[Tensor, "cameras 3"]) -> list[Float[Tensor, "points 3"]]:
+    towards = functional.normalize(eyes - at[:, None], dim=-1)
+    facing = (towards * normal[:, None]).sum(dim=-1)
+    best = facing.topk(min(NEAREST, len(eyes)), dim=-1).indices
+    return [-towards[torch.arange(len(at)), each] for each in best.T]
+
+
+def _short_rays(model: RadianceModel, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:
+    # From before the surface to behind it; what light is left then ends there.
+    edges = torch.linspace(0.0, 2.0 * reach, SAMPLES + 1, device=at.device).expand(len(at), SAMPLES + 1)
+    samples, origins = RaySamples(edges), at - reach * look
+    positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
+    output = model.last.field(positions, look[:, None], None)
+    near = torch.zeros(len(at), device=at.device)
+    rays = RayBundle(origins, look, near, near + 2.0 * reach, torch.zeros_like(near, dtype=torch.int64), look)
+    return composite(output, samples, rays, None).rgb

@@ -1,0 +1,103 @@
+"""Density and colour on a regular grid over the scene's box."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.base import Export, refuse_ndc
+from nerf_lightning.export.lattice import Lattice, Report, require_resolution, sample_density
+from nerf_lightning.export.pictures import to_bytes
+from nerf_lightning.geometry.frames import unit_of
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.tiles import tiles
+
+# Density, colour, and as much again while the file is written.
+BYTES_PER_POINT = 12
+# A cell less opaque than this has no colour.
+LEAST_ALPHA = 1e-3
+# Cameras from which a point's colour is taken.
+NEAREST = 3
+COSTS = {"density": 2.0, "colours": 3.0}
+
+
+class VolumeExport(Export):
+    """Write `volume.npz` (density, rgb) and `volume.json`, which says where the grid lies.
+
+    Args:
+        resolution: cells along the longest side of the box.
+    """
+
+    def __init__(self, resolution: int = 128):
+        self.resolution = resolution
+
+    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the grids."""
+        refuse_ndc(record, "volume")
+        lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
+        with StageProgress(COSTS) as report:
+            density = sample_density(model, lattice, tile_points, report)
+            rgb = _colors(model, record, lattice, density, tile_points, report)
+        unit = unit_of(record.to_user.double())
+        arrays, about = folder / "volume.npz", folder / "volume.json"
+        with whole_file(arrays) as part:
+            np.savez_compressed(part, density=density / np.float32(unit), rgb=rgb)
+        with whole_file(about) as part:
+            part.write_text(json.dumps(_described(record, lattice), indent=2) + "\n", encoding="utf-8")
+        return [arrays, about]
+
+
+def _described(record: SceneRecord, lattice: Lattice) -> dict[str, object]:
+    to_scene = torch.eye(4, dtype=torch.float64)
+    to_scene[:3, :3] *= lattice.spacing
+    to_scene[:3, 3] = lattice.lower
+    return {
+        "scene": record.name,
+        "shape": list(lattice.shape),
+        "index_to_user": (record.to_user.double() @ to_scene).tolist(),
+        "spacing": lattice.spacing * unit_of(record.to_user.double()),
+        "density": "float32 (x, y, z), per unit of length of the capture",
+        "rgb": "uint8 (x, y, z, 3), sRGB, seen from the nearest cameras; 0 where a cell is transparent",
+        "space": record.space,
+    }
+
+
+def _colors(
+    model: RadianceModel,
+    record: SceneRecord,
+    lattice: Lattice,
+    density: Float[ndarray, "x y z"],
+    tile_points: int,
+    report: Report,
+) -> UInt8[ndarray, "x y z 3"]:
+    rgb = np.zeros((lattice.num_points, 3), np.uint8)
+    visible = -np.expm1(-density.reshape(-1) * lattice.spacing) > LEAST_ALPHA
+    eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
+    for chunk in lattice.chunks():
+        kept = torch.from_numpy(np.flatnonzero(visible[chunk]))
+        points = lattice.points(chunk)[kept]
+        parts = [_seen(model, points[part], eyes) for part in tiles(len(points), tile_points)]
+        rgb[chunk.start + kept.numpy()] = torch.cat(parts).numpy()
+        report("colours", chunk.stop / lattice.num_points)
+    return rgb.reshape(*lattice.shape, 3)
+
+
+def _seen(
+    model: RadianceModel, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
+) -> UInt8[Tensor, "points 3"]:
+    away = points[:, None] - eyes
+    nearest = away.norm(dim=-1).topk(min(NEAREST, len(eyes)), dim=-1, largest=False).indices
+    device, colors = next(model.parameters()).device, torch.zeros(len(points), 3)
+    for each in nearest.T:
+        look = functional.normalize(away[torch.arange(len(points)), each], dim=-1)
+        output = model.last.field(points[:, None].to(device), look[:, None].to(device), None)
+        colors += output.rgb[:, 0].cpu() / len(nearest.T)
+    return to_bytes(colors)

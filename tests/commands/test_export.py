@@ -1,0 +1,77 @@
+"""`nerf export` from end to end: what it writes, and what it says of bad input."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from running import said
+
+
+@pytest.fixture(scope="module")
+def last(finished_run):
+    return finished_run / "checkpoints" / "last.ckpt"
+
+
+def test_the_checkpoint_alone_is_exported_beside_it(nerf, last, finished_run):
+    result = nerf("export", f"ckpt={last}", "what=cameras")
+    assert result.code == 0, result.err
+    assert (finished_run / "export" / "transforms.json").is_file()
+    assert (finished_run / "export" / "sparse" / "0" / "images.txt").is_file()
+    assert str(finished_run / "export" / "transforms.json") in result.out
+
+
+def test_every_kind_of_export_writes_what_it_says(nerf, last, tmp_path):
+    settings = {
+        "mesh": ("what.resolution=16", "what.threshold=1e-9", "what.seen_only=false", "what.format=obj"),
+        "points": ("what.min_opacity=0.0", "what.agreement=0", "what.max_views=2"),
+        "volume": ("what.resolution=8",),
+        "images": ("what.max_views=2",),
+    }
+    for what, more in settings.items():
+        result = nerf("export", f"ckpt={last}", f"what={what}", *more, f"paths.output_dir={tmp_path / what}")
+        if what == "mesh" and result.code:  # 20 steps may leave a field without any surface in it
+            said(result, "There is no surface")
+            continue
+        assert result.code == 0, result.err
+        for line in result.out.strip().splitlines():
+            assert (tmp_path / what).joinpath(line.rpartition("/")[2]).exists(), line
+    assert len(trimesh.load(tmp_path / "points" / "points.ply").vertices) == 2 * 16 * 16
+    assert np.load(tmp_path / "volume" / "volume.npz")["density"].shape == (9, 9, 9)
+    assert len(json.loads((tmp_path / "images" / "images.json").read_text())["views"]) == 2
+
+
+def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
+    where = f"paths.output_dir={tmp_path}"
+    said(nerf("export", f"ckpt={tmp_path}/absent.ckpt", where), "There is no checkpoint at")
+    said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "mesh")
+    said(nerf("export", f"ckpt={last}", "what.format=stl", where), "what.format=stl does not fit", "ply, obj, glb")
+    said(nerf("export", f"ckpt={last}", "what.resolution=30000", where), "what.resolution=30000", "GB", "would fit")
+    said(nerf("export", f"ckpt={last}", "what.threshold=1e9", where), "There is no surface", "go from", "1e+09")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_one_paragraph_and_leaves_nothing(nerf, last, tmp_path, monkeypatch):
+    def full(file, **arrays):
+        file.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(np, "savez_compressed", full)
+        import sys as system
+
+        from nerf_lightning import cli
+
+        arguments = [
+            "nerf",
+            "export",
+            f"ckpt={last}",
+            "what=volume",
+            "what.resolution=8",
+            f"paths.output_dir={tmp_path}",
+        ]
+        patched.setattr(system, "argv", arguments)
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    assert stop.value.code == 2
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,66 @@
+"""Depth, opacity and normals of views: the numbers in the files are those of the scene."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from known_fields import ball, solid
+from PIL import Image
+from scenes import ball_scene
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.images import ImagesExport
+from nerf_lightning.geometry.frames import similarity, upright_rotation
+
+TILE, SIZE, UNIT = 1 << 15, 33, 50.0
+TURN = upright_rotation(torch.tensor([1.0, 0.0, 0.0]))
+
+
+def record(**changes):
+    scene = scene_record(ball_scene(num_views=4, size=SIZE))
+    return replace(scene, to_user=similarity(TURN, torch.tensor([5.0, 6.0, 7.0]), UNIT), **changes)
+
+
+def exported(folder, **settings):
+    scene = record(view_names=("../a.jpg", "b/1.2", "c.png", "d"))
+    ImagesExport(**settings).export(solid(ball()), scene, folder, TILE)
+    return scene, json.loads((folder / "images.json").read_text())
+
+
+def test_depth_is_in_the_users_units_and_the_png_says_the_same(tmp_path):
+    scene, said = exported(tmp_path, split="all")
+    assert said["views"] == {"../a.jpg": "0000_.._a", "b/1.2": "0001_b_1.2", "c.png": "0002_c", "d": "0003_d"}
+    for view, name in enumerate(said["views"].values()):
+        depth = np.load(tmp_path / "depth" / f"{name}.npy")
+        distance = float(scene.cameras.c2w[view, :, 3].norm())
+        assert depth[SIZE // 2, SIZE // 2] == pytest.approx(UNIT * (distance - 0.8), abs=0.05 * UNIT)
+        assert np.isnan(depth[0, 0])
+        picture = np.array(Image.open(tmp_path / "depth" / f"{name}.png"))
+        assert picture.dtype == np.uint16
+        np.testing.assert_allclose(picture * said["depth_scale"], np.nan_to_num(depth), atol=said["depth_scale"])
+        opacity = np.array(Image.open(tmp_path / "opacity" / f"{name}.png"))
+        assert (opacity[SIZE // 2, SIZE // 2], opacity[0, 0]) == (255, 0)
+        normal = np.array(Image.open(tmp_path / "normals" / f"{name}.png"))[SIZE // 2, SIZE // 2] / 127.5 - 1
+        facing = TURN.numpy() @ (scene.cameras.c2w[view, :, 3] / distance).numpy()
+        np.testing.assert_allclose(normal, facing, atol=0.05)
+    assert picture.max() > 0.9 * 65535
+
+
+def test_z_is_shorter_than_the_distance_beside_the_axis(tmp_path):
+    exported(tmp_path / "ray", max_views=1)
+    exported(tmp_path / "z", max_views=1, depth="z")
+    (name,) = json.loads((tmp_path / "z" / "images.json").read_text())["views"].values()
+    along, z = (np.load(tmp_path / kind / "depth" / f"{name}.npy") for kind in ("ray", "z"))
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
+    cosine = 1 / np.sqrt(1 + (x**2 + y**2) / (1.6 * SIZE) ** 2)
+    np.testing.assert_allclose(z, along * cosine, rtol=1e-4)
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(InputError, match=r"what\.max_views=0"):
+        ImagesExport(max_views=0)
+    with pytest.raises(InputError, match=r"ball has no val views"):
+        ImagesExport(split="val").export(solid(ball()), record(splits={"train": (0,), "val": ()}), tmp_path, TILE)

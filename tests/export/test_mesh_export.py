@@ -1,0 +1,241 @@
+"""Meshes: the surface of known solids, in the user's frame, in every format; what cannot be meshed is refused."""
+
+import builtins
+import logging
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import psutil
+import pytest
+import torch
+import trimesh
+from known_fields import INSIDE, ball, solid
+from posed_captures import Known, read, write_colmap
+from scenes import ball_scene
+from scipy.spatial import cKDTree
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.errors import InputError
+from nerf_lightning.export import mesh_libraries
+from nerf_lightning.export.components import without_floaters
+from nerf_lightning.export.lattice import Lattice
+from nerf_lightning.export.marching import marching_cubes
+from nerf_lightning.export.mesh import MeshExport
+from nerf_lightning.geometry.frames import similarity, unit_of, upright_rotation
+
+RADIUS = 0.8
+TILE = 1 << 15
+
+
+def silent(stage, done):
+    assert 0 <= done <= 1
+
+
+def record(**changes):
+    return replace(scene_record(ball_scene(num_views=8, size=24)), **changes)
+
+
+def exported(folder, model, scene, **settings):
+    (path,) = MeshExport(**{"resolution": 48, "seen_only": False} | settings).export(model, scene, folder, TILE)
+    loaded = trimesh.load(path, process=False)
+    return next(iter(loaded.geometry.values())) if isinstance(loaded, trimesh.Scene) else loaded
+
+
+def colors_of(mesh):
+    visual = mesh.visual
+    colors = visual.vertex_colors if hasattr(visual, "vertex_colors") else visual.vertex_attributes["color"]
+    return np.asarray(colors)[:, :3].astype(int)
+
+
+def test_blocks_make_the_surface_of_the_whole_and_close_it():
+    axes = [np.linspace(0, 3, size) for size in (23, 31, 18)]
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    density = (np.sin(2 * x + y) * np.cos(3 * y - z) + np.sin(2 * z)).astype(np.float32)
+    density[[0, -1]], density[:, [0, -1]], density[:, :, [0, -1]] = -3, -3, -3
+    whole, whole_faces = marching_cubes(density, 0.1, silent, block=64)
+    vertices, faces = marching_cubes(density, 0.1, silent, block=7)
+    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
+    assert len(vertices) == len(whole)
+    assert len(faces) == len(whole_faces)
+    assert cKDTree(whole).query(vertices)[0].max() < 1e-5
+
+
+def test_a_lattice_covers_the_box():
+    lattice = Lattice.over(torch.tensor([[0.0, 0, 0], [1, 0.5, 0.26]]), 10)
+    assert lattice.shape == (11, 6, 4)
+    points = lattice.points(slice(0, lattice.num_points))
+    assert bool((points.amin(dim=0) <= 1e-6).all())
+    assert bool((points.amax(dim=0) >= torch.tensor([1, 0.5, 0.26]) - 1e-6).all())
+    places = np.stack(np.meshgrid(*map(np.arange, lattice.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(lattice.to_scene(places.astype(float)), points, atol=1e-6)
+
+
+@pytest.mark.parametrize("format", ["ply", "obj", "glb"])
+def test_a_ball_is_a_ball_in_every_format(tmp_path, format):
+    mesh = exported(tmp_path, solid(ball()), record(), format=format)
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    # The surface that rendering sees lies where light is stopped: about the width of the ramp outside.
+    assert np.abs(radius - RADIUS).max() < 0.05
+    assert radius.std() < 0.005
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    outward = (np.asarray(mesh.vertex_normals) * mesh.vertices).sum(axis=1) / radius
+    assert outward.min() > 0.95
+    colors = colors_of(mesh)
+    clear = np.abs(mesh.vertices[:, 0]) > 0.2
+    expected = np.where(mesh.vertices[:, :1] > 0, [[255, 0, 0]], [[0, 255, 0]])
+    assert np.abs(colors - expected)[clear].max() <= 2
+
+
+@pytest.mark.parametrize("colors", ["cameras", "normal"])
+def test_grey_is_the_same_grey_but_linear_in_glb(tmp_path, colors):
+    model = solid(ball(), color=lambda positions: torch.full_like(positions, 0.4))
+    for format, grey in (("ply", 102), ("glb", 34)):
+        mesh = exported(tmp_path, model, record(), format=format, colors=colors, resolution=16)
+        assert np.unique(colors_of(mesh)).tolist() == [grey]
+
+
+def test_the_surface_is_where_the_depth_of_the_pictures_is(tmp_path):
+    # Thin matter is seen deep inside; the level follows.
+    dense, thin = (exported(tmp_path, solid(ball(), inside=inside), record()) for inside in (4000.0, 40.0))
+    assert np.linalg.norm(dense.vertices, axis=1).mean() > np.linalg.norm(thin.vertices, axis=1).mean() + 0.02
+
+
+@pytest.mark.parametrize("space", ["bounded", "contracted"])
+def test_a_scene_in_another_frame_gives_the_same_mesh_in_the_new_place(tmp_path, space):
+    def shape(positions):  # a ball with a nose: no turn brings it onto itself
+        return torch.minimum(ball(0.6, (0.3, -0.2, 0.1))(positions), ball(0.25, (0.9, 0.1, 0.5))(positions))
+
+    rotation = upright_rotation(torch.nn.functional.normalize(torch.tensor([0.3, -1.2, 0.4]), dim=0)).numpy()
+    scale, shift = 13.0, np.array([20.0, -7.0, 4.0])
+    known, found = Known(), []
+    for name, capture in (("one", known), ("other", known.moved(scale, rotation, shift))):
+        scene = scene_record(read("colmap", write_colmap(tmp_path / name, capture), space=space))
+        back = np.linalg.inv(np.block([[scale * rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
+        to_first = torch.tensor(back if name == "other" else np.eye(4)).float() @ scene.to_user
+        unit = unit_of(to_first)
+
+        def distance(positions, to_first=to_first, unit=unit):
+            return shape(positions @ to_first[:3, :3].T + to_first[:3, 3]) / unit
+
+        found.append((exported(tmp_path / name, solid(distance), scene, resolution=96, threshold=INSIDE / 2), unit))
+    (one, unit), (other, _) = found
+    assert one.is_watertight
+    assert other.is_watertight
+    moved = scale * one.vertices @ rotation.T + shift
+    spacing = 4.0 * unit / 96
+    for a, b in ((moved, other.vertices), (other.vertices, moved)):
+        assert cKDTree(a).query(b)[0].max() < scale * spacing
+    assert other.volume == pytest.approx(scale**3 * one.volume, rel=0.01)
+    # Both stand on the solid itself.
+    assert float(shape(torch.tensor(one.vertices).float()).abs().max()) < 0.02
+
+
+def test_floaters_are_removed_by_their_share_of_faces(tmp_path, caplog):
+    def shape(positions):
+        return torch.minimum(ball(0.6)(positions), ball(0.1, (0.85, 0.85, 0.85))(positions))
+
+    with caplog.at_level(logging.INFO):
+        mesh = exported(tmp_path, solid(shape), record(), min_share=0.1)
+    assert "1 floaters removed" in caplog.text
+    assert mesh.body_count == 1
+    assert exported(tmp_path, solid(shape), record(), min_share=0.0).body_count == 2
+
+
+def test_of_two_parts_alike_both_are_kept():
+    cube = trimesh.creation.box()
+    both = trimesh.util.concatenate([cube, cube.copy().apply_translation([3, 0, 0])])
+    vertices, faces, removed = without_floaters(np.asarray(both.vertices), np.asarray(both.faces), 1.0)
+    assert (len(vertices), len(faces), removed) == (16, 24, 0)
+
+
+def test_what_no_view_sees_is_removed_when_asked(tmp_path):
+    def hollow(positions):  # a shell: its inside is a surface that nobody sees
+        return torch.maximum(ball(0.8)(positions), -ball(0.4)(positions))
+
+    whole = exported(tmp_path, solid(hollow), record())
+    seen = exported(tmp_path, solid(hollow), record(), seen_only=True)
+    assert np.linalg.norm(whole.vertices, axis=1).min() < 0.5
+    assert np.linalg.norm(seen.vertices, axis=1).min() > 0.7
+    assert seen.area > 0.6 * 4 * np.pi * RADIUS**2
+
+
+def test_decimation_keeps_the_shape(tmp_path):
+    mesh = exported(tmp_path, solid(ball()), record(), faces=500)
+    assert 400 < len(mesh.faces) <= 500
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() < 0.06
+    assert mesh.volume > 0
+
+
+def test_content_that_leaves_a_bounded_box_is_closed_and_that_of_a_contracted_scene_is_not(tmp_path):
+    floor = solid(lambda positions: positions[..., 2] + 0.3)
+    assert exported(tmp_path, floor, record(), threshold=100.0).is_watertight
+    open_mesh = exported(tmp_path, floor, record(space="contracted"), threshold=100.0)
+    assert not open_mesh.is_watertight
+    assert np.ptp(open_mesh.vertices[:, 2]) < 0.05
+    assert np.abs(open_mesh.vertices).max() <= 1.001
+
+
+def test_an_empty_field_is_refused_with_the_densities_seen(tmp_path):
+    thin = solid(ball(), inside=0.01)
+    with pytest.raises(InputError, match=r"densities of its box go from 0 to 0\.01.*sees anything opaque"):
+        exported(tmp_path, thin, record())
+    with pytest.raises(InputError, match=r"where the density is 900: .* go from 0 to 400 .*what\.threshold="):
+        exported(tmp_path, solid(ball()), record(), threshold=900.0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch):
+    memory = type("Memory", (), {"available": 1_000_000_000})
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+    with pytest.raises(InputError, match=r"2049 x 2049 x 2049 points, which takes 68\.\d GB, and 0\.8 GB") as error:
+        exported(tmp_path, solid(ball()), record(), resolution=2048)
+    fitting = int(str(error.value).split("what.resolution=")[2].split(" ")[0])
+    assert 400 < fitting < 500
+    exported(tmp_path, solid(ball()), record(), resolution=20)
+
+
+def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch):
+    def absent(name):
+        if name.startswith("skimage"):
+            raise ImportError("No module named 'skimage'")
+        return import_module(name)
+
+    monkeypatch.setattr(mesh_libraries, "import_module", absent)
+    with pytest.raises(InputError, match=r"needs scikit-image, .*pip install 'nerf-lightning\[mesh\]'"):
+        exported(tmp_path, solid(ball()), record())
+
+
+def test_ndc_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"what=mesh: ball was trained in normalised device coordinates"):
+        exported(tmp_path, solid(ball()), record(space="ndc"))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"resolution": 1}, {"threshold": 0.0}, {"min_share": 2.0}, {"faces": 2}],
+)
+def test_settings_that_make_no_sense_are_refused(tmp_path, settings):
+    with pytest.raises(InputError, match=f"what.{next(iter(settings))}="):
+        exported(tmp_path, solid(ball()), record(), **settings)
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    def full(self, content):
+        builtins.open(self, "wb").close()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        exported(tmp_path, solid(ball()), record(), resolution=16)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_arbitrary_similarity_keeps_faces_outward(tmp_path):
+    turn = upright_rotation(torch.tensor([1.0, 0.0, 0.0]))
+    mesh = exported(tmp_path, solid(ball()), record(to_user=similarity(turn, torch.tensor([5.0, 6.0, 7.0]), 100.0)))
+    assert mesh.volume == pytest.approx(1e6 * 4 / 3 * np.pi * RADIUS**3, rel=0.2)
+    np.testing.assert_allclose(mesh.bounds.mean(axis=0), [5, 6, 7], atol=1.0)
+    outward = ((mesh.vertices - [5, 6, 7]) / 80 * mesh.vertex_normals).sum(axis=1)
+    assert outward.min() > 0.9

@@ -1,0 +1,81 @@
+"""Grids: the density where it is, in the user's units, and colours where something is."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import psutil
+import pytest
+import torch
+from known_fields import INSIDE, ball, solid
+from scenes import ball_scene, some_rays
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.volume import VolumeExport
+from nerf_lightning.fields.hash_field import HashField
+from nerf_lightning.geometry.frames import similarity
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.models.masked_level import MaskedLevel
+from nerf_lightning.models.packed_level import PackedLevel
+from nerf_lightning.samplers.occupancy import OccupancySampler
+
+CENTER = (0.3, 0.0, -0.2)
+
+
+def record(**changes):
+    return replace(scene_record(ball_scene(num_views=4, size=8)), **changes)
+
+
+def test_the_grid_lies_where_the_json_says_in_the_users_units(tmp_path):
+    to_user = similarity(torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([5.0, 6.0, 7.0]), 4.0)
+    arrays, about = VolumeExport(40).export(solid(ball(0.5, CENTER)), record(to_user=to_user), tmp_path, 4096)
+    said = json.loads(about.read_text())
+    with np.load(arrays, allow_pickle=False) as content:
+        density, rgb = content["density"], content["rgb"]
+    assert density.shape == tuple(said["shape"]) == rgb.shape[:3] == (41, 41, 41)
+    index = np.stack(np.meshgrid(*map(np.arange, density.shape), indexing="ij"), axis=-1)
+    matrix = np.array(said["index_to_user"])
+    places = index @ matrix[:3, :3].T + matrix[:3, 3]
+    distance = np.linalg.norm(places - [5 + 4 * 0.3, 6, 7 + 4 * 0.2], axis=-1) - 4 * 0.5
+    np.testing.assert_allclose(density[distance < -0.6], INSIDE / 4, rtol=0.01)
+    assert density[distance > 1.0].max() < 1e-3
+    assert said["spacing"] == pytest.approx(4 * 2 / 40)
+    red = places[..., 0] > 5.01
+    assert (rgb[(distance < -0.6) & red] == [255, 0, 0]).all()
+    assert (rgb[distance > 1.0] == 0).all()
+
+
+@pytest.mark.parametrize("kind", [PackedLevel, MaskedLevel])
+def test_what_rays_pass_by_has_no_density(kind):
+    torch.manual_seed(0)
+
+    encoder = HashGridEncoder(num_levels=2, log2_table_size=8, min_resolution=4, max_resolution=8)
+    field = HashField(encoder, SphericalHarmonicsEncoder(), density_bias=3.0)
+    level = kind(OccupancySampler(resolution=8), field)
+    model, points = RadianceModel({"fine": level}).eval(), some_rays(500).origins / 4
+    with torch.no_grad():
+        assert bool((model.last.density(points) > 0).all())
+        level.sampler._occupy(torch.zeros_like(level.sampler.possible))
+        assert not bool(model.last.density(points).any())
+        half = torch.zeros_like(level.sampler.possible)
+        half[:, 4:] = True
+        level.sampler._occupy(half)
+        found = model.last.density(points)
+        torch.testing.assert_close(found > 0, points[:, 0] >= 0)
+        torch.testing.assert_close(found[found > 0], field.density(points)[found > 0])
+
+
+def test_refusals(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"what=volume: ball was trained in normalised device coordinates"):
+        VolumeExport(8).export(solid(ball()), record(space="ndc"), tmp_path, 4096)
+    with pytest.raises(InputError, match=r"what\.resolution=1: give the number of cells"):
+        VolumeExport(1).export(solid(ball()), record(), tmp_path, 4096)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1e9}))
+    with pytest.raises(
+        InputError, match=r"12\.9 GB, and 0\.8 GB of memory can be had\. what\.resolution=\d+ would fit"
+    ):
+        VolumeExport(1024).export(solid(ball()), record(), tmp_path, 4096)
+    assert not list(tmp_path.iterdir())
