@@ -94,5 +94,6 @@ def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
         tensors = [cameras.c2w, cameras.focal, cameras.width, cameras.height, shot.near, shot.far]
         tensors += [] if seen_from is None else [seen_from.c2w]
         for tensor in (*tensors, *shot.subject.model.state_dict().values()):
-            digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+            flat = tensor.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

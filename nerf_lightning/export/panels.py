@@ -66,7 +66,7 @@ def film_pictures(
     if mosaic:
         rows = [
             side_by_side(
-                [with_caption(each[name], f"{label}: {name}" if several else name, size) for name in each], gap=size
+                [with_caption(each[name], f"{label} | {name}" if several else name, size) for name in each], gap=size
             )
             for each, label in zip(panels, labels, strict=True)
         ]

@@ -161,6 +161,10 @@ def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
             assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
 
 
+def test_a_single_frame_is_a_film(last, rendered):
+    assert rendered(last, "path.num_frames=1", frame=0)["video"].shape == (12, 12, 3)
+
+
 def test_other_settings_begin_anew(nerf, last, tmp_path, rendered):
     before = rendered(last)["video"]
     after = rendered(last, "path.elevation=60.0")["video"]
