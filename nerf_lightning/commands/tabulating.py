@@ -52,7 +52,11 @@ def tabulate(config: DictConfig) -> int:
         notes.append(f"Without {FILES[config.measured]}, and so without numbers: {listed(gathered.unmeasured, cap=5)}.")
     folder = output_folder(config.paths.output_dir or _common(folders), Path())
     write_rows(rows, folder, "table", tuple(notes))
-    print_rows(rows, f"{len(gathered.results)} runs")
+    # A source is longer than a terminal has room for; the files have it.
+    short = [
+        {key: (value or "").partition(",")[0] if key == "source" else value for key, value in r.items()} for r in rows
+    ]
+    print_rows(short, "1 run" if len(gathered.results) == 1 else f"{len(gathered.results)} runs")
     print("\n".join([*map(printable, notes), f"written to  {folder / 'table.md'} and {folder / 'table.csv'}"]))
     return len(rows)
 
