@@ -51,7 +51,7 @@ def one_round(folder: Path, cache: Path) -> None:
     """A run, its continuation, its measurement, its film."""
     run, scene = folder / "run", (*SCENE, f"scene.cache_dir={cache}")
     nerf("train", *scene, *SMALL, f"paths.output_dir={run}")
-    nerf("train", f"resume={run}", "trainer.max_steps=100")
+    nerf("train", f"resume={run}", f"scene.cache_dir={cache}", "trainer.max_steps=100")
     last = f"ckpt={run}/checkpoints/last.ckpt"
     nerf("eval", last, "evaluation.num_pictures=1")
     nerf("render", last, "path.num_frames=4", "path.width=64")

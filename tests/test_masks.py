@@ -10,7 +10,8 @@ from scenes import ball_scene, tiny_model
 from test_system import gradients, make_system
 
 from nerf_lightning.callbacks.collapse_guard import is_constant
-from nerf_lightning.commands.scoring import Scoring, split_hash
+from nerf_lightning.commands.protocol import split_hash
+from nerf_lightning.commands.scoring import Scoring
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, Progress, RayBatches, gather
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
@@ -154,7 +155,7 @@ def test_scores_leave_masked_pixels_out_and_say_so(tmp_path):
     results = [scoring.score(model, each, "white", 1000, tmp_path) for each in (scene, garbled(scene), ball_scene())]
     assert results[0]["psnr"] == results[1]["psnr"] != results[2]["psnr"]
     assert results[0]["protocol"]["masks"] == "left out"
-    assert "masks" not in results[2]["protocol"]
+    assert results[2]["protocol"]["masks"] == "none"
     views = [3, 4]
     assert split_hash(scene, views) != split_hash(ball_scene(), views)
 

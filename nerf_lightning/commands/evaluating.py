@@ -6,6 +6,7 @@ from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.finish import metric_lines
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.protocol import measured_of
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
 
 
@@ -18,7 +19,9 @@ def evaluate(config: DictConfig) -> float:
     model = load_model(checkpoint).to(settings.device)
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
     scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
+    origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
+    scoring, tile_points = build(config.evaluation), settings.inference_tile_points
     with settings.inference():
-        metrics = build(config.evaluation).score(model, scene, scene.background, settings.inference_tile_points, folder)
+        metrics = scoring.score(model, scene, scene.background, tile_points, folder, origin)
     print("\n".join(metric_lines(metrics, folder)))
     return float(metrics["psnr"])

@@ -1,107 +1,99 @@
-"""Render a model along a camera path: colour and depth, as videos or as frames."""
+"""Film models along a camera path: colour, depth and more, as videos or as frames."""
 
-import logging
-from collections.abc import Iterator
-from dataclasses import replace
+import hashlib
+import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
 
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 from rich.progress import track
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.commands.console import stderr_console
+from nerf_lightning.commands.film_frames import FilmFrames, Range
+from nerf_lightning.commands.film_settings import FilmSettings
+from nerf_lightning.commands.shots import Shot, Subject, depth_range, make_shots
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.pictures import depth_picture, to_bytes
-from nerf_lightning.export.video import write_frames, write_video
-from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
-from nerf_lightning.geometry.frames import unit_of
-from nerf_lightning.geometry.ndc import LEAST_FORWARD
-from nerf_lightning.geometry.paths.base import CameraPath, frame_of
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import Picture, render_picture
-from nerf_lightning.types import Background, Cameras
-
-FORMATS = ("video", "frames")
-
-log = logging.getLogger(__name__)
+from nerf_lightning.export.panels import FILMS, film_pictures, panel
+from nerf_lightning.export.video import require_ffmpeg
+from nerf_lightning.geometry.paths.base import CameraPath
 
 
 def film(
-    model: RadianceModel,
-    scene: SceneRecord,
-    path: CameraPath,
-    background: Background,
-    tile_points: int,
-    folder: Path,
-    form: Literal["video", "frames"] = "video",
+    subjects: list[Subject], path: CameraPath, tile_points: int, folder: Path, settings: FilmSettings | None = None
 ) -> list[Path]:
-    """Write `video.mp4` and `depth.mp4` (or folders of frames of these names) and return where they are.
+    """Write the films (`video.mp4`, `depth.mp4`; or folders of frames of these names) and return where they are.
 
-    Depth is in the user's units along the ray, coloured over the range of what is seen on the whole path (its outer
-    1 % at each end left out), with its scale beside it.
+    A film that was stopped goes on with its missing frames. Depth is in the user's units along the ray, coloured over
+    the range of what is seen on the whole path, with its scale beside it.
+
+    Args:
+        subjects: models of one capture; where there are several, they are shown side by side.
+        path: where the cameras are.
+        tile_points: most points that go through a field at once.
+        folder: where to.
+        settings: what is filmed; None: colour and depth as videos.
+
+    Raises:
+        InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
-    if form not in FORMATS:
-        raise InputError(f"format={form}: choose video (mp4) or frames (PNG files).")
-    # Rendered once and kept: the scale of the depth is known at the end only.
-    pictures = ranks.in_turn(list(render_path(model, scene, path, background, tile_points)))
-    unit = unit_of(scene.to_user)
-    seen = unit * torch.cat([picture.depth[picture.opacity > 0.5].flatten() for picture in pictures])
-    near, far = unit * float(scene.near.min()), unit * float(scene.far.max())
-    if seen.numel():
-        near, far = (float(value) for value in torch.quantile(_thinned(seen), torch.tensor([0.01, 0.99])))
-    color = [to_bytes(picture.rgb) for picture in pictures]
-    depth = [depth_picture(unit * picture.depth, near, far, picture.opacity) for picture in pictures]
-    return [
-        _write(folder, "video", color, path.fps, form),
-        _write(folder, "depth", depth, path.fps, form),
-    ]
+    settings = FilmSettings() if settings is None else settings
+    _check(subjects, settings)
+    shots = make_shots(subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera)
+    films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
+    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form)
+    try:
+        # The first process alone looks, before any of them writes.
+        missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
+        mine = ranks.every_other(missing)
+        for number in track(mine, description="filming", transient=True, console=stderr_console()):
+            for name, picture in _frame(shots, settings, number, seen).items():
+                frames.save(name, number, picture)
+        ranks.gather(None)  # all frames are there
+        if ranks.is_first():
+            frames.finish(path.fps)
+    finally:
+        frames.close()
+    return frames.results()
 
 
-def render_path(
-    model: RadianceModel, scene: SceneRecord, path: CameraPath, background: Background, tile_points: int
-) -> Iterator[Picture]:
-    """Render this process's pictures of the path; near and far are the widest of the photographs."""
-    cameras = path.cameras(frame_of(scene.cameras, scene.aabb))
-    count = cameras.c2w.shape[0]
-    if scene.cameras.ndc is not None:
-        lost = int((~in_front_of_near_plane(cameras)).sum())
-        if lost:
-            log.warning(
-                "%d of %d cameras of the path look aside or stand among the content, where the forward-facing capture "
-                "%s has nothing to show: their pictures mean nothing. Use path=spiral.",
-                lost,
-                count,
-                scene.name,
+def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ 3"]]:
+    panels = []
+    for shot in shots:
+        picture = shot.picture(number)
+        normals = shot.normals(number, picture) if "normals" in settings.outputs else None
+        panels.append({name: panel(name, picture, seen, shot.unit, normals) for name in settings.outputs})
+    return film_pictures(panels, [shot.subject.label for shot in shots], settings.mosaic)
+
+
+def _check(subjects: list[Subject], settings: FilmSettings) -> None:
+    if settings.form == "video":
+        require_ffmpeg()
+    for subject in subjects:
+        name = f" ({subject.label})" if len(subjects) > 1 else ""
+        if "levels" in settings.outputs and subject.model.first_picture is None:
+            raise InputError(
+                f"outputs: this model{name} has one level that makes pictures, so there is no difference of levels to "
+                "show. Leave levels out; model=nerf and its smaller versions have two."
             )
-        cameras = replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
-    near = scene.near.min().expand(count)
-    far = scene.far.max().expand(count)
-    mine = ranks.every_other(range(count))
-    for view in track(mine, description="filming", transient=True, console=stderr_console()):
-        yield render_picture(model, cameras, view, near, far, background, tile_points)
+        if settings.crop is not None and subject.background == "none":
+            raise InputError(
+                f"crop: this model{name} has no background that could be seen around the box. Add background=white or "
+                "background=black."
+            )
 
 
-def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
-    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
-    zeros = torch.zeros(len(cameras.c2w))
-    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
-    return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
-
-
-def _write(folder: Path, name: str, frames: list[UInt8[Tensor, "h w 3"]], fps: int, form: str) -> Path:
-    target = folder / (name if form == "frames" else f"{name}.mp4")
-    if ranks.is_first():
-        if form == "frames":
-            write_frames(target, frames)
-        else:
-            write_video(target, frames, fps, len(frames))
-    return target
-
-
-def _thinned(values: Tensor, most: int = 1_000_000) -> Tensor:
-    # torch.quantile takes at most 16 million values.
-    return values[:: max(1, values.numel() // most)]
+def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
+    """Return what tells films apart: the weights, the cameras, and all settings that decide what is seen."""
+    digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
+    for shot in shots:
+        digest.update(f"{shot.subject.label} {shot.subject.background}".encode())
+        cameras, seen_from = shot.cameras, shot.seen_from
+        tensors = [cameras.c2w, cameras.focal, cameras.width, cameras.height, shot.near, shot.far]
+        tensors += [] if seen_from is None else [seen_from.c2w]
+        for tensor in (*tensors, *shot.subject.model.state_dict().values()):
+            flat = tensor.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]

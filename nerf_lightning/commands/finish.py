@@ -12,7 +12,9 @@ from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.protocol import measured_of
 from nerf_lightning.commands.scoring import Scoring
+from nerf_lightning.commands.shots import Subject, lay_path
 from nerf_lightning.commands.tensorboard import FINAL_METRICS
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.images import read_rgba
@@ -43,6 +45,15 @@ class Finish:
             require_ffmpeg()
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
 
+    def require_film(self, scene: Scene) -> None:
+        """Refuse a path that cannot be laid around the scene.
+
+        Raises:
+            InputError: why not.
+        """
+        if self.path is not None:
+            lay_path(self.path, scene_record(scene))
+
     def __call__(
         self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
     ) -> float | None:
@@ -52,12 +63,14 @@ class Finish:
         tile_points = settings.inference_tile_points
         with settings.inference():
             if self.scoring is not None:
-                metrics = self.scoring.score(model, scene, scene.background, tile_points, folder)
+                origin = _origin(trainer, model, settings)
+                metrics = self.scoring.score(model, scene, scene.background, tile_points, folder, origin)
                 psnr = metrics["psnr"]
                 _log_metrics(trainer, metrics)
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
-                video, depth = film(model, scene_record(scene), self.path, scene.background, tile_points, folder)
+                subject = Subject(model, scene_record(scene), scene.background)
+                video, depth = film([subject], self.path, tile_points, folder)
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
@@ -66,13 +79,21 @@ class Finish:
         return None if psnr is None else float(psnr)
 
 
+def _origin(trainer: Trainer, model: RadianceModel, settings: TrainerSettings) -> dict[str, Any]:
+    system: Any = trainer.lightning_module
+    record = system.record
+    return measured_of(model, record["config"], record["choices"], settings.device, settings.precision)
+
+
 def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Return the lines that a person reads at the end."""
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
-        f"({metrics['num_images']} views, {protocol['background']} background)"
+        f"({metrics['num_images']} views, {protocol['background']} background)",
+        f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
+        f"({metrics['worst']['psnr']['name']})",
     ]
     if metrics["depth_error"] is not None:
         normal = metrics["normal_error"]
@@ -82,6 +103,10 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"LPIPS        not computed: {metrics['lpips_hint']}")
     else:
         lines.append(f"LPIPS        {metrics['lpips']:.4f}")
+    lines.append(
+        f"speed        {metrics['frames_per_second']:.3g} frames per second, "
+        f"at most {metrics['peak_memory_gigabytes']:.2f} GB of memory"
+    )
     return [*lines, f"metrics      {folder / 'metrics.json'}"]
 
 

@@ -1,6 +1,7 @@
-"""Links in a folder that is written to: an unpacked archive may have brought some that lead elsewhere."""
+"""Links in a folder that is written to or shown: an unpacked archive may have brought some that lead elsewhere."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
@@ -12,12 +13,29 @@ def require_no_way_out(folder: Path) -> None:
     Raises:
         InputError: with the link.
     """
+    for path in _ways_out(folder):
+        raise InputError(
+            f"{path} is a symbolic link to {os.readlink(path)}, and writing into {folder} would write there. "
+            "Remove the link (or put what it names in its place), or give another folder with paths.output_dir=DIR."
+        )
+
+
+def require_nothing_from_outside(folder: Path) -> None:
+    """Refuse to show a folder with links that lead out of it: what they name would be shown, and perhaps sent on.
+
+    Raises:
+        InputError: with the link.
+    """
+    for path in _ways_out(folder):
+        raise InputError(
+            f"{path} is a symbolic link to {os.readlink(path)}, which lies outside of {folder} and would be shown. "
+            "Remove the link, or put what it names in its place."
+        )
+
+
+def _ways_out(folder: Path) -> Iterator[Path]:
     root = os.path.realpath(folder)
     for base, folders, names in os.walk(root):
         for path in (Path(base) / name for name in (*folders, *names)):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
-                raise InputError(
-                    f"{path} is a symbolic link to {os.readlink(path)}, and writing into {folder} would write there. "
-                    "Remove the link (or put what it names in its place), or give another folder with "
-                    "paths.output_dir=DIR."
-                )
+                yield path

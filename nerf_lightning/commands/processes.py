@@ -26,6 +26,7 @@ from torch import distributed
 
 from nerf_lightning import ranks
 from nerf_lightning.commands.devices import choose_device
+from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.strategy import Launcher, cluster_environment
 from nerf_lightning.errors import InputError
 
@@ -45,6 +46,7 @@ def on_all_processes(command: str, config: DictConfig, work: Callable[[DictConfi
     """
     if distributed.is_initialized():  # a worker: its processes are joined
         return work(config)
+    require_fitting_values(config.trainer, "trainer")
     launcher: Launcher = config.trainer.launched_by
     _require_launcher(launcher)
     if launcher == "nerf":

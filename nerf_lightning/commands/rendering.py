@@ -1,24 +1,60 @@
-"""`nerf render`: read a checkpoint, follow a camera path, write what is seen."""
+"""`nerf render`: read checkpoints, follow a camera path, write what is seen."""
+
+from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.film_settings import film_settings, listed
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.shots import Subject
 from nerf_lightning.data.checks import known_background
+from nerf_lightning.errors import InputError
 
 
 def render(config: DictConfig) -> None:
-    """Film a checkpoint; it is all that is needed."""
+    """Film one checkpoint, or several side by side; they are all that is needed."""
+    shown = film_settings(config)
     settings = build(config.trainer)
     settings.prepare_machine()
-    checkpoint = read_checkpoint(config.ckpt)
-    settings.keep_tile(checkpoint.tile_points)
-    model = load_model(checkpoint).to(settings.device)
+    checkpoints = [read_checkpoint(path) for path in listed(config.ckpt)]
+    labels = labels_of(checkpoints, config.labels)
+    settings.keep_tile(checkpoints[0].tile_points)
     path = build(config.path)
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "render"))
-    background = known_background(config.background or checkpoint.scene.background)
+    subjects = [
+        Subject(
+            load_model(checkpoint).to(settings.device),
+            checkpoint.scene,
+            known_background(config.background or checkpoint.scene.background),
+            label,
+        )
+        for checkpoint, label in zip(checkpoints, labels, strict=True)
+    ]
+    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoints[0].path, "render"))
     with settings.inference():
-        written = film(model, checkpoint.scene, path, background, settings.inference_tile_points, folder, config.format)
+        written = film(subjects, path, settings.inference_tile_points, folder, shown)
     print("\n".join(str(file) for file in written))
+
+
+def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
+    """Return what checkpoints are called beside each other: as given, else after their run folders.
+
+    Raises:
+        InputError: there are more or fewer names than checkpoints.
+    """
+    if given is None:
+        names = [_run_name(checkpoint.path) for checkpoint in checkpoints]
+        twice = len(set(names)) < len(names)
+        return [f"{name} {each.path.stem}" if twice else name for name, each in zip(names, checkpoints, strict=True)]
+    labels = list(map(str, listed(given)))
+    if len(labels) != len(checkpoints):
+        raise InputError(f"labels={labels}: give one for each of the {len(checkpoints)} checkpoints, or null.")
+    return labels
+
+
+def _run_name(path: Path) -> str:
+    parent = path.absolute().parent
+    return parent.parent.name if parent.name == "checkpoints" else path.stem

@@ -60,6 +60,10 @@ class RunFolder:
         os.replace(folder / PREVIOUS, folder / LAST)
         return folder / LAST
 
+    def trained(self) -> None:
+        """Note that training is over, and how long it took."""
+        self._note(training_seconds=self._note())
+
     def finish(self, step: int, psnr: float | None = None) -> None:
         """Note that the run is complete."""
         self._note(finished_at_step=step, psnr=psnr)
@@ -72,10 +76,13 @@ class RunFolder:
         """Let others have the folder."""
         self.lock.release()
 
-    def _note(self, **values: Any) -> None:
+    def _note(self, **values: Any) -> float:
         note = read_note(self.path)
-        seconds = round(note.get("seconds", 0.0) + time.monotonic() - self.began, 1)
+        now = time.monotonic()
+        seconds: float = round(note.get("seconds", 0.0) + now - self.began, 1)
+        self.began = now
         _write_json(self.path / "run.json", note | {"seconds": seconds} | values)
+        return seconds
 
 
 def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> RunFolder:

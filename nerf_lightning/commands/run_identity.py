@@ -15,7 +15,7 @@ from nerf_lightning.commands.suggestions import flatten
 # Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
 NOT_IDENTITY = (
     *("paths.", "resume", "sweep.", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
-    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "scene.cache_dir", "scene.verify"),
+    *("logger.", "evaluation.", "final.", "path.", "callbacks.", "viewer.", "scene.cache_dir", "scene.verify"),
     *("scene.allow_outside", "scene.max_gigabytes"),
 )
 IDENTITY = ("callbacks.collapse_guard.",)
@@ -25,8 +25,12 @@ OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "scene.cache_dir")
 
 def run_identity(config: DictConfig) -> dict[str, Any]:
     """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    leaves = flatten(config)
-    return {key: value for key, value in leaves.items() if key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)}
+    return {key: value for key, value in flatten(config).items() if is_identity(key)}
+
+
+def is_identity(key: str) -> bool:
+    """Tell whether a setting makes a run what it is."""
+    return key.startswith(IDENTITY) or not key.startswith(NOT_IDENTITY)
 
 
 def fingerprint(identity: dict[str, Any]) -> str:

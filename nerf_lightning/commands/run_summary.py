@@ -8,6 +8,8 @@ from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.data.json_files import read_json
 from nerf_lightning.errors import InputError
 
+LARGEST = 1e30
+
 
 @dataclass(frozen=True)
 class RunSummary:
@@ -22,24 +24,28 @@ class RunSummary:
     """The step at which the run finished."""
     seconds: float | None
     """Time in training, evaluation and film, of all starts but those that were killed."""
+    started: str | None = None
+    """When the run was begun, such as 2026-11-21T10:00:00."""
 
 
 def read_run(folder: Path) -> RunSummary:
     """Return what a folder says, finished or not."""
-    note, metrics = read_note(folder), _read_json(folder / "metrics.json")
+    note, metrics = read_note(folder), read_json_object(folder / "metrics.json")
+    steps = number(note.get("finished_at_step"))
     return RunSummary(
         folder=folder,
         overrides=by_key(_read_overrides(folder / ".hydra" / "overrides.yaml")),
-        psnr=_number(metrics.get("psnr", note.get("psnr"))),
-        ssim=_number(metrics.get("ssim")),
-        steps=note.get("finished_at_step"),
-        seconds=_number(note.get("seconds")),
+        psnr=number(metrics.get("psnr", note.get("psnr"))),
+        ssim=number(metrics.get("ssim")),
+        steps=None if steps is None else int(steps),
+        seconds=number(note.get("seconds")),
+        started=str(note["started"]) if "started" in note else None,
     )
 
 
 def read_note(folder: Path) -> dict[str, Any]:
     """Return the content of `run.json`, empty where it is missing or damaged."""
-    return _read_json(folder / "run.json")
+    return read_json_object(folder / "run.json")
 
 
 def by_key(overrides: list[str]) -> dict[str, str]:
@@ -51,7 +57,8 @@ def by_key(overrides: list[str]) -> dict[str, str]:
     return {key: value for key, _, value in (override.partition("=") for override in overrides)}
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
     try:
         content = read_json(path)
     except InputError:
@@ -67,5 +74,8 @@ def _read_overrides(path: Path) -> list[str]:
     return [str(override) for override in content] if isinstance(content, list) else []
 
 
-def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+def number(value: Any) -> float | None:
+    """Return a number from a file, None where it is anything else; NaN is no number."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or abs(value) > LARGEST or value != value:
+        return None
+    return float(value)

@@ -1,31 +1,28 @@
-"""Measure a model on the views of a split: numbers per picture, their mean, and the protocol of both."""
+"""Measure a model on the views of a split: numbers per picture, what they come to, and the protocol of all of them."""
 
-import csv
-import hashlib
-import json
 import time
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.progress import track
-from torch import Tensor
 
 from nerf_lightning import ranks
 from nerf_lightning.commands.console import stderr_console
+from nerf_lightning.commands.environment import environment
+from nerf_lightning.commands.kept_views import KeptViews
+from nerf_lightning.commands.metrics_files import summary, write_metrics
+from nerf_lightning.commands.protocol import measured_how
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.geometry import depth_error, normal_error, normals_from_depth, surface_depth
-from nerf_lightning.evaluation.lpips import LPIPS_HINT, load_lpips
-from nerf_lightning.evaluation.metrics import image_metrics, masked_out, mean_over_images
-from nerf_lightning.export.atomic import whole_file
-from nerf_lightning.export.pictures import mosaic, save_png
+from nerf_lightning.evaluation.lpips import load_lpips
+from nerf_lightning.evaluation.metrics import image_metrics, masked_out
+from nerf_lightning.export.view_pictures import ScoredView
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
 from nerf_lightning.rendering.blending import photograph
 from nerf_lightning.types import Background, Scene
-
-METRICS = ("psnr", "ssim", "lpips", "depth_error", "normal_error")
 
 
 class Scoring:
@@ -35,7 +32,8 @@ class Scoring:
         split: train, val or test.
         max_views: most views, evenly spread over the split; None for all.
         quantize: round the render to 8 bits first, as a saved picture would be.
-        num_pictures: how many comparison pictures are kept.
+        num_pictures: how many views keep their pictures, evenly spread.
+        num_worst: how many more, those of the lowest PSNR.
         lpips_weights: a file with the backbone's weights; None: LPIPS is not computed.
         lpips_net: the backbone, alex or vgg.
     """
@@ -46,52 +44,63 @@ class Scoring:
         max_views: int | None = None,
         quantize: bool = False,
         num_pictures: int = 5,
+        num_worst: int = 3,
         lpips_weights: str | None = None,
         lpips_net: Literal["alex", "vgg"] = "alex",
     ):
         if max_views is not None and max_views < 1:
             raise InputError(f"evaluation.max_views={max_views}: give at least one view, or null for all.")
-        self.split, self.max_views, self.quantize, self.num_pictures = (
-            split,
-            max_views,
-            quantize,
-            num_pictures,
-        )
+        for name, count in (("num_pictures", num_pictures), ("num_worst", num_worst)):
+            if count < 0:
+                raise InputError(f"evaluation.{name}={count}: give 0 or more.")
+        self.split, self.max_views, self.quantize = split, max_views, quantize
+        self.num_pictures, self.num_worst = num_pictures, num_worst
         self.lpips = load_lpips(lpips_weights, lpips_net)
 
     def score(
-        self, model: RadianceModel, scene: Scene, background: Background, tile_points: int, folder: Path
+        self,
+        model: RadianceModel,
+        scene: Scene,
+        background: Background,
+        tile_points: int,
+        folder: Path,
+        origin: dict[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Render the views, write `metrics.json`, `metrics.csv` and pictures into `folder`, and return the metrics.
 
-        Depth errors are in scene units, normal errors in degrees; both only for scenes that know the truth.
+        Depth errors are in scene units, normal errors in degrees; both only for scenes that know the truth. `origin`
+        says whose numbers these are (`protocol.measured_of`), and is stamped beside them.
         """
         views = self._views(scene)
-        kept = {views[i * len(views) // self.num_pictures] for i in range(self.num_pictures)} if views else set()
+        spread = [views[i * len(views) // self.num_pictures] for i in range(self.num_pictures)]
+        kept = KeptViews(folder, self.split, self.num_worst)
         rows: list[dict[str, Any]] = []
-        started = time.perf_counter()
         mine = ranks.every_other(views)
         for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
+            started = time.perf_counter()
             picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
-            truth = photograph(scene, view, background)
-            if self.quantize:
-                picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
-            rows.append({"name": scene.view_names[view]} | self._measure(picture, truth, scene, view))
-            if view in kept:
-                panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
-                save_png(folder / "images" / _file_name(self.split, scene.view_names[view]), panel)
+            seconds = time.perf_counter() - started
+            row, shown = self._compare(picture, scene, view, background)
+            rows.append(row | {"seconds": seconds})
+            kept.watch(row["name"], row["psnr"], shown)
+            if view in spread:
+                kept.save(row["name"], shown)
         rows = ranks.in_turn(rows)
-        result: dict[str, Any] = mean_over_images([{m: row[m] for m in METRICS} for row in rows]) | {
-            "num_images": len(rows),
-            "seconds_per_image": (time.perf_counter() - started) / len(rows),
-            "per_image": rows,
-            "protocol": self._protocol(scene, views, background),
+        result = summary(rows) | {
+            "pictures": [scene.view_names[view] for view in dict.fromkeys(spread)],
+            "worst_views": kept.finish(rows),
+            "protocol": self.protocol(scene, views, background),
+            "origin": origin or {},
+            "environment": environment(),
         }
-        if result["lpips"] is None:
-            result["lpips_hint"] = LPIPS_HINT
         if ranks.is_first():
             write_metrics(folder, result)
         return result
+
+    def protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
+        """Return how these views are measured."""
+        lpips = None if self.lpips is None else self.lpips.net
+        return measured_how(scene, self.split, views, background, self.quantize, lpips)
 
     def _views(self, scene: Scene) -> list[int]:
         views = scene.splits.get(self.split, ())
@@ -102,49 +111,18 @@ class Scoring:
         count = len(views) if self.max_views is None else min(self.max_views, len(views))
         return [views[i * len(views) // count] for i in range(count)]
 
-    def _measure(self, picture: Picture, truth: Tensor, scene: Scene, view: int) -> dict[str, float | None]:
+    def _compare(
+        self, picture: Picture, scene: Scene, view: int, background: Background
+    ) -> tuple[dict[str, Any], ScoredView]:
+        truth = photograph(scene, view, background)
+        if self.quantize:
+            picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
         kept = scene.pixels.kept(view)
-        values: dict[str, float | None] = dict(image_metrics(picture.rgb, truth, kept))
+        row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(picture.rgb, truth, kept)}
         compared = masked_out(picture.rgb, truth, kept)
-        values["lpips"] = None if self.lpips is None else self.lpips.score(compared, truth)
-        return values | _geometry_errors(picture, scene, view)
-
-    def _protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
-        sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
-        return {
-            "scene": scene.name,
-            "split": self.split,
-            "split_hash": split_hash(scene, views),
-            "background": "white" if background == "random" else background,
-            "resolution": [list(size) for size in sizes],
-            "pixels": "8-bit" if self.quantize else "float",
-            "psnr": "mean of the pictures' own",
-            "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
-            **({} if scene.pixels.mask is None else {"masks": "left out"}),
-            **scene.protocol,
-        }
-
-
-def split_hash(scene: Scene, views: list[int]) -> str:
-    """Return a fingerprint of names, pixels and masks, so that numbers on different pictures are not compared."""
-    digest = hashlib.sha256()
-    for view in views:
-        digest.update(scene.view_names[view].encode())
-        digest.update(scene.pixels.view(view).contiguous().numpy().tobytes())
-        kept = scene.pixels.kept(view)
-        if kept is not None:
-            digest.update(kept.numpy().tobytes())
-    return digest.hexdigest()[:16]
-
-
-def write_metrics(folder: Path, result: dict[str, Any]) -> None:
-    """Write `metrics.json`, and `metrics.csv` with a row per picture."""
-    with whole_file(folder / "metrics.json") as part:
-        part.write_text(json.dumps(result, indent=2) + "\n")
-    with whole_file(folder / "metrics.csv") as part, part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["name", *METRICS])
-        writer.writeheader()
-        writer.writerows(result["per_image"])
+        row["lpips"] = None if self.lpips is None else self.lpips.score(compared, truth)
+        depth = unit_of(scene.to_user) * picture.depth
+        return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
 
 
 def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, float | None]:
@@ -166,8 +144,3 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
         "depth_error": depth_error(picture.depth, picture.opacity, far, true_depth, alpha),
         "normal_error": normal_error(normals, true_normals, alpha),
     }
-
-
-def _file_name(split: str, view_name: str) -> str:
-    plain = view_name.replace("/", "_").replace("\\", "_")
-    return f"{plain}.png" if plain.startswith(f"{split}_") else f"{split}_{plain}.png"

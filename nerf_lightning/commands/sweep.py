@@ -17,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.slurm import slurm_job
 from nerf_lightning.commands.sweep_job import JobRecord, read_records, records_folder, stop_file
-from nerf_lightning.commands.sweep_table import job_rows, print_rows, write_rows
+from nerf_lightning.commands.sweep_table import job_rows
+from nerf_lightning.commands.table_files import print_rows, write_rows
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 
@@ -104,7 +105,7 @@ def _end() -> list[JobRecord]:
         return []
     rows = job_rows(records, sweep.folder)
     print_rows(rows, f"sweep {sweep.folder}")
-    write_rows(rows, sweep.folder)
+    write_rows(rows, sweep.folder, "sweep")
     print(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
         print(f"go on with   {sweep.go_on_with()}")

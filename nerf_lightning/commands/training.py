@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch import Callback
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
@@ -62,7 +62,10 @@ def train(config: DictConfig) -> float | None:
     try:
         path, checkpoint = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
         with _log_file(path) if ranks.is_first() else nullcontext():
-            psnr, last_step = _run(config, parts, path, checkpoint)
+            trainer = _fit(config, parts, path, checkpoint)
+            for folder in held:
+                folder.trained()
+            psnr, last_step = _finish(parts, path, trainer), trainer.global_step
         for folder in held:
             folder.finish(last_step, psnr)
         return psnr
@@ -88,6 +91,7 @@ def _build_parts(config: DictConfig) -> Parts:
     settings.prepare_machine()
     finish = Finish.from_config(config)
     scene: Scene = build(config.scene).read()
+    finish.require_film(scene)
     num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
     num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
@@ -101,7 +105,7 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, *build(config.callbacks).values(), *build(config.viewer).values()]
     if config.budget.seconds is not None:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
@@ -109,7 +113,7 @@ def _build_parts(config: DictConfig) -> Parts:
     return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
 
 
-def _run(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None) -> tuple[float | None, int]:
+def _fit(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None) -> Trainer:
     former = None if checkpoint is None else read_checkpoint(checkpoint)
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder)
@@ -131,10 +135,14 @@ def _run(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
         raise SystemExit(128 + parts.signals.received)
+    return trainer
+
+
+def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
     psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder)
     for logger in trainer.loggers:
         logger.finalize("success")
-    return psnr, trainer.global_step
+    return psnr
 
 
 def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:

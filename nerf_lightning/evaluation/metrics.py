@@ -3,6 +3,7 @@
 Papers average the PSNR of each image. Pooling the squared error over images first gives a lower number.
 """
 
+import statistics
 from collections.abc import Sequence
 
 import torch
@@ -12,6 +13,8 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
+HIGHER_IS_BETTER = ("psnr", "ssim")
+"""Of the others, which are errors, the lower is better."""
 
 
 def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
@@ -65,11 +68,36 @@ def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, 
     Raises:
         ValueError: no images.
     """
+    return {name: None if known is None else sum(known) / len(known) for name, known in _columns(per_image).items()}
+
+
+def median_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
+    """Return each metric's median over images; None where an image has none.
+
+    Raises:
+        ValueError: no images.
+    """
+    return {name: None if known is None else statistics.median(known) for name, known in _columns(per_image).items()}
+
+
+def worst_of_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, int | None]:
+    """Return which image is worst by each metric; None where an image has none.
+
+    >>> worst_of_images([{"psnr": 30.0, "lpips": 0.1}, {"psnr": 20.0, "lpips": 0.3}])
+    {'psnr': 1, 'lpips': 1}
+
+    Raises:
+        ValueError: no images.
+    """
+    return {
+        name: None if known is None else known.index(min(known) if name in HIGHER_IS_BETTER else max(known))
+        for name, known in _columns(per_image).items()
+    }
+
+
+def _columns(per_image: Sequence[dict[str, float | None]]) -> dict[str, list[float] | None]:
     if not per_image:
         raise ValueError("there is no image to average over")
-    return {name: _mean([image[name] for image in per_image]) for name in per_image[0]}
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if len(known) == len(values) else None
+    columns = {name: [image[name] for image in per_image] for name in per_image[0]}
+    known = {name: [value for value in values if value is not None] for name, values in columns.items()}
+    return {name: known[name] if len(known[name]) == len(columns[name]) else None for name in columns}

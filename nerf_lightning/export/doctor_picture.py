@@ -50,6 +50,13 @@ def doctor_picture(
     return picture_of(figure)
 
 
+def coverage_picture(scene: Scene, width: int = 900, height: int = 460) -> UInt8[Tensor, "height width 3"]:
+    """Return the coverage map alone; it needs the cameras and no photograph."""
+    figure = new_figure(width, height)
+    _draw_coverage(figure.subplots(), scene)
+    return picture_of(figure)
+
+
 def content_points(evidence: Evidence) -> Float[Tensor, "points 3"]:
     """Return where content lies: the sparse points, or where the rays of matched details meet."""
     scene = evidence.scene

@@ -87,9 +87,16 @@ def depth_picture(
     """
     colors = color_map(depth, low=far, high=near)
     if opacity is not None:
-        shown = opacity.detach().float().cpu().clamp(0, 1)[..., None]
-        colors = colors * shown + _BACKDROP * (1 - shown)
+        colors = faded(colors, opacity)
     return _with_scale(to_bytes(colors), top=near, bottom=far)
+
+
+def faded(
+    colors: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
+) -> Float[Tensor, "height width 3"]:
+    """Return colours that fade to pale grey where light passes through."""
+    shown = opacity.detach().float().cpu().clamp(0, 1)[..., None]
+    return colors * shown + _BACKDROP * (1 - shown)
 
 
 def error_picture(
@@ -114,8 +121,8 @@ def mosaic(
         "depth": depth_picture(depth, near, far, opacity),
         "error": error_picture(truth, render),
     }
-    size = _letter_size(truth.shape[0])
-    row = side_by_side([_with_caption(p, name, size) for name, p in panels.items()], gap=size)
+    size = letter_size(truth.shape[0])
+    row = side_by_side([with_caption(p, name, size) for name, p in panels.items()], gap=size)
     return torch.nn.functional.pad(row, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)
 
 
@@ -127,12 +134,13 @@ def _colors() -> Float[Tensor, "256 3"]:
     return torch.tensor(colormaps["magma"](np.arange(256))[:, :3], dtype=torch.float32)
 
 
-def _letter_size(height: int) -> int:
+def letter_size(height: int) -> int:
     """Return a size of type (pixels), legible beside a small picture and not loud beside a large one."""
     return max(10, round(0.03 * height))
 
 
-def _with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int) -> UInt8[Tensor, "taller wider 3"]:
+def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the picture under a line of text, in letters of `size` pixels."""
     font = ImageFont.load_default(size)
     height, width, _ = picture.shape
     top = round(1.5 * size)
@@ -145,7 +153,7 @@ def _with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int
 def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
     """Set a slim colour bar at the picture's right, from bright at `top` down to dark, with both numbers."""
     height, width, _ = picture.shape
-    size = _letter_size(height)
+    size = letter_size(height)
     font = ImageFont.load_default(size)
     texts = (f"{top:.3g}", f"{bottom:.3g}")
     thick, space = max(4, size // 2), max(3, size // 3)

@@ -46,6 +46,6 @@ def _surface_points(model: RadianceModel, record: SceneRecord, tile_points: int)
         for size in (record.cameras.width, record.cameras.height)
     )
     rays = rays_through_pixels(record.cameras, PixelIndex(view, x, y), record.near, record.far)
-    _, depth, opacity = render_rays(model, rays, record.background, tile_points)
+    _, depth, opacity, *_ = render_rays(model, rays, record.background, tile_points)
     at = rays.origins + surface_depth(depth, opacity, rays.far)[:, None] * rays.directions
     return at[opacity > OPAQUE]

@@ -1,4 +1,4 @@
-"""Videos: H.264 in mp4 by the ffmpeg that imageio-ffmpeg carries, or a folder of PNG frames.
+"""Videos: H.264 in mp4 by the ffmpeg that imageio-ffmpeg carries.
 
 ffmpeg is run here, not by imageio's writer, which rescales odd sizes and says nothing when ffmpeg fails.
 """
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
-from nerf_lightning.export.pictures import save_png
 
 # The picture is converted by the rule of BT.709 and says so: untagged, players guess the rule from the size.
 # Newer ffmpegs convert by the tag alone, those before 7 need the filter.
@@ -60,15 +59,6 @@ def write_video(
             count += 1
         if total is not None and count != total:
             raise ValueError(f"{path}: {count} frames came, {total} were promised")
-
-
-def write_frames(folder: Path, frames: Iterable[UInt8[Tensor, "height width 3"]]) -> int:
-    """Write frames as frame_0000.png, frame_0001.png, ... and return how many; removes nothing."""
-    count = 0
-    for frame in frames:
-        save_png(folder / f"frame_{count:04d}.png", frame)
-        count += 1
-    return count
 
 
 def pad_to_even(picture: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "even_height even_width 3"]:

@@ -61,6 +61,16 @@ def world_distance(rays: RayBundle, share: Float[Tensor, "*rays"]) -> Float[Tens
     return before + origins[..., 2] * (1.0 / gap - 1.0) / forward
 
 
+def share_at_distance(rays: RayBundle, distance: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays"]:
+    """Return the share of the way through the cube at a distance along world rays; before the near plane it is 0.
+
+    The inverse of `world_distance`.
+    """
+    origins, forward = _at_near_plane(rays)
+    before = ((origins - rays.origins) * rays.directions).sum(dim=-1)
+    return 1.0 - 1.0 / (1.0 + (distance - before).clamp(min=0.0) * forward / origins[..., 2])
+
+
 def _at_near_plane(rays: RayBundle) -> tuple[Float[Tensor, "*rays 3"], Float[Tensor, "*rays"]]:
     forward = rays.directions[..., 2].clamp(max=-LEAST_FORWARD)
     reach = -(1.0 + rays.origins[..., 2]) / forward

@@ -14,22 +14,22 @@ def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[
     return finite & (off < tolerance) & (torch.linalg.det(torch.nan_to_num(rotation)) > 0)
 
 
-def rotation_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3 3"]:
+def rotation_from_quaternion(quaternion: Float[Tensor, "*views 4"]) -> Float[Tensor, "*views 3 3"]:
     """Return the rotation of a quaternion w, x, y, z of any length but zero.
 
     >>> rotation_from_quaternion(torch.tensor([1.0, 0.0, 0.0, 1.0])).round().tolist()  # a quarter turn around z
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    w, x, y, z = (quaternion / quaternion.norm()).unbind()
+    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(dim=-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return torch.stack([torch.stack(row) for row in rows])
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def quaternion_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Tensor, "*views 4"]:
     """Return the unit quaternion w, x, y, z (w not negative) of a rotation; the inverse of `rotation_from_quaternion`.
 
     It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (AIAA 00-4101, 2000), so no case is special.
@@ -37,15 +37,16 @@ def quaternion_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4
     >>> quaternion_from_rotation(torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])).abs()  # a quarter turn around z
     tensor([0.7071, 0.0000, 0.0000, 0.7071])
     """
-    (a, b, c), (d, e, f), (g, h, i) = rotation.double()
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(dim=-1) for row in rotation.double().unbind(dim=-2))
     rows = [
         [a + e + i, h - f, c - g, d - b],
         [h - f, a - e - i, b + d, c + g],
         [c - g, b + d, e - a - i, f + h],
         [d - b, c + g, f + h, i - a - e],
     ]
-    vector = torch.linalg.eigh(torch.stack([torch.stack(row) for row in rows]))[1][:, -1]
-    return (vector if vector[0] >= 0 else -vector).to(rotation)
+    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    vector = torch.linalg.eigh(matrix)[1][..., -1]
+    return torch.where(vector[..., :1] < 0, -vector, vector).to(rotation)
 
 
 def look_at(

@@ -17,6 +17,8 @@ class AnyLevel(nn.Module):
     """The contract of a level: one round of sampling and rendering."""
 
     field: Field
+    has_color = True
+    """Whether its rendering is a picture."""
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
@@ -136,6 +138,12 @@ class RadianceModel(nn.Module):
     def level_names(self) -> tuple[str, ...]:
         """The levels' names, first to last."""
         return tuple(self.levels)
+
+    @property
+    def first_picture(self) -> int | None:
+        """The number of the first level whose rendering is a picture, where it is not the last one."""
+        numbers = [number for number, level in enumerate(self._in_order()) if level.has_color]
+        return numbers[0] if len(numbers) > 1 else None
 
     @property
     def needs_whole_batch(self) -> bool:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.geometry.clipping import Clip
 from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
@@ -25,6 +26,8 @@ class Picture(TensorStruct):
     depth: Float[Tensor, "height width"]
     """Expected distance along the ray; light that escapes ends at far."""
     opacity: Float[Tensor, "height width"]
+    first_rgb: Float[Tensor, "height width 3"] | None = None
+    """What the first level sees that makes pictures, where it is not the last."""
 
 
 @torch.no_grad()
@@ -36,23 +39,75 @@ def render_picture(
     far: Float[Tensor, "views"],
     background: Background,
     tile_points: int,
+    clip: Clip | None = None,
+    seen_from: Cameras | None = None,
 ) -> Picture:
-    """Render one view with the last level, as at evaluation (no jitter)."""
-    pixels = all_pixels(cameras, view)
-    shape = pixels.x.shape
-    rays = rays_through_pixels(cameras, pixels.map(torch.flatten), near, far)
-    rgb, depth, opacity = render_rays(model, rays, background, tile_points)
+    """Render one view with the last level, as at evaluation (no jitter).
+
+    Args:
+        model: in evaluation mode.
+        cameras: among others the one of this view.
+        view: its number.
+        near: where rays begin, per view.
+        far: where they end.
+        background: what lies behind the scene.
+        tile_points: most points that go through a field at once.
+        clip: what of the scene is shown; None: all.
+        seen_from: cameras from whose directions the colour is looked up, in place of the view's own.
+    """
+    rays, straight = view_rays(cameras, view, near, far, clip)
+    if seen_from is not None:
+        rays = replace(rays, view_directions=view_rays(seen_from, view, near, far)[1].view_directions)
+    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
+    shape = rays.near.shape
+    rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
     if cameras.ndc is not None:
-        straight = rays_through_pixels(replace(cameras, ndc=None), pixels.map(torch.flatten), near, far)
-        depth = world_distance(straight, depth / rays.far)
-    return Picture(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape))
+        whole = rays_through_pixels(cameras, all_pixels(cameras, view), near, far).far
+        depth = world_distance(straight, depth / whole)
+    return Picture(rgb, depth, opacity, *first)
+
+
+def view_rays(
+    cameras: Cameras,
+    view: int,
+    near: Float[Tensor, "views"],
+    far: Float[Tensor, "views"],
+    clip: Clip | None = None,
+) -> tuple[RayBundle, RayBundle]:
+    """Return a picture of rays as the model takes them, and the same rays through the world."""
+    pixels = all_pixels(cameras, view)
+    rays = rays_through_pixels(cameras, pixels, near, far)
+    straight = rays if cameras.ndc is None else rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)
+    if clip is not None:
+        rays = clip(rays, straight, ndc=cameras.ndc is not None)
+    return rays, straight
+
+
+def _flat(picture: Tensor) -> Tensor:
+    return picture.flatten(0, 1)
 
 
 @torch.no_grad()
-def render_rays(
-    model: RadianceModel, rays: RayBundle, background: Background, tile_points: int
-) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"]]:
-    """Render rays with the last level, without jitter: colour, depth and opacity, on the CPU."""
+def render_rays(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+    """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
+
+    Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
+    """
+    count = rays.near.numel()
+    behind = background_colors(background, count, torch.device("cpu"), random=None)
+    empty = torch.zeros(count, 3) if behind is None else behind
+    columns = [empty.clone(), rays.far.cpu().clone(), torch.zeros(count)]
+    if model.first_picture is not None:
+        columns.append(empty.clone())
+    shown = (rays.far > rays.near).nonzero()[:, 0]
+    if shown.numel():
+        rendered = _render_all(model, rays[shown], background, tile_points)
+        for column, part in zip(columns, rendered, strict=True):
+            column[shown.cpu()] = part.to(column)
+    return columns
+
+
+def _render_all(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
     device = next(model.parameters()).device
     at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
@@ -60,8 +115,7 @@ def render_rays(
     while True:
         try:
             parts = [_render_tile(model, rays[p].to(device), background) for p in tiles(rays.near.numel(), at_once)]
-            rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
-            return rgb, depth, opacity
+            return [torch.cat(column) for column in zip(*parts, strict=True)]
         except RuntimeError as error:
             if at_once == 1 or not is_out_of_memory(error):
                 raise
@@ -69,7 +123,9 @@ def render_rays(
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
 
 
-def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> tuple[Tensor, Tensor, Tensor]:
+def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> list[Tensor]:
     behind = background_colors(background, rays.near.numel(), rays.near.device, random=None)
-    last = model(rays, behind, random=None)[-1]
-    return last.rgb.cpu(), last.depth.cpu(), last.opacity.cpu()
+    levels = model(rays, behind, random=None)
+    last, first = levels[-1], model.first_picture
+    columns = [last.rgb.cpu(), last.depth.cpu(), last.opacity.cpu()]
+    return columns if first is None else [*columns, levels[first].rgb.cpu()]

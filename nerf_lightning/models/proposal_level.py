@@ -11,6 +11,8 @@ from nerf_lightning.types import FieldOutput
 class ProposalLevel(Level):
     """Sample, ask the field for density alone, and hand the weights on; its picture is black."""
 
+    has_color = False
+
     def ask(
         self,
         positions: Float[Tensor, "*rays samples 3"],

@@ -144,6 +144,8 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),
+        ("path=photographs path.views=[nobody,0]", "path.views: the capture has no photograph nobody"),
+        ("path=keyframes path.file=none.yaml", "The keyframe file none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("evaluation.split=all", "evaluation.split=all does not fit"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
@@ -153,7 +155,9 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
     ],
 )
 def test_a_bad_setting_is_named_before_a_folder_is_taken(nerf, capture, tmp_path, override, words):
-    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run", override)
+    result = nerf(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run", *override.split()
+    )
     said(result, words)
     assert not (tmp_path / "run").exists()
 

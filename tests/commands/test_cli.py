@@ -24,7 +24,7 @@ def test_help_imports_nothing_heavy():
     assert output.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "view"])
 def test_help_of_a_command_lists_groups_and_examples(nerf, command):
     result = nerf(command, "--help")
     assert result.code == 0

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.commands.build import build
 from nerf_lightning.export.base import Export
+from nerf_lightning.geometry.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = {
     "encoder": "encoder",
@@ -17,6 +18,7 @@ BUILT = {
     "loss": "loss",
     "scheduler": "scheduler",
     "callbacks": "callbacks",
+    "viewer": "viewer",
     "path": "path",
     "evaluation": "evaluation",
     "optimizer": "optimizer",
@@ -24,8 +26,12 @@ BUILT = {
 
 
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g in BUILT for o in options(g)])
-def test_every_component_builds(group, option):
-    assert build(composed("train", f"{group}={option}")[BUILT[group]]) is not None
+def test_every_component_builds(group, option, tmp_path):
+    config = composed("train", f"{group}={option}")[BUILT[group]]
+    if OmegaConf.is_missing(config, "file"):
+        write_keyframes(tmp_path / "keys.yaml", [Keyframe((x, 0.0, 0.0), look_at=(0.0, 1.0, 0.0)) for x in (0.0, 1.0)])
+        config.file = str(tmp_path / "keys.yaml")
+    assert build(config) is not None
 
 
 @pytest.mark.parametrize("option", options("experiment"))
@@ -53,7 +59,7 @@ def test_every_export_builds(option):
     assert isinstance(build(composed("export", f"what={option}").what), Export)
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view"])
 def test_every_command_composes(command):
     assert "trainer" in composed(command)
 

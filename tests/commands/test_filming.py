@@ -5,7 +5,7 @@ import math
 import torch
 from posed_captures import Known, read, wall, write_llff
 
-from nerf_lightning.commands.filming import in_front_of_near_plane
+from nerf_lightning.commands.shots import in_front_of_near_plane
 from nerf_lightning.geometry.cameras import pinhole_cameras
 from nerf_lightning.geometry.paths.auto import AutoPath
 from nerf_lightning.geometry.paths.base import frame_of

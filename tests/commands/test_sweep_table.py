@@ -7,7 +7,8 @@ import yaml
 
 from nerf_lightning.commands.run_summary import read_run
 from nerf_lightning.commands.sweep_job import JobRecord, read_records
-from nerf_lightning.commands.sweep_table import job_rows, print_rows, write_rows
+from nerf_lightning.commands.sweep_table import job_rows
+from nerf_lightning.commands.table_files import print_rows, write_rows
 
 
 def leave_run(folder, overrides, measured, ssim=0.5, **note):
@@ -69,7 +70,7 @@ def test_files_are_whole_and_the_text_is_short(tmp_path, capsys):
         {"job": 0, "lr": "0.00012520653814999472", "PSNR": 20.123456789, "SSIM": None, "folder": "a|b"},
         {"job": 1, "lr": "1e-3", "PSNR": None, "SSIM": None, "folder": "c"},
     ]
-    write_rows(rows, tmp_path)
+    write_rows(rows, tmp_path, "sweep")
     header, first, *_ = csv.reader((tmp_path / "sweep.csv").read_text().splitlines())
     assert dict(zip(header, first, strict=True))["PSNR"] == "20.123456789"
     assert (tmp_path / "sweep.md").read_text().splitlines() == [

@@ -3,7 +3,14 @@ import math
 import pytest
 import torch
 
-from nerf_lightning.evaluation.metrics import SSIM_WINDOW, image_metrics, mean_over_images, psnr
+from nerf_lightning.evaluation.metrics import (
+    SSIM_WINDOW,
+    image_metrics,
+    mean_over_images,
+    median_over_images,
+    psnr,
+    worst_of_images,
+)
 
 
 def pair(mse, size=16):
@@ -64,3 +71,15 @@ def test_a_metric_that_an_image_lacks_has_no_mean():
     assert mean == {"psnr": 25.0, "ssim": None}
     with pytest.raises(ValueError, match="no image"):
         mean_over_images([])
+
+
+def test_median_and_worst_know_which_way_is_worse():
+    rows = [{"psnr": 20.0, "depth_error": 0.1}, {"psnr": 30.0, "depth_error": 0.3}, {"psnr": 22.0, "depth_error": 0.2}]
+    assert median_over_images(rows) == {"psnr": 22.0, "depth_error": 0.2}
+    assert worst_of_images(rows) == {"psnr": 0, "depth_error": 1}
+    lacking = [*rows, {"psnr": 10.0, "depth_error": None}]
+    assert median_over_images(lacking) == {"psnr": 21.0, "depth_error": None}
+    assert worst_of_images(lacking) == {"psnr": 3, "depth_error": None}
+    for function in (mean_over_images, median_over_images, worst_of_images):
+        with pytest.raises(ValueError, match="no image"):
+            function([])

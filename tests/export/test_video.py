@@ -5,11 +5,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from videos import read_video
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.video import pad_to_even, write_frames, write_video
+from nerf_lightning.export.video import pad_to_even, write_video
 
 COLORS = [(220, 40, 40), (40, 180, 60), (30, 60, 200), (250, 250, 250)]
 
@@ -118,13 +117,3 @@ def test_no_ffmpeg_says_how_to_get_it(tmp_path, monkeypatch):
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"ends in \.mp4"):
         write_video(tmp_path / "a.gif", plain(8, 8), fps=10)
-
-
-def test_frames_are_numbered_pictures(tmp_path):
-    assert write_frames(tmp_path / "frames", iter(plain(5, 7))) == 4
-    names = sorted(os.listdir(tmp_path / "frames"))
-    assert names == [f"frame_{i:04d}.png" for i in range(4)]
-    for name, color in zip(names, COLORS, strict=True):
-        picture = np.asarray(Image.open(tmp_path / "frames" / name))
-        assert picture.shape == (5, 7, 3)
-        assert (picture == color).all()

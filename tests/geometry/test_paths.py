@@ -1,18 +1,18 @@
 import inspect
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-import yaml
+from configs import loaded, options
+from hydra.utils import get_class
+from omegaconf import OmegaConf
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import pinhole_cameras, project
 from nerf_lightning.geometry.paths.auto import AutoPath, widest_gap
 from nerf_lightning.geometry.paths.base import PathFrame, frame_of
 from nerf_lightning.geometry.paths.orbit import Orbit
-from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.geometry.poses import is_rigid, look_at
 
 
@@ -102,11 +102,13 @@ def test_a_radius_of_ones_own():
         ({"width": 0}, "path.width is 0"),
         ({"height": -3}, "path.height is -3"),
         ({"fps": 0}, "path.fps is 0"),
+        ({"fov": 180.0}, "path.fov is 180.0"),
+        ({"center": [0.0, 1.0]}, "path.center is .0.0, 1.0., but must be three finite numbers"),
     ],
 )
 def test_a_bad_number_is_named(bad, words):
     with pytest.raises(InputError, match=words):
-        Orbit(**bad)
+        Orbit(**bad).cameras(frame())
 
 
 def test_the_frame_of_a_capture():
@@ -132,12 +134,13 @@ def test_a_path_leaves_the_lens_behind():
     assert cameras.focal.tolist() == [[70.0, 70.0]] * 3
 
 
-@pytest.mark.parametrize("path", [Orbit, Spiral, AutoPath])
-def test_the_yaml_lists_the_constructors_defaults(path):
-    name = "auto" if path is AutoPath else path.__name__.lower()
-    listed = yaml.safe_load((Path(__file__).parents[2] / "conf" / "path" / f"{name}.yaml").read_text())
-    assert listed.pop("_target_") == f"{path.__module__}.{path.__qualname__}"
-    assert listed == {name: each.default for name, each in inspect.signature(path).parameters.items()}
+@pytest.mark.parametrize("name", options("path"))
+def test_the_yaml_lists_the_constructors_defaults(name):
+    listed = OmegaConf.to_container(loaded("path", name))
+    path = get_class(listed.pop("_target_"))
+    assert listed.pop("file", "???") == "???"
+    defaults = {name: each.default for name, each in inspect.signature(path).parameters.items()}
+    assert listed == {name: value for name, value in defaults.items() if value is not inspect.Parameter.empty}
 
 
 def ring(degrees, elevation=40.0, radius=4.0):

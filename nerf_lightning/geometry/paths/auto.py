@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.geometry.frames import gaps_around
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting, horizontal
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.geometry.paths.spiral import Spiral
 from nerf_lightning.types import Cameras
@@ -27,6 +27,7 @@ class AutoPath(CameraPath):
         height: picture's height in pixels; None: it follows the width.
         longest: where neither is given, the picture is as large as the photographs, but its longer side has at most so
             many pixels: a film of photographs at full size takes hours.
+        fov: degrees that the picture's width takes in; None: as the photographs.
         fps: frames per second.
     """
 
@@ -36,11 +37,11 @@ class AutoPath(CameraPath):
         width: int | None = None,
         height: int | None = None,
         longest: int = 480,
+        fov: float | None = None,
         fps: int = 30,
     ) -> None:
-        check_film(num_frames, width, height, fps)
+        super().__init__(num_frames, width, height, fov, fps)
         check_setting("longest", longest, longest >= 1, "at least 1 pixel")
-        self.num_frames, self.width, self.height, self.fps = num_frames, width, height, fps
         self.longest = longest
 
     def cameras(self, around: PathFrame) -> Cameras:
@@ -50,11 +51,11 @@ class AutoPath(CameraPath):
             width = max(1, round(around.width * min(1.0, self.longest / max(around.width, around.height))))
         from_center = around.poses[:, :, 3] - around.center
         if widest_gap(from_center, around.up) > WIDEST_GAP:
-            return Spiral(self.num_frames, width=width, height=self.height, fps=self.fps).cameras(around)
+            return Spiral(self.num_frames, width=width, height=self.height, fov=self.fov).cameras(around)
         height = from_center @ around.up / (from_center.norm(dim=-1) * around.up.norm())
         elevation = float(torch.rad2deg(height.clamp(-1, 1).asin()).median())
         elevation = min(max(elevation, LOWEST), HIGHEST)
-        return Orbit(self.num_frames, elevation, width=width, height=self.height, fps=self.fps).cameras(around)
+        return Orbit(self.num_frames, elevation, width=width, height=self.height, fov=self.fov).cameras(around)
 
 
 def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.geometry.cameras import pinhole_cameras
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting, horizontal
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -21,11 +20,13 @@ class Orbit(CameraPath):
     Args:
         num_frames: how many cameras.
         elevation: degrees above the horizon, between -90 and 90, both excluded (there the picture has no up).
-        radius: distance from the centre in scene units; None: the frame's own, as the photographs were taken.
+        radius: distance from the centre in the capture's units; None: as far as the photographs were taken.
         turns: full circles; negative goes clockwise.
         start: azimuth of the first camera in degrees; 0 is on the world's x axis where up is z.
-        width: picture's width in pixels; None: it follows the height, or is the frame's own.
-        height: picture's height in pixels; None: it follows the width, or is the frame's own.
+        center: what it goes around, [x, y, z] in the capture's own frame; None: the middle of the scene.
+        width: picture's width in pixels; None: it follows the height, or is the photographs'.
+        height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        fov: degrees that the picture's width takes in; None: as the photographs.
         fps: frames per second.
 
     Raises:
@@ -39,26 +40,27 @@ class Orbit(CameraPath):
         radius: float | None = None,
         turns: float = 1.0,
         start: float = 0.0,
+        center: list[int | float] | None = None,
         width: int | None = None,
         height: int | None = None,
+        fov: float | None = None,
         fps: int = 30,
     ) -> None:
-        check_film(num_frames, width, height, fps)
+        super().__init__(num_frames, width, height, fov, fps)
         check_setting("elevation", elevation, -90 < elevation < 90, "between -90 and 90 degrees, both excluded")
         check_setting("radius", radius, radius is None or 0 < radius < math.inf, "a positive distance, or null")
         check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
         check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
-        self.num_frames, self.elevation, self.radius = num_frames, elevation, radius
-        self.turns, self.start, self.fps = turns, start, fps
-        self.width, self.height = width, height
+        self.elevation, self.radius = elevation, radius
+        self.turns, self.start, self.center = turns, start, center
 
     def cameras(self, around: PathFrame) -> Cameras:
-        """Return the cameras of the circle. A picture of another size keeps the horizontal field of view."""
-        radius = around.radius if self.radius is None else self.radius
-        eyes = around.center + radius * self._directions(around.up)
-        width, height, scale = around.size(self.width, self.height)
-        c2w = look_at(eyes, around.center.expand_as(eyes), around.up)
-        return pinhole_cameras(c2w, around.focal * scale, width, height)
+        """Return the cameras of the circle."""
+        given = around.point("center", self.center)
+        center = around.center if given is None else given
+        radius = around.radius if self.radius is None else self.radius / around.unit
+        eyes = center + radius * self._directions(around.up)
+        return self.pinholes(look_at(eyes, center.expand_as(eyes), around.up), around)
 
     def _directions(self, up: Float[Tensor, "3"]) -> Float[Tensor, "frames 3"]:
         """Return unit vectors from the centre to the cameras."""

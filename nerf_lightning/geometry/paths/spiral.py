@@ -5,9 +5,8 @@ from typing import final
 
 import torch
 
-from nerf_lightning.geometry.cameras import pinhole_cameras
 from nerf_lightning.geometry.frames import average_pose
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_film, check_setting
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -20,8 +19,10 @@ class Spiral(CameraPath):
         num_frames: how many cameras.
         reach: size of the spiral as a share of how far the photographs were taken apart.
         turns: full circles; on the way the camera goes once nearer and back.
+        target: what it looks at, [x, y, z] in the capture's own frame; None: the middle of the scene.
         width: picture's width in pixels; None: it follows the height, or is the photographs'.
         height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        fov: degrees that the picture's width takes in; None: as the photographs.
         fps: frames per second.
 
     Raises:
@@ -33,18 +34,21 @@ class Spiral(CameraPath):
         num_frames: int = 120,
         reach: float = 0.7,
         turns: float = 2.0,
+        target: list[int | float] | None = None,
         width: int | None = None,
         height: int | None = None,
+        fov: float | None = None,
         fps: int = 30,
     ) -> None:
-        check_film(num_frames, width, height, fps)
+        super().__init__(num_frames, width, height, fov, fps)
         check_setting("reach", reach, 0 < reach < math.inf, "a positive share")
         check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        self.num_frames, self.reach, self.turns, self.fps = num_frames, reach, turns, fps
-        self.width, self.height = width, height
+        self.reach, self.turns, self.target = reach, turns, target
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the spiral, the last of which precedes the first."""
+        given = around.point("target", self.target)
+        target = around.center if given is None else given
         mean = average_pose(around.poses)
         offsets = (around.poses[:, :, 3] - mean[:, 3]) @ mean[:, :3]
         # The outermost tenth of the photographs does not count: there, only few of them see the same.
@@ -52,6 +56,4 @@ class Spiral(CameraPath):
         angle = 2 * math.pi * torch.arange(self.num_frames).to(mean) / self.num_frames
         wave = torch.stack([(self.turns * angle).cos(), (self.turns * angle).sin(), angle.sin()], dim=-1)
         eyes = mean[:, 3] + (wave * reach) @ mean[:, :3].mT
-        width, height, scale = around.size(self.width, self.height)
-        c2w = look_at(eyes, around.center.expand_as(eyes), mean[:, 1])
-        return pinhole_cameras(c2w, around.focal * scale, width, height)
+        return self.pinholes(look_at(eyes, target.expand_as(eyes), mean[:, 1]), around)

@@ -1,0 +1,47 @@
+"""Which of the scored views keep their pictures: some, evenly spread, and the worst."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.export.view_pictures import ScoredView, save_view
+
+
+@dataclass
+class KeptViews:
+    """The pictures that one process keeps while it scores its views."""
+
+    folder: Path
+    split: str
+    num_worst: int
+    worst: list[tuple[float, str, ScoredView]] = field(default_factory=list)
+    """The lowest PSNR so far, with name and pictures; no more are held, since a split may be larger than memory."""
+
+    def save(self, name: str, view: ScoredView) -> None:
+        """Write the pictures of a view of the even spread."""
+        self._write(picture_name(self.split, name), view)
+
+    def watch(self, name: str, psnr: float, view: ScoredView) -> None:
+        """Hold a view for as long as it may be among the worst."""
+        self.worst = sorted([*self.worst, (psnr, name, view)], key=lambda held: held[:2])[: self.num_worst]
+
+    def finish(self, rows: list[dict[str, Any]]) -> list[str]:
+        """Write those that are among the worst of all processes' rows; return the names of these, the worst first."""
+        names = [name for _, name in sorted((row["psnr"], row["name"]) for row in rows)][: self.num_worst]
+        for _, name, view in self.worst:
+            if name in names:
+                self._write(f"worst_{names.index(name) + 1}", view)
+        return names
+
+    def _write(self, name: str, view: ScoredView) -> None:
+        save_view(view, self.folder / "images" / f"{name}.png", self.folder / "images" / "views" / name)
+
+
+def picture_name(split: str, view_name: str) -> str:
+    """Return the name of a view's pictures without its ending.
+
+    >>> picture_name("test", "r_0"), picture_name("test", "test/r_0")
+    ('test_r_0', 'test_r_0')
+    """
+    plain = view_name.replace("/", "_").replace("\\", "_")
+    return plain if plain.startswith(f"{split}_") else f"{split}_{plain}"

@@ -1,0 +1,116 @@
+"""A smooth path through the cameras of a keyframe file."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.cameras import focal_from_fov
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
+from nerf_lightning.geometry.paths.keyframes import Keyframe, read_keyframes
+from nerf_lightning.geometry.paths.spline import along, even_speed, frame_times, rotations_along
+from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.types import Cameras
+
+FRAMES_WITHOUT_TIMES = 120
+
+
+@final
+class KeyframePath(CameraPath):
+    """Go through the keyframes of a file (`geometry.paths.keyframes`) on a smooth curve.
+
+    Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
+    stays in the middle.
+
+    Args:
+        file: the keyframe file.
+        num_frames: how many cameras; None: as many as the keyframes' times and `fps` make, or 120 without times.
+        closed: go back to the first keyframe at the end, in a mean leg's time; the last frame then precedes the first.
+        width: picture's width in pixels; None: it follows the height, or is the photographs'.
+        height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        fov: degrees that the picture's width takes in, for all frames; None: as the keyframes, else as the photographs.
+        fps: frames per second.
+
+    Raises:
+        InputError: a number out of its range, or a file that is no keyframe file.
+    """
+
+    def __init__(
+        self,
+        file: str,
+        num_frames: int | None = None,
+        closed: bool = False,
+        width: int | None = None,
+        height: int | None = None,
+        fov: float | None = None,
+        fps: int = 30,
+    ) -> None:
+        super().__init__(1 if num_frames is None else num_frames, width, height, fov, fps)
+        self.asked_frames, self.closed = num_frames, closed
+        self.keyframes = read_keyframes(Path(file).expanduser())
+
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras between the keyframes."""
+        keys = _poses(self.keyframes, around)
+        knots = self._knots(keys, around)
+        at = frame_times(knots, self._count(knots), self.closed)
+        eyes = along(knots, keys[:, :, 3], at)
+        c2w = torch.cat([rotations_along(knots, keys[:, :, :3], at), eyes[:, :, None]], dim=-1)
+        targets = [around.point("file", each.look_at) for each in self.keyframes]
+        if all(target is not None for target in targets):
+            held = along(knots, torch.stack([target for target in targets if target is not None]), at)
+            back = normalize(eyes - held, dim=-1)
+            right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
+            c2w = torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
+        cameras = self.pinholes(c2w, around)
+        return cameras if self.fov is not None else self._zoomed(cameras, knots, at, around)
+
+    def _knots(self, keys: Tensor, around: PathFrame) -> Float[Tensor, "knots"]:
+        times = [each.time for each in self.keyframes if each.time is not None]
+        if not times:
+            return even_speed(keys, around.radius, self.closed)
+        back = [times[-1] + (times[-1] - times[0]) / (len(times) - 1)] if self.closed else []
+        return torch.tensor(times + back, dtype=keys.dtype)
+
+    def _count(self, knots: Float[Tensor, "knots"]) -> int:
+        if self.asked_frames is not None:
+            return self.asked_frames
+        if self.keyframes[0].time is None:
+            return FRAMES_WITHOUT_TIMES
+        return max(1, round(float(knots[-1] - knots[0]) * self.fps) + (not self.closed))
+
+    def _zoomed(self, cameras: Cameras, knots: Tensor, at: Tensor, around: PathFrame) -> Cameras:
+        """Return the cameras with the keyframes' focal lengths, between them even in ratio."""
+        logs = torch.tensor([[math.log(_focal(each, around))] for each in self.keyframes], dtype=knots.dtype)
+        scale = cameras.width[0] / around.width
+        return replace(cameras, focal=(scale * along(knots, logs, at).exp()).expand(-1, 2).contiguous())
+
+
+def _poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "keys 3 4"]:
+    poses = []
+    for number, each in enumerate(keyframes, start=1):
+        eye = around.point("file", each.position)
+        assert eye is not None
+        up = around.up if each.up is None else around.direction(each.up)
+        pose = look_at(eye, eye + around.direction(each.ahead), up)
+        if float(pose[:, 0].norm()) < 0.5:
+            raise InputError(
+                f"path.file: keyframe {number} looks straight along its up, so its picture has no top. Give it another "
+                "`up`, for instance one that is horizontal."
+            )
+        poses.append(pose)
+    return torch.stack(poses)
+
+
+def _focal(keyframe: Keyframe, around: PathFrame) -> float:
+    """Return a keyframe's focal length in pixels of a picture as wide as the photographs."""
+    if keyframe.fov is not None:
+        return focal_from_fov(around.width, math.radians(keyframe.fov))
+    return around.focal if keyframe.focal is None else keyframe.focal

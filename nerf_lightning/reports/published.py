@@ -1,0 +1,63 @@
+"""Numbers that others have published for well-known scenes, with their sources."""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import yaml
+
+FILE = Path(__file__).with_name("published.yaml")
+
+
+@dataclass(frozen=True)
+class Published:
+    """One method's result on one scene."""
+
+    benchmark: str
+    scene: str
+    method: str
+    psnr: float
+    time: str | None
+    source: str
+    measured: str
+    """On which views, of what size, over what."""
+    readers: tuple[str, ...]
+    """The formats that such a capture is read by."""
+
+
+def published_for(scene: str, reader: str) -> list[Published]:
+    """Return what is known of a scene, the best first.
+
+    >>> [found.psnr for found in published_for("lego_200", "blender")][-1]
+    32.54
+    >>> published_for("bricks", "bricks")
+    []
+
+    Args:
+        scene: its name, or one that begins with it.
+        reader: the format that it was read by: a chair of one's own is none of the benchmark's.
+    """
+    names = {scene.lower(), re.split(r"[\W_]", scene.lower())[0]}
+    found = [result for result in _all() if result.scene in names and reader in result.readers]
+    return sorted(found, key=lambda result: -result.psnr)
+
+
+@cache
+def _all() -> tuple[Published, ...]:
+    benchmarks = yaml.safe_load(FILE.read_text(encoding="utf-8"))["benchmarks"]
+    return tuple(
+        Published(
+            benchmark=benchmark["name"],
+            scene=scene,
+            method=result["method"],
+            psnr=float(psnr),
+            time=result["time"],
+            source=result["source"],
+            measured=benchmark["measured"],
+            readers=tuple(benchmark["readers"]),
+        )
+        for benchmark in benchmarks
+        for result in benchmark["results"]
+        for scene, psnr in result["psnr"].items()
+    )

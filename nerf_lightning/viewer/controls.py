@@ -1,0 +1,161 @@
+"""The panel of the page: what is shown, the crop box, photographs, the camera path, snapshots."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.export.pictures import save_png
+from nerf_lightning.geometry.clipping import CropBox
+from nerf_lightning.viewer.channels import CHANNELS
+from nerf_lightning.viewer.free_name import free_name
+from nerf_lightning.viewer.frusta import Frusta
+from nerf_lightning.viewer.recorded_path import RecordedPath
+from nerf_lightning.viewer.session import Session
+
+AXES = ("x", "y", "z")
+
+
+class Controls:
+    """The panel of one person.
+
+    Args:
+        session: theirs.
+        folder: where snapshots and camera paths are written.
+    """
+
+    def __init__(self, session: Session, folder: Path):
+        self.session, self.folder = session, folder
+        self.gui = session.client.gui
+        self.frusta = Frusta(session, self._enter)
+        self.path = RecordedPath(session, folder, self.frusta.add_keyframe)
+        self._wants_snapshot = False
+        session.on_finest, session.on_leave = self._keep_snapshot, self._left
+        self._add_view()
+        self._add_photographs()
+        self._add_path()
+        self._add_crop()
+
+    def _add_view(self) -> None:
+        channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
+        degrees = round(math.degrees(self.session.client.camera.fov))
+        fov = self.gui.add_slider("Field of view", 10.0, 120.0, 1.0, float(min(120, max(10, degrees))))
+        snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
+
+        @channel.on_update
+        def _(_: Any) -> None:
+            self.session.channel = channel.value
+            self.session.present()
+
+        @fov.on_update
+        def _(_: Any) -> None:
+            self.session.client.camera.fov = math.radians(fov.value)
+
+        @snapshot.on_click
+        def _(_: Any) -> None:
+            self._wants_snapshot = True
+            self.session.refinement.refresh()
+            self.session.studio.wake()
+
+    def _add_photographs(self) -> None:
+        names = self.session.photographs.record.view_names
+        with self.gui.add_folder("Photographs"):
+            visible = self.gui.add_checkbox("Show cameras", False)
+            number = self.gui.add_slider("View", 0, max(1, len(names) - 1), 1, 0)
+            enter = self.gui.add_button("Look through it", hint="Or click a camera in the scene")
+            self._name = self.gui.add_markdown("", visible=False)
+            self._split = self.gui.add_slider(
+                "Photograph | render", 0.0, 1.0, 0.01, self.session.split, visible=False, hint="Left is the photograph"
+            )
+            self._leave = self.gui.add_button("Leave", visible=False)
+
+        @visible.on_update
+        def _(_: Any) -> None:
+            self.frusta.show(visible.value)
+
+        @enter.on_click
+        def _(_: Any) -> None:
+            self._enter(min(number.value, len(names) - 1))
+
+        @self._split.on_update
+        def _(_: Any) -> None:
+            self.session.split = self._split.value
+            self.session.present()
+
+        @self._leave.on_click
+        def _(_: Any) -> None:
+            self.session.leave()
+
+    def _enter(self, view: int) -> None:
+        photographs = self.session.photographs
+        there = photographs.has(view)
+        self._name.content = f"Through the camera of **{photographs.record.view_names[view]}**" + (
+            "" if there else " (its photograph is not at hand)"
+        )
+        self._name.visible = self._leave.visible = True
+        self._split.visible = there
+        self.frusta.hide_for_photograph(True)
+        self.session.enter(view)
+
+    def _left(self) -> None:
+        self._name.visible = self._leave.visible = self._split.visible = False
+        self.frusta.hide_for_photograph(False)
+
+    def _add_path(self) -> None:
+        with self.gui.add_folder("Camera path", expand_by_default=False):
+            add = self.gui.add_button("Add keyframe", hint="The camera as it is now")
+            seconds = self.gui.add_number("Seconds between", 2.0, min=0.1, step=0.1)
+            undo = self.gui.add_button("Remove last")
+            save = self.gui.add_button("Save as yaml")
+            said = self.gui.add_markdown("No keyframes yet.")
+
+        @add.on_click
+        def _(_: Any) -> None:
+            said.content = self.path.add(float(seconds.value))
+
+        @undo.on_click
+        def _(_: Any) -> None:
+            said.content = self.path.remove_last()
+
+        @save.on_click
+        def _(_: Any) -> None:
+            said.content = self.path.save()
+
+    def _add_crop(self) -> None:
+        if self.session.photographs.record.space == "ndc":
+            return
+        low, high = in_user_frame(self.session.photographs.record)
+        with self.gui.add_folder("Crop box", expand_by_default=False):
+            on = self.gui.add_checkbox("Show only what is in the box", False)
+            sliders = [
+                self.gui.add_multi_slider(axis, a, b, (b - a) / 100, (a, b), min_range=(b - a) / 100)
+                for axis, a, b in zip(AXES, low, high, strict=True)
+            ]
+
+        def update(_: Any) -> None:
+            lower, upper = zip(*(slider.value for slider in sliders), strict=True)
+            to_user = self.session.photographs.record.to_user
+            self.session.crop = CropBox.from_user(lower, upper, to_user) if on.value else None
+            self.frusta.draw_box(self.session.crop)
+            self.session.look()
+
+        for each in (on, *sliders):
+            each.on_update(update)
+
+    def _keep_snapshot(self) -> None:
+        picture = self.session.latest()
+        if not self._wants_snapshot or picture is None:
+            return
+        self._wants_snapshot = False
+        path = free_name(self.folder, "snapshot", ".png")
+        save_png(path, picture)
+        self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+
+
+def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
+    """Return the corners of the box along the user's axes that holds the scene's box."""
+    corners = torch.cartesian_prod(*record.aabb.unbind(dim=1)).double()
+    places = corners @ record.to_user[:3, :3].double().mT + record.to_user[:3, 3]
+    return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

@@ -1,0 +1,96 @@
+"""What is drawn over the picture: the cameras of the photographs, keyframes, and the crop box."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerf_lightning.geometry.clipping import CropBox
+from nerf_lightning.viewer.session import Session
+
+ROOT, CAMERAS, KEYFRAMES, BOX = "/overlay", "/overlay/cameras", "/overlay/keyframes", "/overlay/crop"
+GREY, ORANGE, BLUE = (90, 90, 90), (240, 120, 20), (40, 110, 220)
+# Size of a frustum as a share of the photographs' distance.
+SCALE = 0.03
+
+
+class Frusta:
+    """Draw into one person's scene.
+
+    Args:
+        session: theirs.
+        on_click: called with the view whose camera was clicked.
+    """
+
+    def __init__(self, session: Session, on_click: Callable[[int], None]):
+        self.session, self.scene = session, session.client.scene
+        self.size = SCALE * session.around.radius
+        self.root = self.scene.add_frame(ROOT, show_axes=False)
+        self.cameras = self.scene.add_frame(CAMERAS, show_axes=False, visible=False)
+        self.on_click, self.has_cameras = on_click, False
+        self.box: Any = None
+
+    def show(self, visible: bool) -> None:
+        """Show or hide the cameras of the photographs."""
+        if visible and not self.has_cameras:
+            self.has_cameras = True
+            for view in self.session.photographs.shown:
+                self._add_camera(view)
+        self.cameras.visible = visible
+
+    def hide_for_photograph(self, hidden: bool) -> None:
+        """Hide everything: who looks through a photograph's camera compares pixels."""
+        self.root.visible = not hidden
+
+    def draw_box(self, box: CropBox | None) -> None:
+        """Draw the crop box, or take it away."""
+        if self.box is not None:
+            self.box.remove()
+            self.box = None
+        if box is not None:
+            from viser.transforms import SO3
+
+            turned = SO3.from_matrix(box.axes.mT.double().numpy()).wxyz
+            middle = (box.corner + 0.5 * box.size @ box.axes).double().numpy()
+            size = tuple(box.size.tolist())
+            self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
+
+    def add_keyframe(self, number: int, c2w: Tensor, fov: float, aspect: float) -> Any:
+        """Draw a keyframe's camera; return its handle."""
+        return self._frustum(f"{KEYFRAMES}/{number}", c2w, fov, aspect, ORANGE, None)
+
+    def _add_camera(self, view: int) -> None:
+        photographs = self.session.photographs
+        cameras = photographs.record.cameras
+        width, height = int(cameras.width[view]), int(cameras.height[view])
+        fov = 2 * float(torch.atan(0.5 * height / cameras.focal[view, 1]))
+        thumbnail = photographs.thumbnail(view)
+        image = None if thumbnail is None else thumbnail.numpy()
+        handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)
+        handle.on_click(lambda _: self.on_click(view))
+
+    def _frustum(
+        self, name: str, c2w: Tensor, fov: float, aspect: float, color: tuple[int, int, int], image: np.ndarray | None
+    ) -> Any:
+        return self.scene.add_camera_frustum(
+            name,
+            fov,
+            aspect,
+            scale=self.size,
+            thickness=0.02 * self.size,
+            color=color,
+            image=image,
+            wxyz=quaternion_of(c2w),
+            position=c2w[:, 3].double().numpy(),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def quaternion_of(c2w: Tensor) -> np.ndarray:
+    """Return the rotation of a pose as viser wants it: w, x, y, z for the axes right, down, forward."""
+    from viser.transforms import SO3
+
+    return SO3.from_matrix((c2w[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()).wxyz

@@ -1,0 +1,111 @@
+"""The page in the browser: viser's server, and a session for everybody who opens it."""
+
+import logging
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.paths.base import frame_of
+from nerf_lightning.viewer.controls import Controls
+from nerf_lightning.viewer.photographs import Photographs
+from nerf_lightning.viewer.ports import free_port
+from nerf_lightning.viewer.session import Session
+from nerf_lightning.viewer.studio import Studio
+
+# People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
+START = 1.4
+
+
+def require_viser() -> Any:
+    """Return viser.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module("viser")
+    except ImportError as error:
+        raise InputError(
+            "The viewer needs viser, which is not installed or does not load here "
+            f"({error}). Install it with: pip install 'nerf-lightning[viewer]'"
+        ) from error
+
+
+class Page:
+    """Listen, and serve everybody a picture of their own.
+
+    Args:
+        studio: renders; whoever owns the page calls its `work`.
+        photographs: of the capture, for frusta and comparison.
+        folder: where snapshots and camera paths are written.
+        host: the address to listen on; 127.0.0.1 is heard by this machine alone.
+        port: the port, or the first to try.
+        most_height: the finest picture, in pixels.
+
+    Raises:
+        InputError: no viser, or no place to listen.
+    """
+
+    def __init__(
+        self, studio: Studio, photographs: Photographs, folder: Path, host: str, port: int, most_height: int
+    ) -> None:
+        viser = require_viser()
+        self.studio, self.photographs, self.folder = studio, photographs, folder
+        self.most_height = most_height
+        record = photographs.record
+        self.around = frame_of(record.cameras, record.aabb)
+        # A page that is closed amid a picture is nothing to speak of.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+        logging.getLogger("websockets").setLevel(logging.ERROR)
+        with _quietly():
+            self.server = viser.ViserServer(host, free_port(host, port), label="nerf_lightning", verbose=False)
+        self._dress(record)
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(lambda client: studio.remove(client.client_id))
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds the page."""
+        host = self.server.get_host()
+        return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stop listening; open pages say that the connection is lost."""
+        with _quietly():
+            self.server.stop()
+
+    def _dress(self, record: SceneRecord) -> None:
+        # The share button would send everything through somebody else's server.
+        self.server.gui.configure_theme(show_share_button=False, show_logo=False)
+        self.server.scene.set_up_direction(tuple(self.around.up.tolist()))
+        start = self.server.initial_camera
+        first, center = record.cameras.c2w[0, :, 3], self.around.center
+        # Forward-facing captures show nothing to who stands behind their near plane's cameras.
+        farther = START if record.space == "bounded" else 1.0
+        start.position = tuple((center + farther * (first - center)).tolist())
+        start.look_at = tuple(center.tolist())
+        start.fov = 2 * float(torch.atan(0.5 * record.cameras.height[0] / record.cameras.focal[0, 1]))
+        start.near, start.far = 0.01 * self.around.radius, 100 * self.around.radius
+
+    def _welcome(self, client: Any) -> None:
+        session = Session(client, self.studio, self.photographs, self.around, self.most_height)
+        session.start()  # the first picture is on its way while the panel is made
+        Controls(session, self.folder)
+
+
+class _quietly:
+    """Keep viser's boxes off the terminal: it prints through rich's global console."""
+
+    def __enter__(self) -> None:
+        from rich import get_console
+
+        self.console = get_console()
+        self.was, self.console.quiet = self.console.quiet, True
+
+    def __exit__(self, *error: object) -> None:
+        self.console.quiet = self.was

@@ -1,0 +1,56 @@
+"""A port to listen on: the one that is wished, or the next one that is free."""
+
+import logging
+import socket
+
+from nerf_lightning.errors import InputError
+
+TRIED = 50
+
+log = logging.getLogger(__name__)
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the port, or where another program has it the next free one, and say so.
+
+    Raises:
+        InputError: no such address on this machine, a port that is none or not ours to take, or none is free.
+    """
+    require_address(host, port)
+    for candidate in range(port, min(port + TRIED, 65_536)):
+        try:
+            _try(host, candidate)
+        except PermissionError as error:
+            raise InputError(
+                f"port={candidate}: this user may not listen on it ({error.strerror}). Give a port from 1024 on."
+            ) from error
+        except OSError:
+            continue
+        if candidate != port:
+            log.warning("port %d is in use by another program; %d is taken instead.", port, candidate)
+        return candidate
+    raise InputError(f"Ports {port} to {candidate} are all in use on {host}. Give a free one, or stop what has them.")
+
+
+def require_address(host: str, port: int) -> None:
+    """Refuse what nobody can listen on, whether it is in use or not.
+
+    Raises:
+        InputError: no address of this machine, or a number that is no port.
+    """
+    if not 1 <= port <= 65_535:
+        raise InputError(f"port={port}: give a number from 1 to 65535; 1024 and more need no special rights.")
+    try:
+        _try(host, 0)
+    except OSError as error:
+        raise InputError(
+            f"host={host}: this machine cannot listen there ({error}). Use 127.0.0.1 (this machine alone), "
+            "0.0.0.0 (everybody who can reach it), or one of its own addresses."
+        ) from error
+
+
+def _try(host: str, port: int) -> None:
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(address)

@@ -1,0 +1,157 @@
+"""The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
+
+import re
+import socket
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from running import FAST, start
+from viser_client import ViserClient
+
+from nerf_lightning.callbacks.live_view import LiveView
+from nerf_lightning.errors import InputError
+from nerf_lightning.viewer.refinement import Refinement
+from nerf_lightning.viewer.studio import Studio
+
+
+@pytest.fixture
+def capture(tmp_path):
+    import numpy as np
+    from scenes import ball_scene
+
+    scene = ball_scene(num_views=6, size=16, background="black")
+    poses = torch.eye(4).repeat(6, 1, 1)
+    poses[:, :3] = scene.cameras.c2w
+    pictures = torch.stack([scene.pixels.view(view) for view in range(6)]).float() / 255
+    np.savez(tmp_path / "ball.npz", images=pictures[..., :3].numpy(), poses=poses.numpy(), focal=1.6 * 16)
+    return tmp_path / "ball.npz"
+
+
+def run(capture, folder, *arguments):
+    return start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "final.video=false", "final.evaluate=false",
+        "logger=none", "trainer.num_threads=1", f"paths.output_dir={folder}", *arguments,
+    )  # fmt: skip
+
+
+def address_in(process):
+    for line in process.stdout:
+        found = re.search(r"watch the training at http://127\.0\.0\.1:(\d+)", line)
+        if found:
+            return int(found[1])
+    raise AssertionError("it never said where the page is")
+
+
+@pytest.mark.slow
+def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
+    steps = "trainer.max_steps=150"
+    alone = run(capture, tmp_path / "alone", steps)
+    watched = run(
+        capture,
+        tmp_path / "watched",
+        steps,
+        "viewer=on",
+        "viewer.live_view.port=18280",
+        "viewer.live_view.max_height=48",
+    )
+    port = address_in(watched)
+    client, lazy = ViserClient(port, 64, 48), ViserClient(port, 64, 48, reads=False)
+    client.look_from(0)
+    lazy.look_from(0)
+    client.wait_for(len)
+    client.close()
+    again = ViserClient(port, 64, 48)
+    again.look_from(90)
+    again.wait_for(len)
+    for process in (alone, watched):
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, output
+        assert "Traceback" not in output
+    weights = [
+        torch.load(tmp_path / name / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+        for name in ("alone", "watched")
+    ]
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    with socket.socket() as freed:
+        freed.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        freed.bind(("127.0.0.1", port))
+
+
+@pytest.fixture
+def trainer():
+    return Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+
+
+class ClockedStudio(Studio):
+    """A clock in place of pictures: each slice takes a given time."""
+
+    def __init__(self, clock, seconds):
+        self.clock, self.seconds, self.slices = clock, seconds, 0
+        self._refinements = {0: Refinement(lambda *_: None)}
+
+    def work(self):
+        self.clock.now += self.seconds
+        self.slices += 1
+        return True
+
+    def refresh(self):
+        pass
+
+
+class Clock:
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+class FakeSystem:
+    def eval(self):
+        pass
+
+    def train(self):
+        pass
+
+
+@pytest.mark.parametrize("slice_seconds", [0.01, 0.2, 2.0])
+def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, trainer, slice_seconds):
+    from nerf_lightning.callbacks import live_view
+
+    clock = Clock()
+    monkeypatch.setattr(live_view, "time", clock)
+    callback = LiveView(share=0.2)
+    studio = ClockedStudio(clock, slice_seconds)
+    monkeypatch.setattr(callback, "page", SimpleNamespace(studio=studio))
+    spent = 0.0
+    for _ in range(2000):
+        clock.now += 0.05  # a step
+        before = clock.now
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+        spent += clock.now - before
+    assert spent / clock.now < 0.2 + 2 * slice_seconds / clock.now
+    assert spent / clock.now > 0.1
+
+
+def test_nobody_looking_on_costs_nothing(trainer):
+    callback = LiveView()
+    studio = ClockedStudio(Clock(), 1.0)
+    studio._refinements.clear()
+    callback.page = SimpleNamespace(studio=studio)
+    for _ in range(10):
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+    assert studio.slices == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -1.0])
+def test_a_share_that_leaves_nothing_is_refused(share):
+    with pytest.raises(InputError, match="give a part of the time between 0 and 1"):
+        LiveView(share=share)
+
+
+def test_a_place_where_nobody_can_listen_is_refused_at_once():
+    with pytest.raises(InputError, match="cannot listen there"):
+        LiveView(host="192.0.2.1")
+    with pytest.raises(InputError, match="port=0"):
+        LiveView(port=0)

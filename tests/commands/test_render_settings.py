@@ -1,0 +1,208 @@
+"""`nerf render`: what is shown, of which checkpoints, and how it goes on after a stop."""
+
+import json
+import os
+import signal
+import sys
+import time
+from dataclasses import replace
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from running import said, start
+from scenes import ball_scene, tiny_field, tiny_model
+
+from nerf_lightning import cli
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.commands.film_frames import FilmFrames
+from nerf_lightning.commands.film_settings import FilmSettings
+from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.shots import Subject, make_shots
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.paths.look_at import LookAt
+from nerf_lightning.geometry.paths.orbit import Orbit
+from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.samplers.stratified import StratifiedSampler
+
+SMALL = ("path=orbit", "path.num_frames=2", "path.width=12", "trainer.tile_points=8192")
+
+
+@pytest.fixture
+def last(finished_run):
+    return finished_run / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture
+def rendered(nerf, tmp_path):
+    """Render frames, and return one of them by its film."""
+
+    def call(checkpoint, *arguments, name="a", frame=1):
+        folder = tmp_path / name
+        result = nerf("render", f"ckpt={checkpoint}", *SMALL, "format=frames", *arguments, f"paths.output_dir={folder}")
+        assert result.code == 0, result.err
+        return {
+            film: iio.imread(folder / film / f"frame_{frame:04d}.png") for film in os.listdir(folder) if film[0] != "."
+        }
+
+    return call
+
+
+def test_every_output_is_a_film_and_a_mosaic_is_one(last, rendered):
+    outputs = "outputs=[rgb,depth,opacity,normals,levels]"
+    films = rendered(last, outputs)
+    assert set(films) == {"video", "depth", "opacity", "normals", "levels"}
+    assert films["video"].shape == films["normals"].shape == films["opacity"].shape == (12, 12, 3)
+    mosaic = rendered(last, outputs, "mosaic=true", name="b")
+    assert set(mosaic) == {"mosaic"}
+    assert mosaic["mosaic"].shape[1] > 5 * 12
+
+
+def test_two_checkpoints_stand_side_by_side(last, rendered):
+    best = last.with_name("best.ckpt")
+    alone, both = rendered(last)["video"], rendered(f"[{last},{best}]", "labels=[one,two]", name="b")["video"]
+    places = [x for x in range(both.shape[1] - 12) if np.array_equal(both[-17:-5, x : x + 12], alone)]
+    assert places, "the first one's picture is in it"
+    assert both.shape[1] > 2 * 12
+
+
+def test_background_crop_and_near_change_the_picture(last, rendered):
+    white, black = rendered(last, "background=white")["video"], rendered(last, "background=black", name="b")["video"]
+    assert bool((white >= black).all())
+    assert not np.array_equal(white, black)
+    gone = rendered(last, "background=white", "crop=[[5,5,5],[6,6,6]]", name="c")["video"]
+    assert gone.min() == 255
+    some = rendered(last, "background=white", "crop=[[-1,-1,0],[1,1,1]]", name="d")["video"]
+    assert not np.array_equal(some, white)
+    assert not np.array_equal(rendered(last, "background=white", "near=4.5", name="e")["video"], white)
+
+
+def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
+    first = rendered(last, "outputs=[rgb,opacity]", frame=0)
+    held = rendered(last, "outputs=[rgb,opacity]", "hold_camera=true", name="b", frame=1)
+    assert np.array_equal(held["opacity"], first["opacity"])
+    assert not np.array_equal(held["video"], first["video"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["outputs=[rgb,color]"], ["outputs=['rgb', 'color']", "rgb, depth, opacity, normals, levels"]),
+        (["outputs=[]"], ["outputs=[]"]),
+        (["mosaic=maybe"], ["mosaic=maybe", "true or false"]),
+        (["format=gif"], ["format=gif", "video (mp4) or frames"]),
+        (["near=-1"], ["near=-1", "not negative"]),
+        (["near=7"], ["near=7 leaves nothing to see", "rays end at"]),
+        (["crop=[[0,0,0]]"], ["crop=[[0, 0, 0]]", "lower and the upper corner"]),
+        (["crop=[[0,0,0],[1,-1,1]]"], ["holds nothing", "smaller than"]),
+        (["crop=[[-9,-9,-9],[9,9,9]]"], ["the camera of frame 0 stands inside the box (2 of 2 frames do)"]),
+        (["crop=[[-1,-1,0],[1,1,1]]", "background=none"], ["crop: this model has no background", "background=white"]),
+        (["labels=[a,b]"], ["labels=['a', 'b']", "one for each of the 1 checkpoints"]),
+        (["path=photographs", "path.views=[nobody,0]"], ["path.views: the capture has no photograph nobody"]),
+        (["path=keyframes"], ["path.file"]),
+        (["path=zigzag"], ["zigzag", "keyframes"]),
+    ],
+)
+def test_bad_input_is_one_paragraph(nerf, last, tmp_path, arguments, words):
+    given = [*SMALL, *arguments] if not arguments[0].startswith("path=") else arguments
+    said(nerf("render", f"ckpt={last}", *given, f"paths.output_dir={tmp_path}"), *words)
+    assert not list(tmp_path.rglob("*.png"))
+
+
+def test_a_model_of_one_level_has_no_difference_of_levels(tmp_path):
+    model = RadianceModel({"fine": Level(StratifiedSampler(8), tiny_field())})
+    subject, settings = Subject(model, scene_record(ball_scene()), "white"), FilmSettings(outputs=("levels",))
+    with pytest.raises(InputError, match=r"this model has one level that makes pictures.*model=nerf"):
+        film([subject], Orbit(2), 1000, tmp_path, settings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_models_with_other_working_frames_show_the_same_thing(tmp_path):
+    """A capture that was read otherwise has another working frame: the path is the first one's, seen from there."""
+    model, first = tiny_model(), scene_record(ball_scene())
+    to_user = torch.diag(torch.tensor([1.0, 1.0, 1.0, 1.0]))
+    to_user[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    other = replace(first, to_user=to_user)
+    path = LookAt(3, start=[4.0, 0.0, 1.0], end=[0.0, 4.0, 1.0], target=[0.0, 0.0, 0.0])
+    one, two = make_shots([Subject(model, first, "white"), Subject(model, other, "white")], path, 1000)
+    torch.testing.assert_close(two.cameras.c2w[:, :, 3], one.cameras.c2w[:, :, 3] - to_user[:3, 3])
+    torch.testing.assert_close(two.cameras.c2w[:, :, :3], one.cameras.c2w[:, :, :3])
+
+
+def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
+    arguments = ["render", f"ckpt={last}", *SMALL, "path.num_frames=6"]
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    assert nerf(*arguments, f"paths.output_dir={whole}", "format=frames").code == 0
+    save, count = FilmFrames.save, []
+
+    def interrupted(self, film, number, picture):
+        count.append(number)
+        if len(count) == 6:
+            raise KeyboardInterrupt
+        save(self, film, number, picture)
+
+    monkeypatch.setattr(FilmFrames, "save", interrupted)
+    monkeypatch.setattr(sys, "argv", ["nerf", *arguments, f"paths.output_dir={stopped}", "format=frames"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 130
+    monkeypatch.undo()
+    note = json.loads((stopped / ".frames" / "film.json").read_text())
+    times = {file: file.stat().st_mtime_ns for file in stopped.rglob("*.png")}
+    assert len(times) == 5
+    assert nerf(*arguments, f"paths.output_dir={stopped}", "format=frames").code == 0
+    assert json.loads((stopped / ".frames" / "film.json").read_text()) == note
+    half = stopped / "depth" / "frame_0002.png"
+    assert all(file.stat().st_mtime_ns == time for file, time in times.items() if file.name != half.name)
+    for name in ("video", "depth"):
+        for number in range(6):
+            place = f"{name}/frame_{number:04d}.png"
+            assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
+
+
+def test_a_single_frame_is_a_film(last, rendered):
+    assert rendered(last, "path.num_frames=1", frame=0)["video"].shape == (12, 12, 3)
+
+
+def test_other_settings_begin_anew(nerf, last, tmp_path, rendered):
+    before = rendered(last)["video"]
+    after = rendered(last, "path.elevation=60.0")["video"]
+    assert not np.array_equal(before, after)
+
+
+@pytest.mark.slow
+def test_a_killed_render_goes_on_to_a_video(nerf, last, tmp_path):
+    arguments = [
+        "render",
+        f"ckpt={last}",
+        "path=orbit",
+        "path.num_frames=12",
+        "path.width=40",
+        f"paths.output_dir={tmp_path}",
+    ]
+    process = start(*arguments)
+    while process.poll() is None and len(list(tmp_path.glob(".frames/depth/*.png"))) < 3:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    there = len(list(tmp_path.glob(".frames/depth/frame_*.png")))
+    assert 3 <= there < 12
+    result = nerf(*arguments)
+    assert result.code == 0, result.err
+    assert f"{there} of 12 frames are there already" in result.err
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_frames(nerf, last, tmp_path):
+    arguments = ["render", f"ckpt={last}", *SMALL, "path.num_frames=5", "format=frames"]
+    assert nerf(*arguments, "trainer=cpu", f"paths.output_dir={tmp_path}/one").code == 0
+    two = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", f"paths.output_dir={tmp_path}/two")
+    process = start(*arguments, *two)
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    for name in ("video", "depth"):
+        for number in range(5):
+            one, other = (iio.imread(tmp_path / run / name / f"frame_{number:04d}.png") for run in ("one", "two"))
+            assert np.abs(one.astype(int) - other).max() <= 1

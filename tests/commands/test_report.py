@@ -1,0 +1,192 @@
+"""`nerf report`: what the page holds, that it works in a browser, and that a stranger's run stays harmless in it."""
+
+import json
+import re
+import shutil
+
+import pytest
+from browser import opened
+from measured_runs import leave_measured_run
+from running import said
+
+
+@pytest.fixture(scope="module")
+def page_of_run(finished_run, tmp_path_factory):
+    """The page of a real run, written by a process of its own; with what the command printed."""
+    from running import start
+
+    folder = tmp_path_factory.mktemp("page")
+    process = start("report", finished_run, f"paths.output_dir={folder}")
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    return folder / "report.html", output
+
+
+def sections(text):
+    return re.findall(r'<h2 id="(\w+)"', text)
+
+
+def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
+    path, output = page_of_run
+    text = path.read_text()
+    assert sections(text) == ["worst", "views", "steps", "curves", "video", "capture", "numbers", "config"]
+    assert f"report       {path}" in output
+    assert "left out" not in output
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    for shown in (
+        f"{metrics['psnr']:.2f} dB",
+        metrics["protocol"]["split_hash"],
+        metrics["origin"]["checkpoint"],
+        metrics["environment"]["torch"],
+        "trainer.max_steps=20",
+        "near and far",
+    ):
+        assert shown in text, shown
+    addresses = re.findall(r'(?:src|href)="([^"]{5})', text)
+    assert set(addresses) == {"data:"}
+    assert 'http-equiv="Content-Security-Policy" content="default-src &#39;none&#39;' in text
+
+
+def test_sliders_work_in_a_browser(page_of_run):
+    with opened(page_of_run[0].as_uri(), 1200, 900) as driver:
+        run = driver.execute_script
+        assert not [entry for entry in driver.get_log("browser") if "favicon" not in entry["message"]]
+        sizes = run("return [...document.images].filter(i => !i.hidden).map(i => i.naturalWidth)")
+        assert len(sizes) > 10
+        assert min(sizes) > 0
+
+        def moved(selector, value):
+            script = (
+                "const s = document.querySelector(arguments[0] + ' input'); s.value = arguments[1];"
+                "s.dispatchEvent(new Event('input'))"
+            )
+            run(script, selector, value)
+
+        shown = "return [...document.querySelectorAll('.steps img')].filter(i => !i.hidden).map(i => i.alt)"
+        assert run(shown) == ["step 20"]
+        moved(".steps", 0)
+        assert run(shown) == ["step 10"]
+        assert run("return document.querySelector('.steps output').value") == "step 10"
+
+        clip = "return getComputedStyle(document.querySelector('.wipe .over')).clipPath"
+        before = run(clip)
+        moved(".wipe", 10)
+        assert run(clip) != before
+        # What lies left of the line is the truth: none of it is left at 0, all of it at 100.
+        picture = driver.find_element("css selector", ".wipe .layers")
+        shots = []
+        for value in (0, 100, 0):
+            moved(".wipe", value)
+            shots.append(picture.screenshot_as_png)
+        assert shots[0] == shots[2] != shots[1]
+
+
+def test_videos_play_in_a_browser(page_of_run):
+    with opened(page_of_run[0].as_uri()) as driver:
+        script = (
+            "const done = arguments[0]; const films = [...document.querySelectorAll('video')];"
+            "const ready = film => film.readyState > 0 || film.error;"
+            "const look = () => films.every(ready) ? done(films.map(f => f.error ? f.error.message : f.videoWidth))"
+            " : setTimeout(look, 100); look();"
+        )
+        driver.set_script_timeout(60)
+        assert driver.execute_async_script(script) == [16, pytest.approx(40, abs=30), 16]
+
+
+def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    result = nerf("report", run, f"scene.path={tmp_path}/gone.npz")
+    assert result.code == 0, result.err
+    assert "left out     The doctor" in result.out
+    text = (run / "report.html").read_text()
+    assert "gone.npz" in text
+    assert "capture" in sections(text)
+
+
+def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
+    run = leave_measured_run(tmp_path / "run", None)
+    result = nerf("report", run)
+    assert result.code == 0, result.err
+    text = (run / "report.html").read_text()
+    assert sections(text) == ["missing"]
+    for what in ("Numbers", "Curves", "Coverage", "The doctor", "Config"):
+        assert f"<li>{what}: " in text
+
+
+def test_what_is_no_run_is_refused(nerf, tmp_path):
+    said(nerf("report", tmp_path), "no run in it")
+    said(nerf("report"), "run has no value")
+    said(nerf("report", tmp_path, tmp_path / "b"), "one folder is wanted")
+    said(nerf("report", leave_measured_run(tmp_path / "run"), "measured=twice"), "measured=twice")
+
+
+EVIL = (
+    "</title></style></script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">"
+)
+
+
+@pytest.fixture
+def evil_run(tmp_path):
+    """A run whose every text is markup."""
+    run = leave_measured_run(
+        tmp_path / "run",
+        overrides=(EVIL,),
+        protocol={EVIL: EVIL, "scene": EVIL},
+        origin={"model": EVIL, EVIL: [EVIL]},
+        started=EVIL,
+    )
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics |= {"per_image": [{"name": EVIL, "psnr": 20.0}], "worst_views": [EVIL], "pictures": ["../../secret", EVIL]}
+    metrics["environment"] = {"torch": EVIL}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    (run / ".hydra" / "config.yaml").write_text(json.dumps({"a": EVIL}))
+    return run
+
+
+def test_markup_in_a_strangers_run_is_shown_and_not_obeyed(nerf, evil_run):
+    result = nerf("report", evil_run, "doctor=false")
+    assert result.code == 0, result.err
+    text = (evil_run / "report.html").read_text()
+    assert text.count("<script>") == 1
+    assert 'onerror="' not in text
+    with opened((evil_run / "report.html").as_uri()) as driver:
+        assert driver.title == "run"
+        assert not driver.get_log("browser")
+
+
+def test_the_policy_stops_scripts_that_escaping_would_miss(nerf, evil_run):
+    """Were a text put in unescaped, nothing of it would run."""
+    assert nerf("report", evil_run, "doctor=false").code == 0
+    page = evil_run / "report.html"
+    planted = "<script>document.title = 'evil'</script><img src='data:,x' onerror=\"document.title = 'evil'\">"
+    page.write_text(page.read_text().replace("<body>", f"<body>{planted}"))
+    with opened(page.as_uri()) as driver:
+        assert driver.title == "run"
+
+
+@pytest.mark.parametrize("name", ["metrics.json", ".hydra/config.yaml", "video.mp4", "images/validation"])
+def test_a_link_that_leads_out_is_refused(nerf, tmp_path, name):
+    run = leave_measured_run(tmp_path / "run")
+    (tmp_path / "secret").mkdir()
+    link = run / name
+    link.unlink(missing_ok=True)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(tmp_path / "secret")
+    said(nerf("report", run, f"paths.output_dir={tmp_path}/out"), "symbolic link", "would be shown")
+
+
+def test_what_is_too_large_or_no_film_or_no_log_is_left_out(nerf, tmp_path):
+    run = leave_measured_run(tmp_path / "run")
+    (run / "video.mp4").write_bytes(b"\0" * 1_200_000)
+    (run / "depth.mp4").write_bytes(b"<html>")
+    (run / "tensorboard").mkdir()
+    (run / "tensorboard" / "events.out.tfevents.0").write_bytes(b"\xff" * 1000)
+    (run / "images" / "validation").mkdir(parents=True)
+    (run / "images" / "validation" / "step_0000001.png").write_bytes(b"no picture")
+    result = nerf("report", run, "max_megabytes=1", "doctor=false")
+    assert result.code == 0, result.err
+    assert "video.mp4 has 1.2 MB, more than the 1.0 MB of max_megabytes" in result.out
+    assert "depth.mp4 is not an mp4" in result.out
+    assert "left out     A picture of the validation" in result.out
+    assert "video" not in sections((run / "report.html").read_text())

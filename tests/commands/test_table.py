@@ -1,0 +1,213 @@
+"""`nerf table`: which runs it finds, what it puts together, what it refuses, and that texts stay texts."""
+
+import csv
+import json
+import statistics
+
+import pytest
+from measured_runs import PROTOCOL, leave_measured_run
+from running import said
+
+
+@pytest.fixture
+def table(nerf, tmp_path):
+    """Call `nerf table` on tmp_path/runs; return what it printed and the rows of its CSV."""
+
+    def call(*arguments):
+        out = tmp_path / "out"
+        result = nerf("table", tmp_path / "runs", f"paths.output_dir={out}", *arguments)
+        written = out / "table.csv"
+        return result, list(csv.DictReader(written.read_text().splitlines())) if result.code == 0 else []
+
+    return call
+
+
+def ours(rows):
+    return [row for row in rows if not row.get("source")]
+
+
+def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
+    values = (30.0, 31.0, 35.0)
+    for seed, value in enumerate(values):
+        leave_measured_run(tmp_path / "runs" / f"{seed}_seed={seed}", value, seed)
+    leave_measured_run(tmp_path / "runs" / "other", 33.0, origin={"model": "nerf", "config": "other"})
+    result, rows = table("published=false")
+    assert result.code == 0, result.err
+    assert [row["model"] for row in rows] == ["nerf", "fast"]
+    assert rows[1]["seeds"] == "0 1 2"
+    assert float(rows[1]["PSNR"]) == pytest.approx(32.0)
+    assert float(rows[1]["PSNR std"]) == pytest.approx(statistics.stdev(values))
+    assert rows[0]["PSNR std"] == ""
+    assert (float(rows[1]["minutes"]), float(rows[1]["MB"])) == (1.5, 0.004)
+    assert "LPIPS" not in rows[0]
+
+
+def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
+    for number, rate in enumerate(("1e-2", "1e-3")):
+        leave_measured_run(
+            tmp_path / "runs" / str(number),
+            20.0 + number,
+            overrides=(f"optimizer.lr={rate}", "trainer.max_steps=10", f"paths.output_dir={number}"),
+        )
+    _, rows = table("published=false")
+    assert [row["optimizer.lr"] for row in rows] == ["1e-3", "1e-2"]
+    assert "trainer.max_steps" not in rows[0]
+    assert "paths.output_dir" not in rows[0]
+
+
+def test_published_numbers_stand_below_with_their_source(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a", 33.0)
+    leave_measured_run(tmp_path / "runs" / "b", 20.0, protocol={"scene": "bricks"}, origin={"scene": "bricks"})
+    result, rows = table()
+    assert [row["scene"] for row in ours(rows)] == ["bricks", "lego"]
+    published = [row for row in rows if row["source"]]
+    assert {row["scene"] for row in published} == {"lego"}
+    assert rows.index(published[0]) > rows.index(ours(rows)[1])
+    assert ("NeRF", "32.54") in [(row["model"], row["PSNR"]) for row in published]
+    assert all("800 x 800" in row["source"] for row in published)
+    assert any("arXiv 2003.08934" in row["source"] for row in published)
+    assert "Zip-NeRF" in result.out
+
+
+def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder(table, tmp_path):
+    leave_measured_run(
+        tmp_path / "runs" / "a", protocol={"scene": "blender"}, overrides=("scene=blender", "scene.root=data/lego_200")
+    )
+    _, rows = table()
+    assert ours(rows)[0]["scene"] == "lego_200"
+    assert len(rows) == 6
+
+
+def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
+    result, _ = table()
+    said(result, "runs/a", "runs/b", "pixels: float and 8-bit", "force=true", "measured=eval")
+    assert not (tmp_path / "out").exists()
+    result, rows = table("force=true")
+    assert len(ours(rows)) == 2
+    assert "Not all of these were measured alike" in result.out
+    assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_scenes_that_were_measured_differently_are_refused_too(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", protocol={"scene": "chair", "background": "black", "split": "val"})
+    said(table()[0], "split: test and val")
+    assert "background" not in table()[0].err
+
+
+def test_what_was_measured_before_the_stamp_was_whole_is_refused(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    run = leave_measured_run(tmp_path / "runs" / "b")
+    old = {key: value for key, value in PROTOCOL.items() if key not in ("cameras", "masks", "lpips")}
+    (run / "metrics.json").write_text(json.dumps({"psnr": 20.0, "protocol": old}))
+    said(table()[0], "cameras: raw and not said")
+
+
+def test_another_device_or_version_is_noted_below(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", seed=1, origin={"device": "NVIDIA H200"})
+    result, rows = table()
+    assert ours(rows)[0]["seeds"] == "0 1"
+    assert "device: NVIDIA H200, cpu" in result.out
+
+
+def test_the_newest_of_equal_runs_counts(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "new", 31.0, started="2026-02-01T00:00:00")
+    leave_measured_run(tmp_path / "runs" / "old", 30.0)
+    result, rows = table()
+    assert [row["PSNR"] for row in ours(rows)] == ["31.0"]
+    assert "runs/old" in " ".join(result.out.split())
+
+
+def test_rows_are_chosen_and_sorted(table, tmp_path):
+    for name, value, seconds in (("fast", 30.0, 60.0), ("fast_small", 28.0, 30.0), ("nerf", 29.0, 600.0)):
+        leave_measured_run(
+            tmp_path / "runs" / name, value, origin={"model": name, "config": name}, training_seconds=seconds
+        )
+    assert [row["model"] for row in ours(table("sort=minutes")[1])] == ["fast_small", "fast", "nerf"]
+    assert [row["model"] for row in ours(table("models=fast*")[1])] == ["fast", "fast_small"]
+    assert [row["model"] for row in ours(table("models=[nerf,fast_*]")[1])] == ["nerf", "fast_small"]
+    said(table("models=gnt")[0], "models=gnt", "fast, fast_small, nerf")
+    said(table("sort=speed")[0], "sort=speed", "frames_per_second")
+
+
+def test_what_nerf_eval_measured_can_be_taken_instead(table, tmp_path):
+    run = leave_measured_run(tmp_path / "runs" / "a", 30.0)
+    (run / "evaluation").mkdir()
+    again = json.loads((run / "metrics.json").read_text()) | {"psnr": 25.0}
+    (run / "evaluation" / "metrics.json").write_text(json.dumps(again))
+    leave_measured_run(tmp_path / "runs" / "b", 29.0, seed=1)
+    assert [row["PSNR"] for row in ours(table()[1])] == ["29.5"]
+    result, rows = table("measured=eval")
+    assert [row["PSNR"] for row in ours(rows)] == ["25.0"]
+    assert "runs/b" in " ".join(result.out.split())
+
+
+def test_an_evaluation_on_its_own_is_a_row(table, tmp_path):
+    run = leave_measured_run(tmp_path / "runs" / "a", 30.0)
+    (run / "run.json").unlink()
+    assert len(ours(table()[1])) == 1
+
+
+def test_nothing_to_show_is_said(nerf, table, tmp_path):
+    said(nerf("table", tmp_path / "nowhere"), "nowhere", "no such folder")
+    (tmp_path / "runs").mkdir()
+    said(table()[0], "no run in")
+    leave_measured_run(tmp_path / "runs" / "a", None)
+    said(table()[0], "None of the 1 runs has metrics.json")
+    said(nerf("table"), "runs has no value")
+
+
+def test_texts_of_strangers_stay_texts(table, tmp_path):
+    names = ("=cmd|' /C calc'!A0", "<script>alert(1)</script>", "[/red]\x1b[2J| a\nb")
+    for number, name in enumerate(names):
+        leave_measured_run(tmp_path / "runs" / str(number), origin={"model": name, "config": name})
+    result, rows = table("published=false")
+    assert result.code == 0, result.err
+    assert "\x1b[2J" not in result.out
+    assert {row["model"][0] for row in rows} == {"'", "<", "["}
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "<script>" not in text
+    assert len(text.splitlines()) == 2 + len(names)
+
+
+DAMAGED = {
+    "not json": "{",
+    "a list": "[]",
+    "no numbers": '{"psnr": "30"}',
+    "a huge number": f'{{"psnr": 1{"0" * 400}}}',
+    "NaN": '{"psnr": NaN}',
+    "deep": "[" * 100 + "]" * 100,
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_damaged_metrics_are_no_numbers(table, tmp_path, content):
+    leave_measured_run(tmp_path / "runs" / "a")
+    run = leave_measured_run(tmp_path / "runs" / "b")
+    (run / "metrics.json").write_text(content)
+    result, rows = table()
+    assert result.code == 0, result.err
+    assert len(ours(rows)) == 1
+    assert "runs/b" in " ".join(result.out.split())
+
+
+def test_damaged_parts_of_metrics_are_left_out(table, tmp_path):
+    run = leave_measured_run(tmp_path / "runs" / "a", started=7, finished_at_step=["x"], training_seconds={})
+    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": {"seed": [1], "parameters": "x", "model": {"a": 1}}}
+    (run / "metrics.json").write_text(json.dumps(content))
+    result, rows = table()
+    assert result.code == 0, result.err
+    assert rows[0]["PSNR"] == "20.0"
+
+
+@pytest.mark.slow
+def test_a_real_run_is_a_row(nerf, finished_run, tmp_path):
+    result = nerf("table", finished_run, f"paths.output_dir={tmp_path}")
+    assert result.code == 0, result.err
+    (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
+    metrics = json.loads((finished_run / "metrics.json").read_text())
+    assert (row["scene"], row["model"], row["steps"]) == ("ball", "nerf_tiny", "20")
+    assert float(row["PSNR"]) == metrics["psnr"]

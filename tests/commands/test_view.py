@@ -1,0 +1,140 @@
+"""`nerf view`: the page serves pictures, in a real browser too, and ends cleanly."""
+
+import re
+import signal
+import socket
+from dataclasses import dataclass
+from subprocess import Popen
+
+import numpy as np
+import pytest
+from browser import drag, opened, wait_until
+from running import said, start
+from viser_client import ViserClient
+
+from nerf_lightning.commands import viewing
+from nerf_lightning.viewer import page as page_module
+
+
+@dataclass
+class Served:
+    process: Popen
+    address: str
+    said: str
+
+    @property
+    def port(self):
+        return int(self.address.rpartition(":")[2])
+
+
+def serve(*arguments):
+    """Start `nerf view` and wait until it says where the page is."""
+    process = start("view", *arguments)
+    lines = ""
+    for line in process.stdout:
+        lines += line
+        found = re.search(r"The page is at (http://\S+)", line)
+        if found:
+            return Served(process, found[1], lines)
+    raise AssertionError(lines)
+
+
+@pytest.fixture(scope="module")
+def page(finished_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer")
+    checkpoint = finished_run / "checkpoints" / "last.ckpt"
+    served = serve(f"ckpt={checkpoint}", "port=18080", "max_height=96", f"paths.output_dir={folder}")
+    yield served
+    served.process.kill()
+    served.process.communicate()
+
+
+@pytest.fixture
+def client(page):
+    client = ViserClient(page.port)
+    yield client
+    client.close()
+
+
+@pytest.mark.slow
+def test_a_client_sees_a_coarse_picture_then_a_fine_one_and_another_when_it_moves(client):
+    client.look_from(0)
+    fine = client.wait_for_height(96)
+    assert len(client.pictures[0]) <= 96
+    assert fine.std() > 5
+    before = len(client.pictures)
+    client.look_from(90)
+    other = client.wait_for_height(96, after=before)
+    assert np.abs(fine.astype(float) - other).mean() > 1
+
+
+@pytest.mark.slow
+def test_clients_that_leave_or_never_read_harm_nobody(page, client):
+    slow = ViserClient(page.port, reads=False)
+    for degrees in range(20):
+        slow.look_from(degrees)
+    gone = ViserClient(page.port)
+    gone.look_from(30)
+    gone.close()
+    client.look_from(60)
+    client.wait_for_height(96)
+    slow.close()
+    before = len(client.pictures)
+    client.look_from(61)
+    client.wait_for_height(96, after=before)
+    assert page.process.poll() is None
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
+    checkpoint = finished_run / "checkpoints" / "last.ckpt"
+    served = serve(f"ckpt={checkpoint}", "port=18180", f"paths.output_dir={tmp_path}", "photographs=false")
+    client = ViserClient(served.port)
+    client.look_from(0)
+    client.wait_for(len)
+    served.process.send_signal(signal.SIGINT)
+    output, _ = served.process.communicate(timeout=60)
+    assert served.process.returncode == 0, output
+    assert "Traceback" not in output
+    with socket.socket() as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", served.port))
+
+
+@pytest.mark.slow
+def test_a_real_browser_shows_the_scene_turns_it_and_survives_a_reload(page):
+    with opened(page.address) as browser:
+        first = wait_until(browser, lambda picture: picture.std() > 10)
+        drag(browser, 120, 30)
+        moved = wait_until(browser, lambda picture: np.abs(picture - first).mean() > 3)
+        assert moved.std() > 10
+        browser.refresh()
+        wait_until(browser, lambda picture: picture.std() > 10)
+        assert "nerf_lightning" in browser.page_source
+
+
+def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
+    def missing(name):
+        raise ImportError(f"No module named '{name}'")
+
+    monkeypatch.setattr(page_module, "import_module", missing)
+    said(
+        nerf("view", f"ckpt={finished_run}/checkpoints/last.ckpt"),
+        "needs viser, which is not installed",
+        "pip install 'nerf-lightning[viewer]'",
+    )
+
+
+def test_a_missing_checkpoint_and_a_port_that_is_none_are_said(finished_run, nerf, tmp_path):
+    said(nerf("view", "ckpt=nowhere.ckpt"), "There is no checkpoint at nowhere.ckpt")
+    checkpoint = finished_run / "checkpoints" / "last.ckpt"
+    arguments = [f"ckpt={checkpoint}", f"paths.output_dir={tmp_path}", "photographs=false"]
+    said(nerf("view", *arguments, "port=0"), "port=0: give a number from 1 to 65535")
+    said(nerf("view", *arguments, "host=192.0.2.1"), "host=192.0.2.1: this machine cannot listen there")
+
+
+def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):
+    monkeypatch.setattr(viewing.webbrowser, "open", lambda address: False)
+    viewing.open_browser("http://127.0.0.1:8080")
+    assert "There is no browser here to open. Open http://127.0.0.1:8080 in one yourself" in caplog.text
+    assert "ssh -L 8080:127.0.0.1:8080" in caplog.text

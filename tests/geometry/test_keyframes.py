@@ -1,0 +1,153 @@
+"""Keyframe files and the curves through them."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from test_chosen_paths import MIDDLE, frame, keyframe_file, keys
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.cameras import project
+from nerf_lightning.geometry.paths.keyframe_path import KeyframePath
+from nerf_lightning.geometry.paths.keyframes import Keyframe, read_keyframes, write_keyframes
+from nerf_lightning.geometry.paths.spline import hermite, rotations_along
+from nerf_lightning.geometry.poses import is_rigid, quaternion_from_rotation, rotation_from_quaternion
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    keyframes = [
+        Keyframe((1.0, 2.0, 3.0), look_at=(0.0, 0.0, 0.5), up=(0.0, 1.0, 0.0), fov=40.0, time=0.0),
+        Keyframe((1e-7, 2.0, 3.25), direction=(0.0, -1.0, 0.0), focal=123.5, time=1.5),
+    ]
+    write_keyframes(tmp_path / "keys.yaml", keyframes)
+    assert read_keyframes(tmp_path / "keys.yaml") == keyframes
+    assert [file.name for file in tmp_path.iterdir()] == ["keys.yaml"]
+
+
+def test_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
+    (tmp_path / "keys.yaml").write_text(
+        "- {position: [1, 0, 0], look_at: [0, 0, 0]}\n- {position: [0, 1, 0], direction: [0, -1, 0]}"
+    )
+    first, second = read_keyframes(tmp_path / "keys.yaml")
+    assert (first.position, first.ahead, second.ahead) == ((1, 0, 0), (-1, 0, 0), (0, -1, 0))
+
+
+GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "has no list of keyframes"),
+        ("keyframes: 3", "has no list of keyframes"),
+        ("keyframes: [", "is not usable yaml"),
+        (f"- {GOOD}", r"has 1 keyframe\(s\), and a path needs two"),
+        (f"- {GOOD}\n- 7", "keyframe 2 is 7, but must name a position"),
+        (f"- {GOOD}\n- {{position: [1, 0]}}", "keyframe 2: position is .1, 0., but must be three finite numbers"),
+        (f"- {GOOD}\n- {{position: [1, 0, .nan]}}", "keyframe 2: position is"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], target: [0, 0, 0]}}", "keyframe 2 has the unknown key 'target'"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0]}}", "keyframe 2 must have a position, and one of look_at and direction"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [1, 0, 0]}}", "keyframe 2 looks nowhere"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: wide}}", "keyframe 2: fov is 'wide'"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 18, focal: 9}}", "both fov and focal"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
+        ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "keyframe 2: position is"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}", "is not usable yaml"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}", "is not usable yaml"),
+        ("[" * 5000, "is not usable yaml"),
+        ("- &a [x, x]\n" + "".join(f"- &{n} [{', '.join(9 * [f'*{m}'])}]\n" for m, n in pairwise("abcdefghijk")), "is"),
+        ("- !!python/object/apply:os.system [ls]", "is not usable yaml"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path, text, words):
+    (tmp_path / "keys.yaml").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_keyframes(tmp_path / "keys.yaml")
+    assert "keys.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1500
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"none.yaml cannot be read: No such file.*path.file"):
+        KeyframePath(str(tmp_path / "none.yaml"))
+
+
+def test_a_keyframe_that_looks_along_its_up(tmp_path):
+    file = keyframe_file(tmp_path, *(Keyframe((x, 0.0, 5.0), direction=(0.0, 0.0, -1.0)) for x in (0.0, 1.0)))
+    with pytest.raises(InputError, match="keyframe 1 looks straight along its up"):
+        KeyframePath(file).cameras(frame())
+
+
+def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
+    times, places = (0.0, 1.0, 1.5), ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
+    file = keyframe_file(
+        tmp_path,
+        *(Keyframe(p, direction=(1 - p[0], 2 - p[1], 0.0), time=t) for p, t in zip(places, times, strict=True)),
+    )
+    cameras = KeyframePath(file, fps=10).cameras(frame())
+    assert len(cameras.c2w) == 16
+    assert is_rigid(cameras.c2w, tolerance=1e-9).all()
+    torch.testing.assert_close(cameras.c2w[[0, 10, 15], :, 3], torch.tensor(places, dtype=torch.float64))
+    ahead = -cameras.c2w[10, :, 2]
+    torch.testing.assert_close(ahead, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+    assert len(KeyframePath(file, num_frames=7).cameras(frame()).c2w) == 7
+
+
+def test_what_all_keyframes_look_at_stays_in_the_middle(tmp_path):
+    target = tuple(MIDDLE.tolist())
+    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
+    file = keyframe_file(tmp_path, *(Keyframe(place, look_at=target) for place in places))
+    cameras = KeyframePath(file, num_frames=20, closed=True).cameras(frame())
+    for view in range(20):
+        torch.testing.assert_close(project(cameras, view, MIDDLE), cameras.center[view])
+
+
+def test_focal_lengths_go_from_keyframe_to_keyframe(tmp_path):
+    file = keyframe_file(
+        tmp_path,
+        Keyframe((5.0, 2.0, 4.0), look_at=(1.0, 2.0, 3.0), fov=90.0),
+        Keyframe((5.0, 3.0, 4.0), look_at=(1.0, 2.0, 3.0), focal=200.0),
+        Keyframe((5.0, 4.0, 4.0), look_at=(1.0, 2.0, 3.0)),
+    )
+    path = KeyframePath(file, num_frames=3, width=50)
+    focal = path.cameras(frame()).focal
+    assert focal[:, 0].tolist() == pytest.approx([25.0, 100.0, 70.0], rel=0.02)  # of a picture half as wide
+    assert KeyframePath(file, num_frames=3, fov=90.0).cameras(frame()).focal[1].tolist() == pytest.approx([50.0, 50.0])
+
+
+def test_without_times_there_are_120_frames(tmp_path):
+    assert len(KeyframePath(keys(tmp_path)).cameras(frame()).c2w) == 120
+
+
+def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots():
+    knots = torch.tensor([0.0, 1.0, 1.7, 3.0, 4.5], dtype=torch.float64)
+    values = (knots**2 - 3 * knots)[:, None]
+    torch.testing.assert_close(hermite(knots, values, knots), values)
+    at = torch.linspace(1.0, 3.0, 9, dtype=torch.float64)
+    torch.testing.assert_close(hermite(knots, values, at), (at**2 - 3 * at)[:, None])
+
+
+def test_a_rotation_about_one_axis_stays_about_it_past_half_a_turn():
+    angle = torch.deg2rad(torch.tensor([0.0, 100.0, 200.0, 300.0], dtype=torch.float64))
+    c, s, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    rotations = torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).view(4, 3, 3)
+    at = torch.linspace(0, 3, 31, dtype=torch.float64)
+    found = rotations_along(torch.arange(4.0, dtype=torch.float64), rotations, at)
+    assert found[:, 2, 2].tolist() == pytest.approx([1.0] * 31)
+    turned = torch.atan2(found[:, 1, 0], found[:, 0, 0])
+    steps = turned.diff().remainder(2 * math.pi)
+    assert bool((steps < math.radians(25)).all())  # always forward, never the long way round
+    torch.testing.assert_close(found[::10], rotations)
+
+
+def test_a_quaternion_is_its_rotations():
+    generator = torch.Generator().manual_seed(0)
+    quaternions = torch.nn.functional.normalize(torch.randn(64, 4, dtype=torch.float64, generator=generator), dim=-1)
+    half_turns = torch.eye(4, dtype=torch.float64)
+    given = torch.cat([quaternions, half_turns])
+    found = quaternion_from_rotation(rotation_from_quaternion(given))
+    torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))

@@ -1,0 +1,22 @@
+import base64
+import math
+
+from nerf_lightning.reports.curves import curve_drawings
+
+
+def test_known_curves_are_drawn_together_and_unknown_names_are_not():
+    steps = [1, 2, 3]
+    curves = {
+        "train/psnr_fine": (steps, [10.0, 20.0, 25.0]),
+        "val/psnr": (steps, [10.0, 19.0, 23.0]),
+        "train/loss": (steps, [0.5, 0.0, math.nan]),
+        "memory/resident_gigabytes": ([], []),
+        "train/loss_$\\evil": (steps, [1.0, 1.0, 1.0]),
+        "<script>": (steps, [1.0, 1.0, 1.0]),
+    }
+    drawings = dict(curve_drawings(curves))
+    assert list(drawings) == ["PSNR (dB)", "loss"]
+    kind, _, content = drawings["loss"].partition(",")
+    assert kind == "data:image/svg+xml;base64"
+    assert base64.b64decode(content).startswith(b"<?xml")
+    assert curve_drawings({}) == []

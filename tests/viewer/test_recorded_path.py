@@ -1,0 +1,76 @@
+"""Keyframes of the page mean to `nerf render` what they looked like."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scenes import ball_scene
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.geometry.frames import points_from_user, similarity, upright_rotation
+from nerf_lightning.geometry.paths.keyframes import read_keyframes
+from nerf_lightning.viewer.recorded_path import RecordedPath
+from nerf_lightning.viewer.session import Session
+
+EYES = ([4.0, 0.0, 1.0], [0.0, 4.0, 2.0])
+
+
+class FakeSession(Session):
+    def __init__(self, client, record):
+        self.client, self.photographs = client, SimpleNamespace(record=record)
+
+    def pose(self):
+        return torch.eye(4)[:3]
+
+
+@pytest.fixture
+def record():
+    rotation = upright_rotation(torch.nn.functional.normalize(torch.tensor([0.3, 1.0, 0.2]), dim=0))
+    to_user = similarity(rotation, torch.tensor([5.0, -2.0, 1.0]), 2.5)
+    return replace(scene_record(ball_scene()), to_user=to_user)
+
+
+@pytest.fixture
+def session(record):
+    camera = SimpleNamespace(
+        position=np.array(EYES[0]),
+        look_at=np.zeros(3),
+        up_direction=np.array([0.0, 0.0, 1.0]),
+        fov=0.7,
+        aspect=2.0,
+    )
+    return FakeSession(SimpleNamespace(camera=camera), record)
+
+
+def test_a_recorded_path_is_read_back_in_the_models_frame(session, record, tmp_path):
+    drawn = []
+    path = RecordedPath(
+        session, tmp_path / "new", lambda *what: drawn.append(what) or SimpleNamespace(remove=drawn.pop)
+    )
+    assert path.save() == "A path needs two keyframes or more."
+    for eye in (EYES[0], EYES[1], EYES[0]):
+        session.client.camera.position = np.array(eye)
+        said = path.add(1.5)
+    assert said == "3 keyframes, 3.0 s"
+    assert path.remove_last() == "2 keyframes, 1.5 s"
+    assert len(drawn) == 2
+    path.save()
+    (file,) = (tmp_path / "new").glob("*.yaml")
+    frames = read_keyframes(file)
+    back = points_from_user(torch.tensor([frame.position for frame in frames]).double(), record.to_user.double())
+    assert torch.allclose(back, torch.tensor(EYES).double(), atol=1e-5)
+    looked_at = points_from_user(torch.tensor([frames[1].look_at]).double(), record.to_user.double())
+    assert torch.allclose(looked_at, torch.zeros(1, 3).double(), atol=1e-5)
+    assert [frame.time for frame in frames] == [0.0, 1.5]
+    assert frames[0].fov == pytest.approx(np.degrees(0.7), abs=1e-3)  # square photographs
+
+
+def test_files_are_never_overwritten(session, tmp_path):
+    path = RecordedPath(session, tmp_path, lambda *_: None)
+    path.add(1.0)
+    path.add(1.0)
+    path.save()
+    path.save()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["camera_path_001.yaml", "camera_path_002.yaml"]
