@@ -19,6 +19,7 @@ from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.export.view_pictures import ScoredView
 from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
 from nerf_lightning.rendering.blending import photograph
@@ -72,7 +73,7 @@ class Scoring:
         says whose numbers these are (`protocol.measured_of`), and is stamped beside them.
         """
         views = self._views(scene)
-        spread = [views[i * len(views) // self.num_pictures] for i in range(self.num_pictures)]
+        shown_views = spread(views, self.num_pictures)
         kept = KeptViews(folder, self.split, self.num_worst)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
@@ -83,11 +84,11 @@ class Scoring:
             row, shown = self._compare(picture, scene, view, background)
             rows.append(row | {"seconds": seconds})
             kept.watch(row["name"], row["psnr"], shown)
-            if view in spread:
+            if view in shown_views:
                 kept.save(row["name"], shown)
         rows = ranks.in_turn(rows)
         result = summary(rows) | {
-            "pictures": [scene.view_names[view] for view in dict.fromkeys(spread)],
+            "pictures": [scene.view_names[view] for view in shown_views],
             "worst_views": kept.finish(rows),
             "protocol": self.protocol(scene, views, background),
             "origin": origin or {},
@@ -108,8 +109,7 @@ class Scoring:
             raise InputError(
                 f"The scene {scene.name} has no {self.split} views. Choose another split with evaluation.split=..."
             )
-        count = len(views) if self.max_views is None else min(self.max_views, len(views))
-        return [views[i * len(views) // count] for i in range(count)]
+        return spread(views, len(views) if self.max_views is None else self.max_views)
 
     def _compare(
         self, picture: Picture, scene: Scene, view: int, background: Background

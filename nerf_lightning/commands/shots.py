@@ -11,11 +11,13 @@ from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.commands.film_settings import Corner
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.geometry import normals_from_depth, surface_depth
-from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels, resized
+from nerf_lightning.export.seen_views import at_most
+from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.geometry.clipping import Clip, CropBox
 from nerf_lightning.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.geometry.paths.base import CameraPath, frame_of
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture, view_rays
 from nerf_lightning.types import Background, Cameras
@@ -78,13 +80,8 @@ class Shot:
 
     def small(self) -> "Shot":
         """Return a few of the frames, in small."""
-        count = len(self.cameras.c2w)
-        chosen = torch.arange(min(PROBES, count)) * count // min(PROBES, count)
-        shrink = min(1.0, PROBE_PIXELS / max(int(self.cameras.width[0]), int(self.cameras.height[0])))
-        width, height = (
-            (shrink * size[chosen]).round().long().clamp(min=1) for size in (self.cameras.width, self.cameras.height)
-        )
-        cameras = resized(self.cameras[chosen], width, height)
+        chosen = spread(range(len(self.cameras.c2w)), PROBES)
+        cameras = at_most(self.cameras[chosen], PROBE_PIXELS)
         return replace(self, cameras=cameras, seen_from=None, near=self.near[chosen], far=self.far[chosen])
 
 

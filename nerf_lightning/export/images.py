@@ -18,9 +18,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.pictures import save_png, to_bytes
-from nerf_lightning.export.seen_views import SeenView, see, spread
+from nerf_lightning.export.seen_views import SeenView, see
 from nerf_lightning.geometry.cameras import camera_coordinates
 from nerf_lightning.geometry.frames import directions_to_user, unit_of
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 
 DepthKind = Literal["distance", "z"]

@@ -13,8 +13,9 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.export.point_file import save_points
-from nerf_lightning.export.seen_views import SeenView, at_most, nearest_views, num_agreeing, see, spread
+from nerf_lightning.export.seen_views import SeenView, at_most, nearest_views, num_agreeing, see
 from nerf_lightning.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 
 # So many of the nearest other views are asked whether they agree.

@@ -8,7 +8,8 @@ from numpy import ndarray
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.lattice import Report
-from nerf_lightning.export.seen_views import at_most, num_agreeing, see, spread
+from nerf_lightning.export.seen_views import at_most, num_agreeing, see
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 
 # Training views that are rendered, and their longer side in pixels.

@@ -54,16 +54,6 @@ def at_most(cameras: Cameras, longest: int) -> Cameras:
     return resized(cameras, width, height)
 
 
-def spread(views: Sequence[int], most: int) -> list[int]:
-    """Return at most so many of the views, spread over all.
-
-    >>> spread([3, 4, 5, 6], 2)
-    [3, 5]
-    """
-    count = min(most, len(views))
-    return [views[i * len(views) // count] for i in range(count)]
-
-
 def nearest_views(cameras: Cameras, view: int, others: Sequence[int], count: int) -> list[int]:
     """Return those of the other views that were taken from nearest."""
     rest = [other for other in others if other != view]

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.geometry.footprints import footprint
+from nerf_lightning.geometry.spread import spread
 from nerf_lightning.types import Scene
 
 
@@ -35,8 +36,7 @@ def possible_cells(
         seen[unseen] = (x > -radius) & (x < width + radius) & (y > -radius) & (y < height + radius) & (radius > 0)
     left = seen.nonzero()[:, 0]
     if scene.pixels.has_transparency:
-        count = min(most_views, len(views))
-        for view in (views[i * len(views) // count] for i in range(count)):
+        for view in spread(views, most_views):
             left = left[~_looked_through(scene, view, centers[left], half_diagonal)]
     possible = torch.zeros_like(seen)
     possible[left] = True

@@ -1,5 +1,6 @@
 """The path that suits a capture: around it where it was photographed from all sides, else in front of it."""
 
+from dataclasses import dataclass
 from typing import final
 
 import torch
@@ -18,31 +19,20 @@ LOWEST, HIGHEST = 5.0, 60.0
 
 
 @final
+@dataclass
 class AutoPath(CameraPath):
     """An orbit at the photographs' own height, or a spiral.
 
     Args:
-        num_frames: how many cameras.
-        width: picture's width in pixels; None: it follows the height.
-        height: picture's height in pixels; None: it follows the width.
-        longest: where neither is given, the picture is as large as the photographs, but its longer side has at most so
-            many pixels: a film of photographs at full size takes hours.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
+        longest: where neither width nor height is given, the picture is as large as the photographs, but its longer
+            side has at most so many pixels: a film of photographs at full size takes hours.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        width: int | None = None,
-        height: int | None = None,
-        longest: int = 480,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        check_setting("longest", longest, longest >= 1, "at least 1 pixel")
-        self.longest = longest
+    longest: int = 480
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_setting("longest", self.longest, self.longest >= 1, "at least 1 pixel")
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the path that was chosen."""

@@ -7,7 +7,7 @@ files; `PathFrame.to_user` says how the working frame lies in it.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -108,6 +108,16 @@ def check_setting(name: str, value: object, good: bool, rule: str) -> None:
         raise InputError(f"path.{name} is {value}, but must be {rule}")
 
 
+def check_turns(turns: float, start: float = 0.0) -> None:
+    """Refuse a number of circles, or the angle in degrees at which they begin.
+
+    Raises:
+        InputError: one of them is not good.
+    """
+    check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
+    check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
+
+
 def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
     axis = torch.zeros_like(up)
@@ -115,8 +125,9 @@ def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     return normalize(axis - (axis @ up) * up, dim=0)
 
 
+@dataclass
 class CameraPath(ABC):
-    """A path of virtual cameras for a video.
+    """A path of virtual cameras for a video; a subclass adds the settings of its own.
 
     Args:
         num_frames: how many cameras.
@@ -129,13 +140,20 @@ class CameraPath(ABC):
         InputError: a number out of its range.
     """
 
-    def __init__(self, num_frames: int, width: int | None, height: int | None, fov: float | None, fps: int) -> None:
-        check_setting("num_frames", num_frames, num_frames >= 1, "at least 1")
+    num_frames: int = 120
+    _: KW_ONLY
+    width: int | None = None
+    height: int | None = None
+    fov: float | None = None
+    fps: int = 30
+
+    def __post_init__(self) -> None:
+        width, height, fov = self.width, self.height, self.fov
+        check_setting("num_frames", self.num_frames, self.num_frames >= 1, "at least 1")
         check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
         check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
         check_setting("fov", fov, fov is None or 0 < fov < 180, "between 0 and 180 degrees, both excluded, or null")
-        check_setting("fps", fps, fps >= 1, "at least 1")
-        self.num_frames, self.width, self.height, self.fov, self.fps = num_frames, width, height, fov, fps
+        check_setting("fps", self.fps, self.fps >= 1, "at least 1")
 
     @abstractmethod
     def cameras(self, around: PathFrame) -> Cameras:

@@ -1,6 +1,7 @@
 """An ellipse through the cameras of a capture that was taken from all sides, looking at what they look at."""
 
 import math
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.geometry.frames import focus_point
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -19,6 +20,7 @@ STEPS = 2048
 
 
 @final
+@dataclass
 class Ellipse(CameraPath):
     """Go once around on a level ellipse that fits the cameras, at one speed; the last frame precedes the first.
 
@@ -26,40 +28,27 @@ class Ellipse(CameraPath):
     cameras stand widest and least apart, as seen from above; its height is theirs (after arXiv 2111.12077's films).
 
     Args:
-        num_frames: how many cameras.
         scale: size of the ellipse; 1 takes in nine tenths of the cameras along each axis.
         rise: how far it rises and sinks on the way, as a share of the photographs' own spread in height.
         turns: full circles; negative goes clockwise.
         start: degrees from the long axis at which it begins.
         target: what it looks at, [x, y, z] in the capture's own frame; None: what the photographs look at.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        scale: float = 1.0,
-        rise: float = 0.0,
-        turns: float = 1.0,
-        start: float = 0.0,
-        target: list[int | float] | None = None,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        check_setting("scale", scale, 0 < scale < math.inf, "a positive number")
-        check_setting("rise", rise, math.isfinite(rise), "a finite share")
-        check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
-        self.scale, self.rise, self.turns, self.start, self.target = scale, rise, turns, start, target
+    scale: float = 1.0
+    rise: float = 0.0
+    turns: float = 1.0
+    start: float = 0.0
+    target: list[int | float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_setting("scale", self.scale, 0 < self.scale < math.inf, "a positive number")
+        check_setting("rise", self.rise, math.isfinite(self.rise), "a finite share")
+        check_turns(self.turns, self.start)
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the ellipse."""

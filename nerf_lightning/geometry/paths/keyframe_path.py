@@ -15,7 +15,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import focal_from_fov
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
 from nerf_lightning.geometry.paths.keyframes import Keyframe, read_keyframes
-from nerf_lightning.geometry.paths.spline import along, even_speed, frame_times, rotations_along
+from nerf_lightning.geometry.paths.spline import along, even_speed, frame_times, poses_along
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
@@ -52,7 +52,7 @@ class KeyframePath(CameraPath):
         fov: float | None = None,
         fps: int = 30,
     ) -> None:
-        super().__init__(1 if num_frames is None else num_frames, width, height, fov, fps)
+        super().__init__(1 if num_frames is None else num_frames, width=width, height=height, fov=fov, fps=fps)
         self.asked_frames, self.closed = num_frames, closed
         self.keyframes = read_keyframes(Path(file).expanduser())
 
@@ -61,11 +61,11 @@ class KeyframePath(CameraPath):
         keys = _poses(self.keyframes, around)
         knots = self._knots(keys, around)
         at = frame_times(knots, self._count(knots), self.closed)
-        eyes = along(knots, keys[:, :, 3], at)
-        c2w = torch.cat([rotations_along(knots, keys[:, :, :3], at), eyes[:, :, None]], dim=-1)
+        c2w = poses_along(knots, keys, at)
         targets = [around.point("file", each.look_at) for each in self.keyframes]
         if all(target is not None for target in targets):
             held = along(knots, torch.stack([target for target in targets if target is not None]), at)
+            eyes = c2w[:, :, 3]
             back = normalize(eyes - held, dim=-1)
             right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
             c2w = torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)

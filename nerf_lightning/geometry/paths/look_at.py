@@ -1,5 +1,6 @@
 """A straight drive from one place to another, looking at one point all the way."""
 
+from dataclasses import dataclass
 from typing import final
 
 import torch
@@ -10,6 +11,7 @@ from nerf_lightning.types import Cameras
 
 
 @final
+@dataclass
 class LookAt(CameraPath):
     """Drive from `start` to `end`, looking at `target`.
 
@@ -18,28 +20,14 @@ class LookAt(CameraPath):
         start: [x, y, z] in the capture's own frame; None: where the first photograph was taken.
         end: [x, y, z] in the capture's own frame; None: where the last photograph was taken.
         target: [x, y, z] in the capture's own frame; None: the middle of the scene.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        start: list[int | float] | None = None,
-        end: list[int | float] | None = None,
-        target: list[int | float] | None = None,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        self.start, self.end, self.target = start, end, target
+    start: list[int | float] | None = None
+    end: list[int | float] | None = None
+    target: list[int | float] | None = None
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the drive."""

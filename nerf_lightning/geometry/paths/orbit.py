@@ -1,6 +1,7 @@
 """A level circle around the scene, looking at its middle."""
 
 import math
+from dataclasses import dataclass
 from typing import final
 
 import torch
@@ -8,51 +9,41 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
 
 @final
+@dataclass
 class Orbit(CameraPath):
     """Circle around the centre, anticlockwise from above; the last frame precedes the first, not repeats it.
 
     Args:
-        num_frames: how many cameras.
         elevation: degrees above the horizon, between -90 and 90, both excluded (there the picture has no up).
         radius: distance from the centre in the capture's units; None: as far as the photographs were taken.
         turns: full circles; negative goes clockwise.
         start: azimuth of the first camera in degrees; 0 is on the world's x axis where up is z.
         center: what it goes around, [x, y, z] in the capture's own frame; None: the middle of the scene.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        elevation: float = 30.0,
-        radius: float | None = None,
-        turns: float = 1.0,
-        start: float = 0.0,
-        center: list[int | float] | None = None,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        check_setting("elevation", elevation, -90 < elevation < 90, "between -90 and 90 degrees, both excluded")
-        check_setting("radius", radius, radius is None or 0 < radius < math.inf, "a positive distance, or null")
-        check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
-        self.elevation, self.radius = elevation, radius
-        self.turns, self.start, self.center = turns, start, center
+    elevation: float = 30.0
+    radius: float | None = None
+    turns: float = 1.0
+    start: float = 0.0
+    center: list[int | float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        good = self.radius is None or 0 < self.radius < math.inf
+        check_setting(
+            "elevation", self.elevation, -90 < self.elevation < 90, "between -90 and 90 degrees, both excluded"
+        )
+        check_setting("radius", self.radius, good, "a positive distance, or null")
+        check_turns(self.turns, self.start)
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the circle."""

@@ -1,6 +1,7 @@
 """A camera that stays where it is and turns."""
 
 import math
+from dataclasses import dataclass
 from typing import final
 
 import torch
@@ -13,40 +14,30 @@ from nerf_lightning.types import Cameras
 
 
 @final
+@dataclass
 class Pan(CameraPath):
     """Turn about the vertical, from the left of where a photograph looks to its right.
 
     Args:
-        num_frames: how many cameras.
         view: the photograph to begin from: its name, or its number from 0.
         position: where to stand instead, [x, y, z] in the capture's own frame, looking at the middle of the scene.
         sweep: degrees to turn in all; 360 makes a panorama, negative turns to the left.
         tilt: degrees to look higher than the photograph.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        view: int | str = 0,
-        position: list[int | float] | None = None,
-        sweep: float = 40.0,
-        tilt: float = 0.0,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        check_setting("sweep", sweep, math.isfinite(sweep) and sweep != 0, "a finite angle in degrees, not 0")
-        check_setting("tilt", tilt, -180 < tilt < 180, "between -180 and 180 degrees")
-        self.view, self.position, self.sweep, self.tilt = view, position, sweep, tilt
+    view: int | str = 0
+    position: list[int | float] | None = None
+    sweep: float = 40.0
+    tilt: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        good = math.isfinite(self.sweep) and self.sweep != 0
+        check_setting("sweep", self.sweep, good, "a finite angle in degrees, not 0")
+        check_setting("tilt", self.tilt, -180 < self.tilt < 180, "between -180 and 180 degrees")
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras that turn."""

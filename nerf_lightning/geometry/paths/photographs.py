@@ -2,47 +2,32 @@
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import final
 
-import torch
-
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
-from nerf_lightning.geometry.paths.spline import along, even_speed, frame_times, rotations_along
+from nerf_lightning.geometry.paths.spline import even_speed, frame_times, poses_along
 from nerf_lightning.types import Cameras
 
 
 @final
+@dataclass
 class Photographs(CameraPath):
     """Go from photograph to photograph, where and as they were taken, at about one speed.
 
     Args:
-        num_frames: how many cameras.
         views: photographs in the order of the path, each by its name, a pattern ("IMG_01*") or its number from 0;
             None: all, in the capture's order.
         closed: go back to the first one at the end; the last frame then precedes the first.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        views: list[str | int] | None = None,
-        closed: bool = False,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        self.views, self.closed = views, closed
+    views: list[str | int] | None = None
+    closed: bool = False
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras between the photographs."""
@@ -57,8 +42,7 @@ class Photographs(CameraPath):
         keys = around.poses[numbers]
         knots = even_speed(keys, around.radius, self.closed)
         at = frame_times(knots, self.num_frames, self.closed)
-        eyes = along(knots, keys[:, :, 3], at)
-        return self.pinholes(torch.cat([rotations_along(knots, keys[:, :, :3], at), eyes[:, :, None]], dim=-1), around)
+        return self.pinholes(poses_along(knots, keys, at), around)
 
 
 def find_views(setting: str, chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:

@@ -1,49 +1,39 @@
 """A spiral in front of the scene, as LLFF films captures that were taken from one side."""
 
 import math
+from dataclasses import dataclass
 from typing import final
 
 import torch
 
 from nerf_lightning.geometry.frames import average_pose
-from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
+from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns
 from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types import Cameras
 
 
 @final
+@dataclass
 class Spiral(CameraPath):
     """Circle around the mean camera, within the reach of the photographs, looking at the middle.
 
     Args:
-        num_frames: how many cameras.
         reach: size of the spiral as a share of how far the photographs were taken apart.
         turns: full circles; on the way the camera goes once nearer and back.
         target: what it looks at, [x, y, z] in the capture's own frame; None: the middle of the scene.
-        width: picture's width in pixels; None: it follows the height, or is the photographs'.
-        height: picture's height in pixels; None: it follows the width, or is the photographs'.
-        fov: degrees that the picture's width takes in; None: as the photographs.
-        fps: frames per second.
 
     Raises:
         InputError: a number out of its range.
     """
 
-    def __init__(
-        self,
-        num_frames: int = 120,
-        reach: float = 0.7,
-        turns: float = 2.0,
-        target: list[int | float] | None = None,
-        width: int | None = None,
-        height: int | None = None,
-        fov: float | None = None,
-        fps: int = 30,
-    ) -> None:
-        super().__init__(num_frames, width, height, fov, fps)
-        check_setting("reach", reach, 0 < reach < math.inf, "a positive share")
-        check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
-        self.reach, self.turns, self.target = reach, turns, target
+    reach: float = 0.7
+    turns: float = 2.0
+    target: list[int | float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_setting("reach", self.reach, 0 < self.reach < math.inf, "a positive share")
+        check_turns(self.turns)
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the spiral, the last of which precedes the first."""

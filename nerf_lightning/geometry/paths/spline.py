@@ -90,3 +90,11 @@ def rotations_along(
         period = knots[-1] - knots[0]
         knots = torch.cat([knots[-2:-1] - period, knots, knots[1:2] + period])
     return rotation_from_quaternion(normalize(hermite(knots, torch.stack(turned), at), dim=-1))
+
+
+def poses_along(
+    knots: Float[Tensor, "knots"], poses: Float[Tensor, "keys 3 4"], at: Float[Tensor, "frames"]
+) -> Float[Tensor, "frames 3 4"]:
+    """Return poses between those of the keys."""
+    places = along(knots, poses[:, :, 3], at)
+    return torch.cat([rotations_along(knots, poses[:, :, :3], at), places[:, :, None]], dim=-1)
