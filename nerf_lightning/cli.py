@@ -92,8 +92,11 @@ def _run(command: str, arguments: list[str]) -> None:
             return module.run(config)
 
     with explained(command):
+        from nerf_lightning.commands.hydra_options import options_first
+
+        arguments = options_first(arguments)
         prepare = getattr(module, "prepare", list)
-        sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
+        sys.argv = [f"nerf {command}", *options_first(prepare(sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.commands.sweep import watched
