@@ -217,18 +217,19 @@ def test_a_file_that_is_no_record_of_a_sweep(nerf, tmp_path, content):
 @pytest.mark.parametrize(
     "planted",
     [
-        "hydra.launcher={_target_:os.system,command:'touch MARK'}",
-        "+hydra.callbacks.evil={_target_:os.system,command:'touch MARK'}",
-        "+callbacks.evil={_target_:os.system,command:'touch MARK'},null",
+        "hydra.launcher={_target_:logging.FileHandler,filename:'MARK'}",
+        "+hydra.callbacks.evil={_target_:logging.FileHandler,filename:'MARK'}",
+        "+callbacks.evil={_target_:logging.FileHandler,filename:'MARK'},null",
         "hydra.searchpath=['file://FOLDER/conf']",
         "--config-dir=FOLDER/conf",
         "hydra/launcher=../../../../../../../../../../FOLDER/conf/evil",
     ],
 )
 def test_nothing_planted_runs_through_the_command_line(nerf, capture, tmp_path, planted):
+    """FileHandler makes a file, and is none of the names that Hydra itself refuses (os.system is)."""
     mark, folder = tmp_path / "ran", tmp_path / "sweep"
     (tmp_path / "conf" / "scene").mkdir(parents=True)
-    evil = f"_target_: os.system\ncommand: touch {mark}\n"
+    evil = f"_target_: logging.FileHandler\nfilename: {mark}\n"
     for name in ("evil.yaml", "scene/npz.yaml"):
         (tmp_path / "conf" / name).write_text(evil)
     planted = planted.replace("MARK", str(mark)).replace("FOLDER", str(tmp_path))
