@@ -179,6 +179,7 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     result = nerf(
         "train", f"experiment={experiment}", *scene, f"scene.path={capture}", *article, "trainer.max_steps=2",
         "data.batch_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
+        "data.val_rays=64",
         f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err
