@@ -31,7 +31,7 @@ class RayHistograms(Watcher):
         num_rays: how many rays.
     """
 
-    def __init__(self, every_steps: int = 500, num_rays: int = 256):
+    def __init__(self, every_steps: int = 250, num_rays: int = 256):
         super().__init__(every_steps)
         require_positive(num_rays=num_rays)
         self.num_rays = num_rays
@@ -41,17 +41,16 @@ class RayHistograms(Watcher):
         writers = tensorboard_writers(trainer.loggers)
         if not writers:
             return
-        endless = trainer.datamodule.scene.space == "contracted"
+        step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
         with trainer.precision_plugin.forward_context():
-            seen = look_along(system, batch.rays[: self.num_rays], trainer.global_step, endless)
+            seen = look_along(system, batch.rays[: self.num_rays], step, endless)
         for name, (along, samples) in seen.items():
-            lit = samples[samples > 0]
-            values = {f"rays/effective_samples_{name}": float(lit.mean()) if lit.numel() else 0.0}
-            for logger in trainer.loggers:
-                logger.log_metrics(values, trainer.global_step)
+            lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:
-                write_shares(writer, f"along_rays/weight_{name}", along, trainer.global_step)
-                writer.add_histogram(f"per_ray/effective_samples_{name}", samples, trainer.global_step)
+                write_shares(writer, f"along_rays/weight_{name}", along, step)
+                if lit.numel():
+                    writer.add_histogram(f"per_ray/effective_samples_{name}", lit, step)
+                    writer.add_scalar(f"rays/effective_samples_{name}", lit.mean(), step)
 
 
 @torch.no_grad()
