@@ -153,7 +153,7 @@ class RayBatches:
             restart_steps: its least length in later attempts.
         """
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = fraction, steps, max(steps, restart_steps)
-        self.take_from(self.scene)
+        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
 
     def crop_rays(self, restarts: int) -> int:
         """Return how many rays a run takes from the crop after so many restarts."""
