@@ -31,7 +31,7 @@ from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,8 @@ from nerf_lightning.data.residence import sent
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.randomness import fold, permute
-from nerf_lightning.types import Batch, PixelIndex, Scene
+from nerf_lightning.types.rays import Batch, PixelIndex
+from nerf_lightning.types.scene import Scene
 
 
 @dataclass

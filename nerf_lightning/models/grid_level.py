@@ -6,7 +6,7 @@ from torch import Tensor
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import AnyLevel
 from nerf_lightning.samplers.occupancy import OccupancySampler
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 
 class GridLevel(AnyLevel):

@@ -8,7 +8,8 @@ from nerf_lightning.kernels.march_torch import occupied_intervals
 from nerf_lightning.models.grid_level import GridLevel
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
-from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle, RaySamples, Rendering
+from nerf_lightning.types.rays import RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering, FieldOutput, Rendering
 
 
 class MaskedLevel(GridLevel):

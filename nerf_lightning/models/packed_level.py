@@ -12,7 +12,8 @@ from nerf_lightning.models.grid_level import GridLevel
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.packed import composite_packed
 from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
-from nerf_lightning.types import FieldOutput, PackedRendering, PackedSamples, RayBundle, Rendering
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.renderings import FieldOutput, PackedRendering, Rendering
 
 # A ray's random numbers are numbered by its samples: no ray has more.
 MOST_SAMPLES = 1 << 12

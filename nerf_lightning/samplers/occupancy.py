@@ -18,7 +18,8 @@ from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.samplers.occupancy_grid import OccupancyGrid
-from nerf_lightning.types import PackedSamples, RayBundle, Scene
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
 
