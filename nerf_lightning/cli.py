@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerf_lightning.closed_pipe import ends_quietly
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.sweep_arguments import is_sweep, sweep_arguments
 
@@ -25,7 +26,11 @@ MOST_LETTERS = 5000
 
 def main() -> None:
     """Run the command line."""
-    arguments = sys.argv[1:]
+    with explained("COMMAND"):
+        _answer(sys.argv[1:])
+
+
+def _answer(arguments: list[str]) -> None:
     commands = find_commands()
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_help(commands))
@@ -86,14 +91,17 @@ def _run(command: str, arguments: list[str]) -> None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             from nerf_lightning.commands.sweep_job import run_job
 
-            return run_job(module.run, config, command)
+            return run_job(ends_quietly()(module.run), config, command)
         # Caught inside the job as well: Hydra would print the overrides first.
         with explained(command):
             return module.run(config)
 
     with explained(command):
+        from nerf_lightning.commands.hydra_options import options_first
+
+        arguments = options_first(arguments)
         prepare = getattr(module, "prepare", list)
-        sys.argv = [f"nerf {command}", *prepare(sweep_arguments(arguments))]
+        sys.argv = [f"nerf {command}", *options_first(prepare(sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.commands.sweep import watched
@@ -105,9 +113,10 @@ def _run(command: str, arguments: list[str]) -> None:
 
 @contextmanager
 def explained(command: str) -> Iterator[None]:
-    """Turn bad input into one paragraph and exit code 2."""
+    """Turn bad input into one paragraph and exit code 2; end quietly where nobody reads what is printed."""
     try:
-        yield
+        with ends_quietly():
+            yield
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:

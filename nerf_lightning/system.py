@@ -98,6 +98,9 @@ class RadianceFieldSystem(LightningModule):
             )
         self.guard = StepGuard()
         self.last_step: dict[str, Tensor] = {}
+        # Who wants to know the gradients' norms before they are clipped asks for them, and finds them here.
+        self.measures_gradients = False
+        self.gradient_norms: dict[str, Tensor] = {}
         self.val_errors = RayErrors()
 
     def initialize(self) -> None:
@@ -270,6 +273,7 @@ class RadianceFieldSystem(LightningModule):
         return self.model(rays, background, random=None)[-1]
 
     def _update(self, optimizer: Any) -> None:
+        self.gradient_norms = self.model.gradient_norms() if self.measures_gradients else {}
         if self.clip_norm is not None:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
         for group in optimizer.param_groups:

@@ -17,6 +17,7 @@ FAST = (
     "trainer.val_every_steps=10",
     "callbacks.validation_pictures.every_steps=10",
     "callbacks.monitor.every_steps=5",
+    "callbacks.ray_histograms.every_steps=10",
     "callbacks.checkpoints.every_steps=5",
     "evaluation.max_views=2",
     "evaluation.num_pictures=1",

@@ -71,6 +71,18 @@ def test_clipping_scales_the_whole_gradient():
     assert abs(float(gradient.norm()) - 1e-3) < 1e-6
 
 
+def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they_are_clipped():
+    clipped, whole = make_system(100, clip_norm=1e-3), make_system(100)
+    clipped.measures_gradients = True
+    gradients(clipped, ball_scene())
+    gradients(whole, ball_scene())
+    assert whole.gradient_norms == {}
+    for name, level in whole.model.levels.items():
+        expected = torch.cat([parameter.grad.flatten() for parameter in level.parameters()]).norm()
+        assert float(expected) > 1e-3
+        torch.testing.assert_close(clipped.gradient_norms[name], expected)
+
+
 def test_batch_norm_with_tiles_is_refused_by_name():
     with pytest.raises(InputError, match=r"field\.batch_norm=true .* trainer\.tile_points=null"):
         make_system(64, tiny_model(batch_norm=True))

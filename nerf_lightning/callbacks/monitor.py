@@ -1,4 +1,4 @@
-"""Scalars for TensorBoard: losses, PSNR of each level, learning rate, speed, memory."""
+"""Scalars for TensorBoard: losses, PSNR and gradients of each level, learning rate, speed, memory."""
 
 import time
 from typing import Any
@@ -6,15 +6,15 @@ from typing import Any
 import psutil
 import torch
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from nerf_lightning.errors import require_positive
+from nerf_lightning.callbacks.watcher import Watcher
+from nerf_lightning.types.rays import Batch
 
 GIGABYTE = 1e9
 
 
-class Monitor(Callback):
+class Monitor(Watcher):
     """Log every few steps, straight to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
@@ -22,8 +22,7 @@ class Monitor(Callback):
     """
 
     def __init__(self, every_steps: int = 50):
-        require_positive(every_steps=every_steps)
-        self.every_steps = every_steps
+        super().__init__(every_steps)
         self.since = 0.0
         self.rays_seen = 0
 
@@ -32,24 +31,29 @@ class Monitor(Callback):
         self.since = time.perf_counter()
         self.rays_seen = pl_module.progress.rays_seen
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Log a row when it is time."""
-        if trainer.global_step % self.every_steps:
-            return
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Batch, batch_idx: int) -> None:
+        """Ask for the gradients' norms of a step that gets a row."""
+        # XLA would compile the steps that get a row and those that do not as two programs.
+        always = pl_module.device.type == "xla"
+        pl_module.measures_gradients = always or self.is_time(trainer.global_step + 1, trainer.max_steps)
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Log a row."""
         now, step = time.perf_counter(), trainer.global_step
-        rays, seconds = pl_module.progress.rays_seen - self.rays_seen, now - self.since
-        self.since, self.rays_seen = now, pl_module.progress.rays_seen
-        names = pl_module.model.level_names
-        pictures = names if pl_module.loss.every_level_is_a_picture else names[-1:]
-        values = level_scalars(names, pl_module.last_step["losses"], pictures) | pl_module.model.statistics()
-        values["train/learning_rate"] = pl_module.optimizers().param_groups[0]["lr"]
+        rays, seconds = system.progress.rays_seen - self.rays_seen, now - self.since
+        self.since, self.rays_seen = now, system.progress.rays_seen
+        names = system.model.level_names
+        pictures = names if system.loss.every_level_is_a_picture else names[-1:]
+        values = level_scalars(names, system.last_step["losses"], pictures) | system.model.statistics()
+        values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
         values["speed/rays_per_step"] = batch.rays.near.numel()
-        values["train/skipped_steps"] = pl_module.guard.skipped
+        values["train/skipped_steps"] = system.guard.skipped
         values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
-        if pl_module.device.type == "cuda":
+        if system.device.type == "cuda":
             values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE
+        values |= {f"gradients/norm_{name}": float(norm) for name, norm in system.gradient_norms.items()}
         for logger in trainer.loggers:
             logger.log_metrics(values, step)
 

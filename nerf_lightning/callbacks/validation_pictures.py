@@ -3,18 +3,16 @@
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import Callback
-
 from nerf_lightning.callbacks.validation_view import render_validation_view
+from nerf_lightning.callbacks.watcher import Watcher
 from nerf_lightning.callbacks.writers import tensorboard_writers
-from nerf_lightning.errors import require_positive
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.rendering.blending import photograph
+from nerf_lightning.types.rays import Batch
 
 
-class ValidationPictures(Callback):
+class ValidationPictures(Watcher):
     """Render one view of the validation split.
 
     Args:
@@ -23,16 +21,20 @@ class ValidationPictures(Callback):
     """
 
     def __init__(self, every_steps: int = 1000, view: int = 0):
-        require_positive(every_steps=every_steps)
-        self.every_steps, self.view = every_steps, view
+        super().__init__(every_steps)
+        self.view = view
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Render when it is time."""
-        step = trainer.global_step
-        if not trainer.is_global_zero or (step % self.every_steps and step != trainer.max_steps):
+    def is_time(self, step: int, last_step: int) -> bool:
+        """Tell whether to render after a step; always after the last one."""
+        return super().is_time(step, last_step) or step == last_step
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Render the view, and save its pictures."""
+        if not trainer.is_global_zero:
             return
-        view, picture = render_validation_view(trainer, pl_module, self.view)
-        scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+        step = trainer.global_step
+        view, picture = render_validation_view(trainer, system, self.view)
+        scene = trainer.datamodule.scene
         truth = photograph(scene, view, scene.background)
         panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
         folder = Path(trainer.default_root_dir) / "images"

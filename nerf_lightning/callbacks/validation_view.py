@@ -2,16 +2,14 @@
 
 from typing import Any
 
-from lightning.pytorch import Trainer
-
 from nerf_lightning.models.pictures import Picture, render_picture
 
 WHOLE_BATCH_POINTS = 65_536
 
 
-def render_validation_view(trainer: Trainer, system: Any, number: int) -> tuple[int, Picture]:
+def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
     """Return the number-th validation view (counted round) and its picture, in the precision of training."""
-    scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+    scene = trainer.datamodule.scene
     views = scene.splits["val"]
     view = views[number % len(views)]
     tile_points = system.tile_points or WHOLE_BATCH_POINTS

@@ -6,8 +6,9 @@ from typing import Any
 
 import psutil
 import torch
-from rich.console import Console
 from rich.table import Table
+
+from nerf_lightning.commands.console import StdoutConsole
 
 
 def spread(values: list[float]) -> dict[str, float]:
@@ -40,4 +41,4 @@ def print_table(result: dict[str, Any]) -> None:
         seconds, steps = result["seconds_and_steps_to_target_psnr"]
         table.add_row("seconds to the target PSNR", f"{seconds:.1f}", f"{steps} steps", "")
     table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
-    Console(width=100).print(table)
+    StdoutConsole(width=100).print(table)

@@ -18,17 +18,20 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from rich.progress import track
-from torch.utils.flop_counter import FlopCounterMode
 
+from nerf_lightning.callbacks.watcher import Watcher
 from nerf_lightning.commands.bench_kernels import kernel_ratios
 from nerf_lightning.commands.bench_loading import LoadedSteps
+from nerf_lightning.commands.bench_rates import MATRIX_FLOPS, flops_per_ray, multiplication
 from nerf_lightning.commands.bench_stages import seconds_to_psnr, stage_seconds
 from nerf_lightning.commands.bench_table import peak_memory, print_table, spread
+from nerf_lightning.commands.bench_watching import watching_seconds
 from nerf_lightning.commands.build import build, build_system
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress, RayBatches
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.kernels.backends import without
@@ -40,7 +43,6 @@ from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.rays import Batch, RayBundle
 
 MOST_STEPS = 2000
-MATRIX_ROWS, MATRIX_WIDTH, MATRIX_REPEATS = 4096, 256, 20
 
 
 @dataclass
@@ -49,9 +51,14 @@ class Bench:
 
     settings: TrainerSettings
     system: RadianceFieldSystem
-    batches: RayBatches
+    data: RayDataModule
     optimizer: torch.optim.Optimizer
     plain_optimizer: torch.optim.Optimizer
+
+    @property
+    def batches(self) -> RayBatches:
+        """The training rays."""
+        return self.data.batches
 
     @cached_property
     def batch(self) -> Batch:
@@ -80,7 +87,7 @@ def benchmark(config: DictConfig) -> float:
     reached = _train_first(bench, config)
     loaded_steps = LoadedSteps(bench.batches, bench.train_on, config.steps)
     kinds: dict[str, Callable[[], Any]] = {
-        "matrix": _multiplication(bench.settings),
+        "matrix": multiplication(bench.settings),
         "train": lambda: _train(bench, config.steps, plain=False),
         "train_plain": lambda: _train(bench, config.steps, plain=True),
         "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
@@ -92,11 +99,14 @@ def benchmark(config: DictConfig) -> float:
     peak = peak_memory()  # before the whole batches of the plain kinds
     seconds = _interleaved(kinds, config.rounds)
     num_rays = bench.batch.rays.near.numel()
-    flops = _flops_per_ray(bench)
+    flops = flops_per_ray(bench.system, bench.batch)
     seconds["wait"] = loaded_steps.waits[1:]
     per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
     result: dict[str, Any] = {name: spread([row[name] for row in per_round]) for name in per_round[0]}
     result |= {name: spread(values) for name, values in _stages(bench, seconds["train"], config.steps).items()}
+    watching = _watching(bench, config)
+    steps = [one / config.steps for one in seconds["train"]]
+    result |= {name: spread([value / step for step in steps]) for name, value in watching.items()}
     if config.kernels:
         ratios = kernel_ratios(bench.settings.device, config.rounds)
         result |= {name: spread(values) for name, values in ratios.items()}
@@ -143,7 +153,7 @@ def _prepare(config: DictConfig) -> Bench:
     # Stand-ins for what Lightning's trainer provides.
     setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
     setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
-    return Bench(settings, system, data.batches, optimizer, plain)
+    return Bench(settings, system, data, optimizer, plain)
 
 
 def _interleaved(kinds: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
@@ -160,7 +170,7 @@ def _round(
     seconds: dict[str, list[float]], i: int, batch_rays: int, steps: int, render_rays: int, flops: float
 ) -> dict[str, float]:
     train_rays = batch_rays * steps
-    matrix_rate = 2 * MATRIX_ROWS * MATRIX_WIDTH**2 * MATRIX_REPEATS / seconds["matrix"][i]
+    matrix_rate = MATRIX_FLOPS / seconds["matrix"][i]
     rate = train_rays * flops / seconds["train"][i]
     return {
         "training rays/s": train_rays / seconds["train"][i],
@@ -214,6 +224,17 @@ def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[fl
     return result
 
 
+def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
+    """Return the seconds per step that go into TensorBoard, in all and by what is shown."""
+    watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
+    system, data = bench.system, bench.data
+    bench.take_step()  # losses to look at
+    seconds = watching_seconds(watchers, system, data, bench.batch, bench.settings.autocast)
+    return {"watching, share of a step": sum(seconds.values())} | {
+        f"watching: {name}, share of a step": value for name, value in seconds.items()
+    }
+
+
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
     rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
     size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
@@ -225,25 +246,3 @@ def _render(bench: Bench, num_rays: int, plain: bool) -> None:
 def _render_tile(model: RadianceModel, rays: RayBundle, bench: Bench) -> None:
     behind = background_colors(bench.system.background, rays.near.numel(), rays.near.device, random=None)
     model(rays, behind, random=None)
-
-
-def _multiplication(settings: TrainerSettings) -> Callable[[], None]:
-    dtype = torch.bfloat16 if settings.precision.startswith("bf16") else torch.float32
-    left = torch.randn(MATRIX_ROWS, MATRIX_WIDTH, device=settings.device).to(dtype)
-    right = torch.randn(MATRIX_WIDTH, MATRIX_WIDTH, device=settings.device).to(dtype)
-    out = torch.empty_like(left)
-
-    def multiply() -> None:
-        for _ in range(MATRIX_REPEATS):
-            torch.mm(left, right, out=out)
-
-    return multiply
-
-
-def _flops_per_ray(bench: Bench) -> float:
-    # Where rays differ in their samples, many make the mean.
-    few = 8 if bench.system.model.points_per_ray(training=True) > 64 else min(1024, bench.batch.rays.near.numel())
-    rays = bench.batch[:few]
-    with FlopCounterMode(display=False) as counter, without("mlp_tiles"):  # it counts one thread's
-        bench.system.accumulate_gradients(rays, lambda loss: loss.backward())
-    return counter.get_total_flops() / few

@@ -1,8 +1,16 @@
-"""The terminal that progress bars are drawn on."""
+"""The terminals that tables are printed to and progress bars are drawn on."""
 
 from rich.console import Console
 
 from nerf_lightning import ranks
+
+
+class StdoutConsole(Console):
+    """A console on stdout. Where that is a closed pipe, rich would exit with 1; closed_pipe.py decides here."""
+
+    def on_broken_pipe(self) -> None:
+        """Pass on the error that is being handled."""
+        raise
 
 
 def stderr_console() -> Console:

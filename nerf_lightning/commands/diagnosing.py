@@ -9,10 +9,10 @@ from datetime import datetime
 from pathlib import Path
 
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.text import Text
 
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.console import StdoutConsole
 from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.data.doctor.examine import examine
@@ -51,7 +51,7 @@ def summary(checks: Sequence[Check]) -> str:
 
 def print_checks(checks: Sequence[Check]) -> None:
     """Print a line per check, what is wrong with its cure below."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = StdoutConsole(highlight=False, soft_wrap=True)
     width = max(len(check.name) for check in checks)
     for check in checks:
         line = Text.assemble(

@@ -13,16 +13,13 @@ def prepare(arguments: list[str]) -> list[str]:
     """
     given = [argument.partition("=") for argument in arguments]
     checkpoints = [value for key, _, value in given if key == "ckpt"]
-    if not checkpoints or any(key in ("scene", "--help", "-h") for key, _, _ in given):
+    if not checkpoints or any(key in ("scene", "--help") for key, _, _ in given):
         return arguments
     if "," in checkpoints[-1]:
         raise InputError("A sweep over checkpoints needs the scene by name: add scene=... and its settings.")
     from nerf_lightning.commands.recorded_scene import scene_overrides
 
-    # Flags come first on Hydra's command line.
-    flags = [argument for argument in arguments if argument.startswith("-")]
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
-    return [*flags, *scene_overrides(checkpoints[-1]), *overrides]
+    return [*scene_overrides(checkpoints[-1]), *arguments]
 
 
 def run(config: DictConfig) -> float:

@@ -1,6 +1,6 @@
-"""The overrides that a run was started with, repeated where it is resumed by name.
+"""The overrides that a run or a sweep was started with, repeated where it is gone on with by its folder's name.
 
-They come out of a file in the run's folder, and the folder may come from anybody: what names a class, looks something
+They come out of a file in the folder, and the folder may come from anybody: what names a class, looks something
 up (an interpolation), or says where to write or how far to trust is taken from the command line alone.
 """
 
@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
 from nerf_lightning.commands.plain_yaml import read_plain_yaml
+from nerf_lightning.commands.sweep_record import read_sweep, sweep_record
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 
@@ -24,8 +25,18 @@ OF_THE_USER = ("hydra", "logger", "scene.download", "scene.cache_dir", "scene.al
 """Where to write, what to fetch, and what to trust."""
 DOWNLOADED = "scene.path"
 """Where some scenes put what they fetch: a file that is there already is only read."""
+SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
+SWEEP_NUMBERS = re.compile(r"hydra\.(launcher|sweeper|sweeper\.sampler)\.[A-Za-z]\w*", re.ASCII)
+"""Numbers that say how many jobs there are, at once and in all. Not hydra.sweeper.params: its keys are overrides."""
+SWEEP_WORDS = (
+    "hydra.launcher.batch_size",
+    "hydra.launcher.name",
+    "hydra.launcher.partition",
+    "hydra.sweeper.direction",
+)
 OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
+WORD = re.compile(r"\w[\w-]*", re.ASCII)
 
 
 def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
@@ -40,31 +51,51 @@ def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
     lines = read_plain_yaml(saved)
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError(f"{saved} is no list of overrides: it is damaged. Give the run's settings by hand.")
+    return list(_repeated(lines, arguments, saved, of_sweep=False))
+
+
+def former_sweep(sweep_folder: Path, arguments: Sequence[str]) -> list[str]:
+    """Return what a sweep was started with, but for what belongs to one start and what the user gives again.
+
+    Raises:
+        InputError: the file is no record of a sweep, or holds an override that is not repeated from files.
+    """
+    record = read_sweep(sweep_folder)
+    if record is None:
+        return []
+    return list(_repeated(record.typed(), arguments, sweep_record(sweep_folder), of_sweep=True))
+
+
+def to_give_again(overrides: Sequence[str], of_sweep: bool = False) -> list[str]:
+    """Return, as typed in a shell, those overrides of a run or a sweep that are not repeated from its folder."""
+    return [
+        shlex.quote(line)
+        for line, override in ((line, _parsed(line)) for line in overrides)
+        if override and not _is_of_one_start(override, of_sweep) and not _is_harmless(override, of_sweep)
+    ]
+
+
+def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sweep: bool) -> Iterator[str]:
     given = {argument.lstrip("+~").partition("=")[0] for argument in arguments}
-    kept = []
     for line in lines:
         override = _parsed(line)
-        key = "" if override is None else override.key_or_group
-        if _belongs(key, OF_ONE_START) or key in given:
+        if override is not None and (override.key_or_group in given or _is_of_one_start(override, of_sweep)):
             continue
-        if not _is_harmless(override):
+        if override is None or not _is_harmless(override, of_sweep):
+            flag, kind = ("sweep.resume=true", "sweep") if of_sweep else ("resume=", "run")
             raise InputError(
                 f"{saved} holds {line[:200]!r}, which is not repeated from a file: what names a class, looks something "
                 "up, or says where to write, what to fetch and how far to trust is taken from the command line alone. "
-                "If it is yours, type it again after resume=; else do not go on with this run."
+                f"If it is yours, type it again after {flag}; else do not go on with this {kind}."
             )
-        kept.append(line)
-    return kept
+        yield line
 
 
-def to_give_again(overrides: Sequence[str]) -> list[str]:
-    """Return, as typed in a shell, those of a run's overrides that are not repeated from its folder."""
-    parsed = [(line, _parsed(line)) for line in overrides]
-    return [
-        shlex.quote(line)
-        for line, override in parsed
-        if override and not _belongs(override.key_or_group, OF_ONE_START) and not _is_harmless(override)
-    ]
+def _is_of_one_start(override: Override, of_sweep: bool) -> bool:
+    # Jobs of a sweep that have not begun start from there still.
+    if of_sweep and override.key_or_group == "init_from":
+        return False
+    return _belongs(override.key_or_group, OF_ONE_START)
 
 
 def _parsed(line: str) -> Override | None:
@@ -75,13 +106,46 @@ def _parsed(line: str) -> Override | None:
         return None
 
 
-def _is_harmless(override: Override | None) -> bool:
-    if override is None or override.is_sweep_override():
-        return False
+def _is_harmless(override: Override, of_sweep: bool) -> bool:
+    if not of_sweep:
+        return _is_harmless_alone(override)
+    if _belongs(override.key_or_group, ("hydra",)):
+        return _is_sweep_setting(override)
+    return all(job is not None and _is_harmless_alone(job) for job in _of_each_job(override))
+
+
+def _is_sweep_setting(override: Override) -> bool:
     key, value = override.key_or_group, override.value()
+    if override.package is not None or override.is_sweep_override():
+        return False
+    if key in SWEEP_GROUPS:
+        return isinstance(value, str) and KEY.fullmatch(value) is not None
+    if key in SWEEP_WORDS and isinstance(value, str):
+        return WORD.fullmatch(value) is not None
+    return SWEEP_NUMBERS.fullmatch(key) is not None and (value is None or isinstance(value, (bool, int, float)))
+
+
+def _of_each_job(override: Override) -> Iterator[Override | None]:
+    key, kind = override.get_key_element(), override.value_type
+    if kind in (ValueType.CHOICE_SWEEP, ValueType.SIMPLE_CHOICE_SWEEP):
+        yield from (_parsed(f"{key}={value}") for value in override.sweep_string_iterator())
+    elif kind == ValueType.GLOB_CHOICE_SWEEP:
+        yield _parsed(f"{key}=any")  # stands for the names of our own options
+    elif override.is_sweep_override():
+        yield _parsed(f"{key}=0")  # stands for all numbers of a range or an interval
+    else:
+        yield override
+
+
+def _is_harmless_alone(override: Override) -> bool:
+    if override.is_sweep_override():
+        return False
+    key, value, package = override.key_or_group, override.value(), override.package
     if not all(KEY.fullmatch(word) for word in re.split(r"[./]", key)):
         return False
-    if override.package is not None or "/" in key or (conf_folder() / key).is_dir():
+    if package is not None and (_belongs(package, OF_THE_USER) or not all(map(KEY.fullmatch, package.split(".")))):
+        return False
+    if package is not None or "/" in key or (conf_folder() / key).is_dir():
         names = value if isinstance(value, list) else [value]
         if key.partition("/")[0] == "hydra" or not all(_is_option(name) for name in names):
             return isinstance(value, dict) and _is_plain(key, value)

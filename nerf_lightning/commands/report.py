@@ -20,8 +20,7 @@ def prepare(arguments: list[str]) -> list[str]:
         recorded = scene_overrides(str(Path(given["run"].strip("'\"")) / "checkpoints" / "last.ckpt"))
     except InputError:
         return arguments  # the page says so
-    flags = [argument for argument in arguments if argument.startswith("-")]
-    return [*flags, *recorded, *(argument for argument in arguments if not argument.startswith("-"))]
+    return [*recorded, *arguments]
 
 
 def run(config: DictConfig) -> str:

@@ -14,6 +14,9 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.errors import InputError
 
+OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
+"""How Hydra's complaints about its own options begin: plain ValueErrors."""
+
 
 def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | None:
     """Return what a person is told of an error that bad input causes, or None for any other."""
@@ -21,6 +24,8 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         return str(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _missing_plugin(str(error)) or explain(error, command, conf_folder)
+    if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
+        return str(error)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."

@@ -11,12 +11,14 @@ from types import FrameType
 from typing import Any
 
 import psutil
-import yaml
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.commands.former_overrides import to_give_again
+from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.slurm import slurm_job
 from nerf_lightning.commands.sweep_job import JobRecord, read_records, records_folder, stop_file
+from nerf_lightning.commands.sweep_record import SweepRecord
 from nerf_lightning.commands.sweep_table import job_rows
 from nerf_lightning.commands.table_files import print_rows, write_rows
 from nerf_lightning.cores import num_cores
@@ -34,15 +36,16 @@ class Sweep:
 
     command: str
     folder: Path
+    record: SweepRecord
     received: int | None = None
     """The signal that stopped it."""
     former_handlers: dict[int, Any] = field(default_factory=dict)
 
     def go_on_with(self) -> str:
         """Return the command that goes on with it."""
-        from nerf_lightning.commands.overrides import to_type
-
-        return f"{self.command} -m sweep.resume=true {to_type('paths.output_dir', str(self.folder))}"
+        folder = to_type("paths.output_dir", str(self.folder))
+        again = to_give_again(self.record.typed(), of_sweep=True)
+        return " ".join([self.command, "-m sweep.resume=true", folder, *again])
 
 
 # Hydra builds its callbacks itself, so that what they learn has to be kept outside.
@@ -54,13 +57,12 @@ class SweepWatch(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write down what was asked for, say how to go on after a stop, and share out the cores."""
-        sweep = Sweep(sys.argv[0], Path(config.hydra.sweep.dir))
+        asked: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
+        record = SweepRecord([*asked["hydra"], *asked["task"]], slurm_job())
+        sweep = Sweep(sys.argv[0], Path(config.hydra.sweep.dir), record)
         for leftover in (*records_folder(sweep.folder).glob("*.json"), stop_file(sweep.folder)):
             leftover.unlink(missing_ok=True)
-        asked: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
-        record = {"arguments": [*asked["hydra"], *asked["task"]], "slurm_job": slurm_job()}
-        (sweep.folder / ".hydra").mkdir(parents=True, exist_ok=True)
-        (sweep.folder / ".hydra" / "sweep.yaml").write_text(yaml.safe_dump(record))
+        record.write(sweep.folder)
         if "sweep" in config:
             print(f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}", file=sys.stderr)
         # Optuna's database library lists its parts.

@@ -9,10 +9,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nerf_lightning.commands.console import StdoutConsole
 from nerf_lightning.export.atomic import whole_file
 
 Row = dict[str, Any]
@@ -34,8 +34,8 @@ def print_rows(rows: list[Row], title: str) -> None:
         table.add_column(Text(printable(column)), justify="right" if is_number else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(text) for text in _texts(row)))
-    console = Console()
-    (console if console.is_terminal else Console(width=160)).print(table)
+    console = StdoutConsole()
+    (console if console.is_terminal else StdoutConsole(width=160)).print(table)
 
 
 def write_rows(rows: list[Row], folder: Path, name: str, notes: tuple[str, ...] = ()) -> None:

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 
 from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
@@ -212,6 +213,13 @@ class RadianceModel(nn.Module):
     def statistics(self) -> dict[str, float]:
         """Return what is worth watching while training, of all levels."""
         return {name: value for level in self._in_order() for name, value in level.statistics().items()}
+
+    def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the Euclidean norm of the gradients of each level."""
+        return {
+            name: get_total_norm([parameter.grad for parameter in level.parameters() if parameter.grad is not None])
+            for name, level in zip(self.levels, self._in_order(), strict=True)
+        }
 
     def forget_measurements(self) -> None:
         """Forget what was counted while rendering."""

@@ -129,5 +129,5 @@ def test_bench_measures_a_packed_model(nerf, tmp_path):
         "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
     )  # fmt: skip
     assert result.code == 0, result.err
-    for name in ("training rays/s", "times plain", "march, share of a step", "optimizer, share of a step"):
+    for name in ("training rays/s", "times plain", "march, share of a step", "watching, share of a step"):
         assert name in result.out

@@ -4,18 +4,15 @@ import subprocess
 import sys
 
 import pytest
-import yaml
 from configs import composed
 
-from nerf_lightning import sweep_arguments as module
+from nerf_lightning.commands.sweep_record import JOB_NUMBER, SweepRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.sweep_arguments import sweep_arguments
 
 
 def leave_sweep(folder, *arguments, slurm_job=None):
-    (folder / ".hydra").mkdir(parents=True)
-    record = {"arguments": list(arguments), "slurm_job": slurm_job}
-    (folder / ".hydra" / "sweep.yaml").write_text(yaml.safe_dump(record))
+    SweepRecord(list(arguments), slurm_job).write(folder)
 
 
 def test_the_flag_comes_first_wherever_it_was_typed():
@@ -27,7 +24,12 @@ def test_a_single_run_stays_as_it_is():
 
 
 def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):
-    made = ("hydra.mode=MULTIRUN", "hydra.sweep.dir=x", f"{module.SUBDIR}_seed=${{seed}}'", "sweep.resume=true")
+    made = (
+        "hydra.mode=MULTIRUN",
+        "hydra.sweep.dir=x",
+        f"hydra.sweep.subdir='{JOB_NUMBER}_seed=${{seed}}'",
+        "sweep.resume=true",
+    )
     leave_sweep(tmp_path / "my sweep", *made, "hydra/launcher=parallel", "seed=0,1", "model=nerf_tiny")
     asked = ["-m", "sweep.resume=true", f"paths.output_dir='{tmp_path}/my sweep'", "model=nerf"]
     assert sweep_arguments(asked) == [

@@ -13,8 +13,8 @@ from videos import read_video
 
 
 def events(folder):
-    accumulator = EventAccumulator(str(folder / "tensorboard"), size_guidance={"tensors": 0, "images": 0, "scalars": 0})
-    return accumulator.Reload()
+    everything = dict.fromkeys(("tensors", "images", "scalars", "histograms"), 0)
+    return EventAccumulator(str(folder / "tensorboard"), size_guidance=everything).Reload()
 
 
 def test_a_run_folder_has_everything(finished_run):
@@ -75,9 +75,20 @@ def test_tensorboard_has_scalars_pictures_config_and_a_row_of_hyper_parameters(f
     } <= set(tags["scalars"])
     assert {"val/psnr", "val/psnr_standard_error", "memory/resident_gigabytes", "test/psnr"} <= set(tags["scalars"])
     assert [event.step for event in log.Scalars("train/loss")] == [5, 10, 15, 20]
-    assert "validation/picture" in tags["images"]
+    assert {"validation/picture", "scene/cameras"} <= set(tags["images"])
     assert "config/text_summary" in tags["tensors"]
     assert "_hparams_/session_start_info" in log.summary_metadata
+
+
+def test_tensorboard_shows_what_lies_along_the_rays_of_each_level(finished_run):
+    log = events(finished_run)
+    for level in ("coarse", "fine"):
+        assert all(event.value > 0 for event in log.Scalars(f"gradients/norm_{level}"))
+        assert [event.step for event in log.Scalars(f"rays/effective_samples_{level}")] == [10, 20]
+        for name in ("along_rays/weight", "per_ray/effective_samples"):
+            assert [event.step for event in log.Histograms(f"{name}_{level}")] == [10, 20], name
+        shares = log.Histograms(f"along_rays/weight_{level}")[-1].histogram_value
+        assert 0 < sum(shares.bucket) <= 1.0 + 1e-5
 
 
 def test_a_checkpoint_loads_with_weights_only_and_names_its_state_dict(finished_run):
@@ -168,6 +179,7 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     result = nerf(
         "train", f"experiment={experiment}", *scene, f"scene.path={capture}", *article, "trainer.max_steps=2",
         "data.batch_rays=64", "evaluation.max_views=1", "path.num_frames=2", "path.width=8",
+        "data.val_rays=64",
         f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err

@@ -1,0 +1,98 @@
+"""Histograms for TensorBoard: where along the rays each level sees something, and on how many samples that rests."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from nerf_lightning.callbacks.validation_view import WHOLE_BATCH_POINTS
+from nerf_lightning.callbacks.watcher import Watcher
+from nerf_lightning.callbacks.writers import tensorboard_writers
+from nerf_lightning.errors import require_positive
+from nerf_lightning.models.tiles import tile_rays_for, tiles
+from nerf_lightning.randomness import batch_random, fold
+from nerf_lightning.rendering.blending import background_colors
+from nerf_lightning.rendering.ray_statistics import effective_samples, weight_along
+from nerf_lightning.types.rays import Batch, RayBundle
+
+PARTS = 50
+
+
+class RayHistograms(Watcher):
+    """Render some of the step's rays again, as training does, and tell for each level what lies along them.
+
+    A coarse level that has learnt nothing spreads its weight evenly. Weight that piles up at 0 or at 1 lies at the near
+    or the far bound, which then cut the scene.
+
+    Args:
+        every_steps: steps between two looks.
+        num_rays: how many rays.
+    """
+
+    def __init__(self, every_steps: int = 500, num_rays: int = 256):
+        super().__init__(every_steps)
+        require_positive(num_rays=num_rays)
+        self.num_rays = num_rays
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Write two histograms and a curve for each level."""
+        writers = tensorboard_writers(trainer.loggers)
+        if not writers:
+            return
+        endless = trainer.datamodule.scene.space == "contracted"
+        with trainer.precision_plugin.forward_context():
+            seen = look_along(system, batch.rays[: self.num_rays], trainer.global_step, endless)
+        for name, (along, samples) in seen.items():
+            lit = samples[samples > 0]
+            values = {f"rays/effective_samples_{name}": float(lit.mean()) if lit.numel() else 0.0}
+            for logger in trainer.loggers:
+                logger.log_metrics(values, trainer.global_step)
+            for writer in writers:
+                write_shares(writer, f"along_rays/weight_{name}", along, trainer.global_step)
+                writer.add_histogram(f"per_ray/effective_samples_{name}", samples, trainer.global_step)
+
+
+@torch.no_grad()
+def look_along(
+    system: Any, rays: RayBundle, step: int, endless: bool
+) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
+    """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
+    model, num_rays = system.model, rays.near.numel()
+    tile = tile_rays_for(model, system.tile_points or WHOLE_BATCH_POINTS, training=True)
+    # With random numbers a level that leaves out what is empty takes the way of training, and keeps its weights.
+    random = batch_random(fold(system.seed, step, "histograms"), num_rays, rays.near.device)
+    counts = [count.clone() for count in model.counts()]
+    seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in model.level_names}
+    behind = background_colors(system.background, num_rays, rays.near.device, random)
+    system.eval()
+    for part in tiles(num_rays, tile):
+        renderings = model(rays[part], None if behind is None else behind[part], random[part])
+        for name, rendering in zip(model.level_names, renderings, strict=True):
+            along = weight_along(rendering, rays[part], PARTS, endless) * rays[part].near.numel() / num_rays
+            seen[name].append((along.cpu(), effective_samples(rendering, rays[part]).cpu()))
+    system.train()
+    for count, before in zip(model.counts(), counts, strict=True):
+        count.copy_(before)
+    return {
+        name: (torch.stack([along for along, _ in parts]).sum(0), torch.cat([samples for _, samples in parts]))
+        for name, parts in seen.items()
+    }
+
+
+def write_shares(writer: SummaryWriter, tag: str, shares: Float[Tensor, "parts"], step: int) -> None:
+    """Write a histogram over [0, 1] whose bars are given."""
+    shares = shares.double()
+    places = (torch.arange(len(shares), dtype=torch.double) + 0.5) / len(shares)
+    writer.add_histogram_raw(
+        tag,
+        min=0.0,
+        max=1.0,
+        num=float(shares.sum()),
+        sum=float((shares * places).sum()),
+        sum_squares=float((shares * places.square()).sum()),
+        bucket_limits=((torch.arange(len(shares)) + 1) / len(shares)).tolist(),
+        bucket_counts=shares.tolist(),
+        global_step=step,
+    )

@@ -1,0 +1,84 @@
+"""Readers that leave before the end, and disks that are full."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from running import FAST, REPOSITORY
+
+from nerf_lightning.closed_pipe import READER_LEFT, ends_quietly
+
+COMMAND = [sys.executable, "-m", "nerf_lightning"]
+
+
+def unread(*arguments, buffered=True, merged=False):
+    """Run a command whose reader left before the first word; return its exit code and what stderr says."""
+    ours, theirs = os.pipe()
+    os.close(ours)
+    done = subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        stdout=theirs,
+        stderr=theirs if merged else subprocess.PIPE,
+        cwd=REPOSITORY,
+        env=os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"},
+        text=True,
+    )
+    os.close(theirs)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["eval", "--cfg", "job"]])
+def test_help_that_nobody_reads_to_its_end_says_nothing(arguments, buffered):
+    assert unread(*arguments, buffered=buffered) == (READER_LEFT, "")
+    assert unread(*arguments, buffered=buffered, merged=True)[0] == READER_LEFT
+
+
+@pytest.mark.parametrize("command", ["doctor", "train"])
+def test_a_command_that_nobody_reads_ends_without_a_word(capture, tmp_path, command):
+    quick = (*FAST, "logger=none", "final.video=false", "final.evaluate=false") if command == "train" else ()
+    code, told = unread(command, "scene=npz", f"scene.path={capture}", *quick, f"paths.output_dir={tmp_path}/out")
+    assert code == READER_LEFT, told
+    assert "Traceback" not in told
+    assert "Broken pipe" not in told
+
+
+@pytest.mark.slow
+def test_a_sweep_that_nobody_reads_stops_and_can_be_gone_on_with(capture, tmp_path):
+    quick = (*FAST, "logger=none", "final.video=false", f"paths.output_dir={tmp_path}")
+    code, told = unread("train", "-m", "scene=npz", f"scene.path={capture}", *quick, "seed=0,1")
+    assert code == READER_LEFT, told
+    assert "Traceback" not in told
+    assert "Broken pipe" not in told
+    assert "stopped" in (tmp_path / ".hydra" / "jobs" / "0.json").read_text()
+    assert not (tmp_path / "1_seed=1").exists()
+
+
+def test_bad_input_is_told_though_nobody_reads_stdout():
+    assert unread("trian")[1].startswith("nerf: There is no command 'trian'.")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("arguments", [["--version"], ["train", "--help"]])
+def test_a_full_disk_is_told_once(arguments, buffered):
+    environment = os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*COMMAND, *arguments], stdout=full, stderr=subprocess.PIPE, cwd=REPOSITORY, env=environment, text=True
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith("nerf: No space left on device.")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_another_pipe_that_breaks_is_an_error():
+    with pytest.raises(BrokenPipeError), ends_quietly():
+        raise BrokenPipeError(32, "the encoder has ended")
+
+
+def test_exit_codes_pass():
+    with pytest.raises(SystemExit, match=r"^3$"), ends_quietly():
+        raise SystemExit(3)
