@@ -21,7 +21,7 @@ from nerf_lightning import __version__
 from nerf_lightning.errors import InputError
 from nerf_lightning.record_checks import require_sound_scene
 from nerf_lightning.tensor_files import load_tensors
-from nerf_lightning.types import Background, Cameras, Scene, Space
+from nerf_lightning.types.scene import Background, Cameras, Scene, Space
 
 FORMAT = 1
 KEY = "nerf_lightning"

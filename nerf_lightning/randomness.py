@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.types import TensorStruct
+from nerf_lightning.types.tensor_struct import TensorStruct
 
 WORD = 0xFFFFFFFF
 FEISTEL_ROUNDS = 6

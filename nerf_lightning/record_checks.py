@@ -6,7 +6,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from nerf_lightning.types import Background, LensModel, Space
+from nerf_lightning.types.scene import Background, LensModel, Space
 
 SPLITS = ("train", "val", "test")
 MOST_PIXELS = 1 << 28

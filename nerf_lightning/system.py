@@ -22,7 +22,9 @@ from nerf_lightning.optimizers.step_guard import StepGuard, first_not_finite
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors, blend
 from nerf_lightning.schedules.base import Schedule
-from nerf_lightning.types import Background, Batch, RayBundle, Rendering
+from nerf_lightning.types.rays import Batch, RayBundle
+from nerf_lightning.types.renderings import Rendering
+from nerf_lightning.types.scene import Background
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16

@@ -13,7 +13,7 @@ from nerf_lightning.data.doctor.evidence import gather
 from nerf_lightning.data.doctor.examine import CHECKS
 from nerf_lightning.data.pixel_store import layout
 from nerf_lightning.geometry.cameras import pinhole_cameras
-from nerf_lightning.types import PixelStore, Scene
+from nerf_lightning.types.scene import PixelStore, Scene
 
 VIEWS = 12
 

@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.samplers.stratified import StratifiedSampler
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types.renderings import FieldOutput
 
 INSIDE = 400.0
 """Density well inside."""

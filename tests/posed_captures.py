@@ -16,7 +16,8 @@ from nerf_lightning.data.transforms import TransformsReader
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import PixelIndex, Scene
+from nerf_lightning.types.rays import PixelIndex
+from nerf_lightning.types.scene import Scene
 
 READERS: dict[str, type[CaptureReader]] = {"llff": LlffReader, "colmap": ColmapReader, "transforms": TransformsReader}
 FLIP = np.diag([1.0, -1.0, -1.0])

@@ -25,6 +25,12 @@ FAST = (
     "trainer.tile_points=8192",
     "trainer.max_steps=4",
 )
+# The hash grid with its occupancy grid, as small; its settings take the place of those above.
+FAST_PATH = (
+    "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
+    "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
+    "data.batch_rays=256", "data.sample_budget=2000", "data.crop_steps=0",
+)  # fmt: skip
 
 
 def start(*arguments: str, **options) -> subprocess.Popen:

@@ -11,7 +11,8 @@ from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.samplers.importance import ImportanceSampler
 from nerf_lightning.samplers.stratified import StratifiedSampler
-from nerf_lightning.types import PixelStore, RayBundle, Scene
+from nerf_lightning.types.rays import RayBundle
+from nerf_lightning.types.scene import PixelStore, Scene
 
 BALL_RADIUS = 0.8
 

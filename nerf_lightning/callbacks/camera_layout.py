@@ -7,7 +7,7 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.export.camera_layout import layout_picture
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 
 class CameraLayout(Callback):

@@ -9,7 +9,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nerf_lightning.callbacks.watcher import Watcher
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 GIGABYTE = 1e9
 

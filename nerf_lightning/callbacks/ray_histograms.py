@@ -15,7 +15,7 @@ from nerf_lightning.models.tiles import tile_rays_for, tiles
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.rendering.ray_statistics import effective_samples, weight_along
-from nerf_lightning.types import Batch, RayBundle
+from nerf_lightning.types.rays import Batch, RayBundle
 
 PARTS = 50
 

@@ -9,7 +9,7 @@ from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.export.pictures import mosaic, save_png, to_bytes
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.rendering.blending import photograph
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 
 class ValidationPictures(Watcher):

@@ -7,7 +7,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.errors import require_positive
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 
 class Watcher(Callback):

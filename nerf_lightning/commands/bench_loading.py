@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 
 class LoadedSteps:

@@ -8,7 +8,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 _ROWS, _WIDTH, _REPEATS = 4096, 256, 20
 MATRIX_FLOPS = 2 * _ROWS * _WIDTH**2 * _REPEATS

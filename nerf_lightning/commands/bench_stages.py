@@ -11,7 +11,7 @@ from nerf_lightning.kernels.march import march
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.samplers.occupancy import positions_of
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 LOOK_EVERY = 25
 VALIDATION_RAYS = 8192

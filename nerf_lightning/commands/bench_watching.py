@@ -13,7 +13,7 @@ from nerf_lightning.callbacks.watcher import Watcher
 from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 # A first look may have to load or compile something. A long one is not repeated: it counts for little there.
 LONG_SECONDS = 5.0

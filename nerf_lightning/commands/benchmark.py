@@ -40,7 +40,7 @@ from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.tiles import tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch, RayBundle
+from nerf_lightning.types.rays import Batch, RayBundle
 
 MOST_STEPS = 2000
 

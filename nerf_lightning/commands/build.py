@@ -20,7 +20,7 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import AnyLevel, RadianceModel
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 CONTRACTS = (Encoder, Field, AnySampler, AnyLevel, RadianceModel)
 SPARE_NUMBERS = 1 << 24

@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.film_settings import Form
+from nerf_lightning.commands.run_summary import read_json_object
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.pictures import save_png
@@ -57,7 +57,7 @@ class FilmFrames:
             InputError: another process films into this folder, or it cannot be written.
         """
         self._hold()
-        note = self._note()
+        note = read_json_object(self.hidden / "film.json")
         if note.get("fingerprint") != fingerprint or not _is_range(note.get("depth_range")):
             self._discard()
             note = {"fingerprint": fingerprint, "depth_range": list(measure())}
@@ -134,13 +134,6 @@ class FilmFrames:
                     f"{self.folder} is in use by another process that is filming there. Wait for it, stop it, or give "
                     "another folder with paths.output_dir=DIR."
                 ) from error
-
-    def _note(self) -> dict[str, Any]:
-        try:
-            note = json.loads((self.hidden / "film.json").read_text())
-        except (OSError, ValueError):
-            return {}
-        return note if isinstance(note, dict) else {}
 
     def _discard(self) -> None:
         for folder in self.hidden.iterdir():

@@ -21,7 +21,7 @@ from nerf_lightning.data.images import read_rgba
 from nerf_lightning.export.video import require_ffmpeg, write_video
 from nerf_lightning.geometry.paths.base import CameraPath
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 PROGRESS_FPS = 4
 

@@ -22,7 +22,8 @@ from nerf_lightning.models.tiles import tile_rays_for
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.blending import background_colors
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch, RayBundle, Rendering
+from nerf_lightning.types.rays import Batch, RayBundle
+from nerf_lightning.types.renderings import Rendering
 
 # So many that rays of different lengths make a mean, and so few that it takes a second at most.
 TRIAL_POINTS, FEWEST_RAYS = 2048, 4

@@ -16,7 +16,7 @@ from torch import nn
 from nerf_lightning import __version__
 from nerf_lightning.commands.plain_yaml import plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, is_identity
-from nerf_lightning.types import Background, Scene
+from nerf_lightning.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]
 GIT_SECONDS = 10

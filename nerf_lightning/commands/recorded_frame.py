@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 
 def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:

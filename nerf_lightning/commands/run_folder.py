@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
-from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint
+from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
@@ -28,6 +28,16 @@ from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
+
+
+@dataclass(frozen=True)
+class ResumePoint:
+    """Where training goes on, and what must stay as it was there; small enough to be sent between processes."""
+
+    checkpoint: Path
+    step: int
+    precision: str
+    tile_points: int | None
 
 
 @dataclass
@@ -40,25 +50,23 @@ class RunFolder:
     """The checkpoint that the user named to go on from."""
     began: float = field(default_factory=time.monotonic)
 
-    def whole_checkpoint(self) -> Path | None:
-        """Return where training goes on: the checkpoint that the user named, else the newest that is whole, if any.
+    def resume_point(self) -> ResumePoint | None:
+        """Read the checkpoint that the user named, else the newest that is whole; None where nothing was saved.
 
         Raises:
             InputError: there are checkpoints, and none can be read.
         """
-        if self.named_checkpoint is not None:
-            return self.named_checkpoint
-        folder = self.path / "checkpoints"
-        found = newest_checkpoint(folder)
+        folder, named = self.path / "checkpoints", self.named_checkpoint
+        found = newest_checkpoint(folder) if named is None else read_checkpoint(named)
         if found is None:
             return None
-        if found.path.name == LAST:
-            return found.path
-        # Else the next save would put the damaged one in the place of the good one.
-        with contextlib.suppress(FileNotFoundError):
-            os.replace(folder / LAST, folder / DAMAGED)
-        os.replace(folder / PREVIOUS, folder / LAST)
-        return folder / LAST
+        path = found.path
+        if named is None and path.name == PREVIOUS:
+            # Else the next save would put the damaged one in the place of the good one.
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(folder / LAST, folder / DAMAGED)
+            path = path.replace(folder / LAST)
+        return ResumePoint(path, found.step, found.precision, found.tile_points)
 
     def trained(self) -> None:
         """Note that training is over, and how long it took."""

@@ -1,5 +1,6 @@
 """What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,16 @@ def by_key(overrides: list[str]) -> dict[str, str]:
     {'model': 'nerf_tiny', 'seed': '1'}
     """
     return {key: value for key, _, value in (override.partition("=") for override in overrides)}
+
+
+def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
+    """Return the keys that not all settings have, or have the same value of, in the order in which they first come.
+
+    >>> differing_keys([{"model": "nerf_tiny", "seed": "0"}, {"model": "nerf_tiny", "seed": "1"}])
+    ['seed']
+    """
+    keys = dict.fromkeys(key for given in settings for key in given)
+    return [key for key in keys if len({given.get(key) for given in settings}) > 1]
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from nerf_lightning.commands.protocol import differences
 from nerf_lightning.commands.run_results import RunResult
+from nerf_lightning.commands.run_summary import differing_keys
 from nerf_lightning.commands.table_files import Row
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
@@ -83,8 +84,7 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
 
 def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
     """Return a row per group, by scene and then the best first; settings that all share are left out."""
-    keys = dict.fromkeys(key for group in groups for key in group[0].settings)
-    shown = [key for key in keys if len({group[0].settings.get(key) for group in groups}) > 1]
+    shown = differing_keys([group[0].settings for group in groups])
     return [_row(group, shown) for group in sorted(groups, key=lambda group: _rank(group, order))]
 
 

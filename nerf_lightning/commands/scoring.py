@@ -23,7 +23,7 @@ from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture
 from nerf_lightning.rendering.blending import photograph
-from nerf_lightning.types import Background, Scene
+from nerf_lightning.types.scene import Background, Scene
 
 
 class Scoring:

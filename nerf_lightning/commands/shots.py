@@ -20,7 +20,7 @@ from nerf_lightning.geometry.paths.base import CameraPath, frame_of
 from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import Picture, render_picture, view_rays
-from nerf_lightning.types import Background, Cameras
+from nerf_lightning.types.scene import Background, Cameras
 
 # The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 8, 64

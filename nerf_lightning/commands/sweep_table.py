@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerf_lightning.commands.run_summary import RunSummary, by_key, read_run
+from nerf_lightning.commands.run_summary import RunSummary, by_key, differing_keys, read_run
 from nerf_lightning.commands.sweep_job import JobRecord
 from nerf_lightning.commands.table_files import Row
 
@@ -11,8 +11,7 @@ def job_rows(records: list[JobRecord], sweep_folder: Path) -> list[Row]:
     """Return a row per job, sorted by PSNR; what no job has, or all have the same of, is left out of the settings."""
     runs = {record.number: read_run(Path(record.folder)) for record in records}
     settings = {record.number: by_key(record.overrides) for record in records}
-    keys = dict.fromkeys(key for given in settings.values() for key in given)
-    swept = [key for key in keys if len({given.get(key) for given in settings.values()}) > 1]
+    swept = differing_keys(list(settings.values()))
     rows = []
     for record in sorted(records, key=lambda record: _rank(runs[record.number], record)):
         run = runs[record.number]

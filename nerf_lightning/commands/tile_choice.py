@@ -6,7 +6,7 @@ from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
 GPU_TILES = (1 << 18, 1 << 20, 1 << 22)

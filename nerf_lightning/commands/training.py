@@ -17,21 +17,21 @@ from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.callbacks.time_budget import TimeBudget
-from nerf_lightning.checkpoints import Checkpoint, make_record, read_checkpoint
+from nerf_lightning.checkpoints import make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
 from nerf_lightning.commands.former_overrides import to_give_again
 from nerf_lightning.commands.memory_plan import announce_memory
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.preemption import wants_restart
-from nerf_lightning.commands.run_folder import RunFolder, job_folder, open_run, write_config
+from nerf_lightning.commands.run_folder import ResumePoint, RunFolder, job_folder, open_run, write_config
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -60,9 +60,9 @@ def train(config: DictConfig) -> float | None:
     parts = _build_parts(config)
     held: list[RunFolder] = []
     try:
-        path, checkpoint = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
+        path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
         with _log_file(path) if ranks.is_first() else nullcontext():
-            trainer = _fit(config, parts, path, checkpoint)
+            trainer = _fit(config, parts, path, former)
             for folder in held:
                 folder.trained()
             psnr, last_step = _finish(parts, path, trainer), trainer.global_step
@@ -78,12 +78,12 @@ def train(config: DictConfig) -> float | None:
             folder.release()
 
 
-def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> tuple[Path, Path | None]:
-    """Let one process choose and hold the folder for all; return it, and the checkpoint to go on from."""
+def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> tuple[Path, ResumePoint | None]:
+    """Let one process choose and hold the folder for all; return it, and where training goes on."""
     folder = open_run(config, num_steps, job_folder())
     held.append(folder)
     write_config(folder.path, config, HydraConfig.get())
-    return folder.path, folder.whole_checkpoint()
+    return folder.path, folder.resume_point()
 
 
 def _build_parts(config: DictConfig) -> Parts:
@@ -113,8 +113,7 @@ def _build_parts(config: DictConfig) -> Parts:
     return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
 
 
-def _fit(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None) -> Trainer:
-    former = None if checkpoint is None else read_checkpoint(checkpoint)
+def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder)
         parts.settings.keep_precision(former.precision)
@@ -131,6 +130,7 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, checkpoint: Path | None
     _announce(parts, folder, former)
     if former is None:
         describe_run(trainer.loggers, config)
+    checkpoint = None if former is None else former.checkpoint
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
@@ -145,7 +145,7 @@ def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
     return psnr
 
 
-def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:
+def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
     parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
     tile = parts.system.tile_points if former is None else former.tile_points
     log.info(
@@ -159,7 +159,7 @@ def _announce(parts: Parts, folder: Path, former: Checkpoint | None) -> None:
     )
 
 
-def _loggers(config: DictConfig, folder: Path, former: Checkpoint | None) -> list[Logger]:
+def _loggers(config: DictConfig, folder: Path, former: ResumePoint | None) -> list[Logger]:
     if not ranks.is_first():
         return []
     purge: dict[str, Any] = {}

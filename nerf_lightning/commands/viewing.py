@@ -13,7 +13,7 @@ from nerf_lightning.commands.output_folder import beside_checkpoint, output_fold
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.photographs import Photographs

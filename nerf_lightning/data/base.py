@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 
 class Reader(ABC):

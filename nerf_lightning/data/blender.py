@@ -25,7 +25,7 @@ from nerf_lightning.data.pixel_store import read_pixels
 from nerf_lightning.data.splits import every_kth
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras
-from nerf_lightning.types import Cameras, Scene
+from nerf_lightning.types.scene import Cameras, Scene
 
 SPLITS = ("train", "val", "test")
 HOLD_EVERY = 8

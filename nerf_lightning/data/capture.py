@@ -12,7 +12,7 @@ from nerf_lightning.data.checks import listed
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.types import Cameras, LensModel, PixelStore
+from nerf_lightning.types.scene import Cameras, LensModel, PixelStore
 
 # Of width and height: how far a picture's scale may differ from one axis to the other.
 LARGEST_STRETCH = 0.01

@@ -20,7 +20,7 @@ from nerf_lightning.data.splits import every_kth
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.geometry.lens_checks import require_invertible
-from nerf_lightning.types import Background, Scene
+from nerf_lightning.types.scene import Background, Scene
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 

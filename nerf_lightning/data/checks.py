@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.types import Background
+from nerf_lightning.types.scene import Background
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:

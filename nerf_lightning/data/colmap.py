@@ -15,7 +15,7 @@ from nerf_lightning.data.colmap_records import ColmapCamera, ColmapImage
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import rotation_from_quaternion
-from nerf_lightning.types import LensModel
+from nerf_lightning.types.scene import LensModel
 
 # Which of its parameters are fx, fy, cx, cy, and which k1, k2, k3, k4, p1, p2; -1: none.
 LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {

@@ -11,7 +11,7 @@ from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from nerf_lightning.geometry.frames import (
     up_direction,
     upright_rotation,
 )
-from nerf_lightning.types import Cameras, Space
+from nerf_lightning.types.scene import Cameras, Space
 
 # The near plane lies at this share of the least depth (LLFF's bound factor).
 NEAR_SHARE = 0.75

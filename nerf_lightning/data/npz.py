@@ -27,7 +27,7 @@ from nerf_lightning.data.pixel_store import empty_store
 from nerf_lightning.data.splits import every_kth, in_order
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import pinhole_cameras, resized
-from nerf_lightning.types import PixelStore, Scene
+from nerf_lightning.types.scene import PixelStore, Scene
 
 KEYS = ("images", "poses", "focal")
 LAYOUT = "It needs images (n, height, width, 3), poses (n, 4, 4) camera-to-world and one focal length in pixels."

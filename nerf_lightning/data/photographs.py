@@ -24,7 +24,7 @@ from nerf_lightning.data.images import (
 from nerf_lightning.data.pixel_file import FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixel_store import in_threads
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import PixelStore
+from nerf_lightning.types.scene import PixelStore
 
 # Megapixels that take a few seconds: from here on there is a progress bar.
 NOTICEABLE_PIXELS = 50_000_000

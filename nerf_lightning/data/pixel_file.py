@@ -25,7 +25,7 @@ from torch import Tensor
 from nerf_lightning.data.json_files import read_json
 from nerf_lightning.data.pixel_store import layout
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import PixelStore
+from nerf_lightning.types.scene import PixelStore
 
 FORMAT = 1
 SPOTS, SPOT_BYTES = 64, 4096

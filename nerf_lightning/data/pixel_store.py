@@ -16,7 +16,7 @@ from nerf_lightning.cores import num_cores
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import PixelStore
+from nerf_lightning.types.scene import PixelStore
 
 # Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.
 MAX_THREADS = 4

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from nerf_lightning.types import Batch
+from nerf_lightning.types.rays import Batch
 
 Place = tuple[int, int, int]
 """Attempt, rays seen in it, and rays of the batch: all that a batch depends on besides the config."""

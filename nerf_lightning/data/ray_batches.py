@@ -17,7 +17,8 @@ from nerf_lightning.data.residence import sent
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.randomness import fold, permute
-from nerf_lightning.types import Batch, PixelIndex, Scene
+from nerf_lightning.types.rays import Batch, PixelIndex
+from nerf_lightning.types.scene import Scene
 
 
 @dataclass
@@ -153,7 +154,7 @@ class RayBatches:
             restart_steps: its least length in later attempts.
         """
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = fraction, steps, max(steps, restart_steps)
-        self.take_from(self.scene)
+        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
 
     def crop_rays(self, restarts: int) -> int:
         """Return how many rays a run takes from the crop after so many restarts."""

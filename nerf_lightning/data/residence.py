@@ -9,7 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
 from torch import Tensor
 
 from nerf_lightning.data.progress import progress_bar
-from nerf_lightning.types import PixelStore, Scene
+from nerf_lightning.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9
 AUTO_SHARE = 0.5

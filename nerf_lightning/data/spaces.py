@@ -11,7 +11,7 @@ from torch.nn import functional
 from nerf_lightning.data.capture import Capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
-from nerf_lightning.types import Cameras, Space
+from nerf_lightning.types.scene import Cameras, Space
 
 # Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees).
 FORWARD_FACING = 0.82

@@ -19,7 +19,7 @@ from nerf_lightning.data.transforms_intrinsics import focal_of, lens_of, number_
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.types import LensModel
+from nerf_lightning.types.scene import LensModel
 
 FORMAT = "A transforms.json of nerfstudio or instant-ngp"
 NGP_SCALE = 0.33

@@ -6,7 +6,7 @@ from typing import Any
 from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import focal_from_fov
-from nerf_lightning.types import LensModel
+from nerf_lightning.types.scene import LensModel
 
 LENSES: dict[str, LensModel] = {
     "PINHOLE": "pinhole",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.data.doctor.views import directions_seen, middle_of
 from nerf_lightning.export.figures import new_figure, picture_of
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

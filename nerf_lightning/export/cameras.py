@@ -13,7 +13,7 @@ from nerf_lightning.export.base import Export
 from nerf_lightning.export.colmap_files import beyond_colmap, colmap_files
 from nerf_lightning.geometry.frames import poses_from_user
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.types import Cameras, LensModel
+from nerf_lightning.types.scene import Cameras, LensModel
 
 CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",

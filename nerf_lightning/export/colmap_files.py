@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from nerf_lightning.geometry.poses import quaternion_from_rotation
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # Of the coefficients k1, k2, k3, k4, p1, p2: those that each of COLMAP's models takes, in its order.
 MODELS = {

@@ -18,7 +18,7 @@ from nerf_lightning.geometry.cameras import (
 )
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import render_picture
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import tiles
 from nerf_lightning.rendering.quadrature import composite
-from nerf_lightning.types import RayBundle, RaySamples
+from nerf_lightning.types.rays import RayBundle, RaySamples
 
 SeenFrom = Literal["cameras", "normal"]
 # Of a short ray.

@@ -9,7 +9,7 @@ from nerf_lightning.evaluation.geometry import surface_depth
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import render_rays
-from nerf_lightning.types import PixelIndex
+from nerf_lightning.types.rays import PixelIndex
 
 # So many rays of the training views are asked.
 RAYS = 1 << 13

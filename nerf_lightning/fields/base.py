@@ -6,7 +6,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput, Scene
+from nerf_lightning.types.renderings import FieldOutput
+from nerf_lightning.types.scene import Scene
 
 
 class Field(nn.Module, ABC):

@@ -13,7 +13,8 @@ from nerf_lightning.geometry.boxes import center_and_half, contract, in_unit_bal
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput, Scene
+from nerf_lightning.types.renderings import FieldOutput
+from nerf_lightning.types.scene import Scene
 
 LARGEST_EXPONENT = 15.0
 THICK, THIN = 3.0, -1.0

@@ -12,7 +12,8 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, in_unit_ball
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput, Scene
+from nerf_lightning.types.renderings import FieldOutput
+from nerf_lightning.types.scene import Scene
 
 # Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
 MOMENTUM, EPSILON = 0.01, 1e-3

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import RayBundle
+from nerf_lightning.types.rays import RayBundle
 
 
 def to_unit_cube(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3"]) -> Float[Tensor, "*points 3"]:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from nerf_lightning.geometry.lenses import project_plane, unproject
 from nerf_lightning.geometry.ndc import ndc_rays
-from nerf_lightning.types import Cameras, PixelIndex, RayBundle
+from nerf_lightning.types.rays import PixelIndex, RayBundle
+from nerf_lightning.types.scene import Cameras
 
 
 def focal_from_fov(width: int | float, fov: float) -> float:

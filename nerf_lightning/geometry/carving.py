@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from nerf_lightning.geometry.footprints import footprint
 from nerf_lightning.geometry.spread import spread
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 
 def possible_cells(

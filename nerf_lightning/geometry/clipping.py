@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.geometry.frames import points_from_user, unit_of
 from nerf_lightning.geometry.ndc import share_at_distance
-from nerf_lightning.types import RayBundle
+from nerf_lightning.types.rays import RayBundle
 
 # Farther than any light that a finite number of samples tells from infinity.
 ENDLESS = 1e9

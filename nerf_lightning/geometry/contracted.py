@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 
 class Contracted(nn.Module):

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.geometry.cameras import camera_coordinates, image_plane
 from nerf_lightning.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 def footprint(

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import image_plane
 from nerf_lightning.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 TOLERANCE = 0.01
 """Pixels by which a place in the image may be missed on the way to its ray and back."""

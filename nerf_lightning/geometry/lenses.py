@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import LensModel
+from nerf_lightning.types.scene import LensModel
 
 NEWTON_STEPS = 8
 """A fixed number: shapes and control flow must not depend on values. Mild lenses need 3, hard ones 5."""

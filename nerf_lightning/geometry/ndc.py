@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import RayBundle
+from nerf_lightning.types.rays import RayBundle
 
 # No ray runs sideways or back: it would never reach the far plane.
 LEAST_FORWARD = 1e-3

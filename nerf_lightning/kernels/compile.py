@@ -6,7 +6,7 @@ from nerf_lightning.kernels.adam import adam_step
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.packed import integrate, num_visible
-from nerf_lightning.types import RayBundle
+from nerf_lightning.types.rays import RayBundle
 
 
 def compile_kernels() -> None:

@@ -11,7 +11,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.kernels.backends import cpu_twin
-from nerf_lightning.types import PackedSamples, RayBundle, TensorStruct
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.tensor_struct import TensorStruct
 
 BLOCK = 4
 """Side of the blocks of cells that are skipped at once where all are empty."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.kernels.march import BLOCK, OPAQUE, March, OccupancyCells
-from nerf_lightning.types import PackedSamples, RayBundle
+from nerf_lightning.types.rays import PackedSamples, RayBundle
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 FAR_AWAY = np.float32(1e30)

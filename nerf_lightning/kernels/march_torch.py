@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.kernels.march import OPAQUE, March, OccupancyCells
-from nerf_lightning.types import PackedSamples, RayBundle
+from nerf_lightning.types.rays import PackedSamples, RayBundle
 
 
 def march_torch(

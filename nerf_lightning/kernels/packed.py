@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.kernels.backends import cpu_twin
 from nerf_lightning.kernels.packed_torch import integrate_torch, transmittance_torch
-from nerf_lightning.types import PackedSamples
+from nerf_lightning.types.rays import PackedSamples
 
 
 def integrate(

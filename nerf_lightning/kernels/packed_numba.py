@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
-from nerf_lightning.types import PackedSamples
+from nerf_lightning.types.rays import PackedSamples
 
 
 def integrate(

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import PackedSamples
+from nerf_lightning.types.rays import PackedSamples
 
 
 def transmittance_torch(density: Float[Tensor, "capacity"], samples: PackedSamples) -> Float[Tensor, "capacity"]:

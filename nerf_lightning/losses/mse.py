@@ -4,7 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.losses.base import Loss
-from nerf_lightning.types import Rendering
+from nerf_lightning.types.renderings import Rendering
 
 
 class MeanSquaredError(Loss):

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.kernels.search import search
 from nerf_lightning.losses.base import Loss
-from nerf_lightning.types import DenseRendering
+from nerf_lightning.types.renderings import DenseRendering
 
 
 class ProposalLoss(Loss):

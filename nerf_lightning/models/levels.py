@@ -11,7 +11,9 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle, Rendering, Scene
+from nerf_lightning.types.rays import RayBundle
+from nerf_lightning.types.renderings import DenseRendering, FieldOutput, Rendering
+from nerf_lightning.types.scene import Scene
 
 
 class AnyLevel(nn.Module):

@@ -8,11 +8,12 @@ from torch import Tensor
 
 from nerf_lightning.fields.base import Field
 from nerf_lightning.kernels.march import march
-from nerf_lightning.models.levels import AnyLevel
+from nerf_lightning.models.grid_level import GridLevel
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.packed import composite_packed
 from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
-from nerf_lightning.types import FieldOutput, PackedRendering, PackedSamples, RayBundle, Rendering, Scene
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.renderings import FieldOutput, PackedRendering, Rendering
 
 # A ray's random numbers are numbered by its samples: no ray has more.
 MOST_SAMPLES = 1 << 12
@@ -22,7 +23,7 @@ LEAST_ALPHA = 1e-3
 ROUND_SAMPLES, MOST_ROUND_SAMPLES = 6, 64
 
 
-class PackedLevel(AnyLevel):
+class PackedLevel(GridLevel):
     """March, drop what lies behind opaque samples, ask the field, composite."""
 
     has_static_shapes = False
@@ -30,9 +31,7 @@ class PackedLevel(AnyLevel):
     measured: Tensor
 
     def __init__(self, sampler: OccupancySampler, field: Field):
-        super().__init__()
-        self.sampler: OccupancySampler = sampler
-        self.field = field
+        super().__init__(sampler, field)
         # Samples and rays since the last update of the grid, and samples that exceeded the capacity, ever.
         self.register_buffer("tally", torch.zeros(3, dtype=torch.int64))
         # Samples per ray before the last update; negative: unknown.
@@ -46,21 +45,6 @@ class PackedLevel(AnyLevel):
         if self._samples_per_ray is None:
             self._samples_per_ray = float(self.measured)
         return max(1.0, self._samples_per_ray if self._samples_per_ray >= 0 else float(self.sampler.num_steps))
-
-    def place(self, scene: Scene) -> None:
-        """Hand the scene's box to the field, and all of it to the sampler."""
-        super().place(scene)
-        self.sampler.place(scene)
-
-    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density in the cells where rays look for it."""
-        return self.sampler.density_in_cells(self.field.density, positions)
-
-    def reset_parameters(self) -> None:
-        """Draw the field anew and empty the grid."""
-        super().reset_parameters()
-        self.sampler.reset()
-        self.forget_measurements()
 
     def forget_measurements(self) -> None:
         """Forget how many samples rays have."""

@@ -13,7 +13,9 @@ from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.rendering.blending import background_colors
-from nerf_lightning.types import Background, Cameras, RayBundle, TensorStruct
+from nerf_lightning.types.rays import RayBundle
+from nerf_lightning.types.scene import Background, Cameras
+from nerf_lightning.types.tensor_struct import TensorStruct
 
 log = logging.getLogger(__name__)
 

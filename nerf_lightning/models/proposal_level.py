@@ -5,7 +5,7 @@ from torch import Tensor
 
 from nerf_lightning.models.levels import Level
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types.renderings import FieldOutput
 
 
 class ProposalLevel(Level):

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import Background, Scene
+from nerf_lightning.types.scene import Background, Scene
 
 
 def background_colors(

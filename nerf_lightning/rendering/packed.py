@@ -4,7 +4,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.kernels.packed import integrate
-from nerf_lightning.types import FieldOutput, PackedRendering, PackedSamples, RayBundle
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.renderings import FieldOutput, PackedRendering
 
 
 def composite_packed(

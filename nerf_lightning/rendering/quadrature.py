@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.types import DenseRendering, FieldOutput, RayBundle, RaySamples
+from nerf_lightning.types.rays import RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering, FieldOutput
 
 
 def weights_from_density(

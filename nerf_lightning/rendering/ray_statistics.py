@@ -5,7 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.geometry.spacing import spread
-from nerf_lightning.types import DenseRendering, PackedRendering, RayBundle
+from nerf_lightning.types.rays import RayBundle
+from nerf_lightning.types.renderings import DenseRendering, PackedRendering
 
 
 def effective_samples(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:

@@ -5,7 +5,7 @@ import torch
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.camera_layout import coverage_picture
 from nerf_lightning.reports.embedding import Embedded, embedded
-from nerf_lightning.types import PixelStore, Scene
+from nerf_lightning.types.scene import PixelStore, Scene
 
 
 def coverage(record: SceneRecord) -> Embedded:

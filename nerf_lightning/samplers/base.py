@@ -5,7 +5,9 @@ from abc import ABC, abstractmethod
 from torch import nn
 
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.types import DenseRendering, RayBundle, RaySamples, Scene
+from nerf_lightning.types.rays import RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering
+from nerf_lightning.types.scene import Scene
 
 
 class AnySampler(nn.Module):

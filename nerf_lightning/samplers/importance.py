@@ -7,7 +7,8 @@ import torch
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.histograms import sample_histogram
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import DenseRendering, RayBundle, RaySamples
+from nerf_lightning.types.rays import RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering
 
 
 class ImportanceSampler(Sampler):

@@ -12,26 +12,25 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
 from nerf_lightning.geometry.contracted import Contracted
-from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, blocks_of, march
+from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march
 from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
 from nerf_lightning.samplers.base import AnySampler
-from nerf_lightning.types import PackedSamples, RayBundle, Scene
+from nerf_lightning.samplers.occupancy_grid import OccupancyGrid
+from nerf_lightning.types.rays import PackedSamples, RayBundle
+from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
 
 CELLS_AT_ONCE = 1 << 18
 # Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
 CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
-# The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
-# counts as thin, and only solid matter ends a march.
-RISE = 0.3
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
 
 
-class OccupancySampler(AnySampler):
+class OccupancySampler(OccupancyGrid, AnySampler):
     """Keep a moving average of the density in each cell, and sample only where it is high enough.
 
     Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
@@ -56,14 +55,6 @@ class OccupancySampler(AnySampler):
         capacity: size of the arrays of samples on GPUs, where no size is read on the host.
     """
 
-    aabb: Tensor
-    range: Tensor
-    density: Tensor
-    floor: Tensor
-    possible: Tensor
-    cells: Tensor
-    blocks: Tensor
-
     def __init__(
         self,
         resolution: int = 128,
@@ -86,9 +77,7 @@ class OccupancySampler(AnySampler):
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
         self.contracted = Contracted()
-        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
-        self.register_buffer("range", torch.tensor([0.0, 1.0]))
-        self._allocate()
+        self._fit_to_space()
         # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
@@ -100,12 +89,12 @@ class OccupancySampler(AnySampler):
             InputError: no training ray meets the box, or nothing is left in it.
         """
         self.contracted.place(scene)
-        self._allocate()
+        self._fit_to_space()
         self.aabb.copy_(scene.aabb)
         self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
         for cascade in range(self.num_cascades):
-            centers, half_diagonal = self._cell_centers(cascade)
+            centers, half_diagonal = self.cell_centers(cascade)
             # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
             if scene.space != "ndc":
                 possible = possible_cells(scene, centers, half_diagonal)
@@ -139,12 +128,6 @@ class OccupancySampler(AnySampler):
                 eyes.shape[0],
                 scene.name,
             )
-
-    def reset(self) -> None:
-        """Forget what was learnt: every possible cell is occupied."""
-        self.density.zero_()
-        self.floor.zero_()
-        self._occupy(self.possible)
 
     def forward(
         self, rays: RayBundle, screen_fn: ScreenFn, random: RayRandom | None
@@ -222,56 +205,30 @@ class OccupancySampler(AnySampler):
             number = number[(step // self.update_every) % 2 :: 2]
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
-            found = density_fn(self._positions(cells, part)).float()
-            self.density.view(-1)[cells] = torch.maximum(self.decay * self.density.view(-1)[cells], found)
-            floor = self.floor.view(-1)[cells]
-            self.floor.view(-1)[cells] = torch.minimum(found, floor + RISE * (found - floor))
+            self.learn(cells, density_fn(self.positions(cells, part)).float(), self.decay)
         if step >= self.prune_after:
             mean = self.density.sum() / self.possible.sum()
             shortest = (self.aabb[1] - self.aabb[0]).norm().double() / self.num_steps
             threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
-            self._occupy((self.density > threshold) & self.possible)
+            self.occupy((self.density > threshold) & self.possible)
 
-    def _allocate(self) -> None:
+    def _fit_to_space(self) -> None:
         """Make the grid as large as the space wants it; what it held is forgotten."""
         resolution, cascades, cone_angle = self.wanted
         if self.contracted:
             resolution = max(BLOCK, resolution // 2 // BLOCK * BLOCK) if cascades is None else resolution
             cascades = CASCADES_ENDLESS if cascades is None else cascades
             cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
-        self.resolution, self.num_cascades, self.cone_angle = resolution, cascades or 1, cone_angle or 0.0
-        side = (self.num_cascades, resolution, resolution, resolution)
-        blocks = (self.num_cascades, *(resolution // BLOCK,) * 3)
-        device = self.aabb.device
-        self.register_buffer("density", torch.zeros(side, device=device))
-        self.register_buffer("floor", torch.zeros(side, device=device))
-        self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
-        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
-        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+        self.cone_angle = cone_angle or 0.0
+        self.allocate(resolution, cascades or 1)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         # The grid must be as large as the one that is read; without a switch that one is of a bounded scene.
         self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", torch.tensor(False)))
         self.contracted.forget()
-        self._allocate()
+        self._fit_to_space()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._lattice = self._numbers = None
-
-    def _occupy(self, occupied: Tensor) -> None:
-        self.cells.copy_(occupied)
-        self.blocks.copy_(blocks_of(self.cells))
-
-    def _positions(self, number: Tensor, within: Tensor) -> Tensor:
-        side = self.resolution
-        cascade, rest = number // side**3, number % side**3
-        cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
-        center, half = center_and_half(self.aabb)
-        return center + (2.0 * (cell + within) / side - 1.0) * half * (2.0**cascade)[:, None]
-
-    def _cell_centers(self, cascade: int) -> tuple[Tensor, float]:
-        number = torch.arange(self.resolution**3, device=self.aabb.device) + cascade * self.resolution**3
-        half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) * 2**cascade / self.resolution
-        return self._positions(number, torch.full((1, 3), 0.5, device=number.device)), half_diagonal
 
 
 def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:

@@ -6,7 +6,9 @@ from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.geometry.spacing import spread, unspread
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.samplers.base import Sampler
-from nerf_lightning.types import DenseRendering, RayBundle, RaySamples, Scene
+from nerf_lightning.types.rays import RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering
+from nerf_lightning.types.scene import Scene
 
 
 class StratifiedSampler(Sampler):

@@ -11,7 +11,7 @@ from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras, res
 from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.geometry.paths.base import frame_of
 from nerf_lightning.geometry.poses import rotation_from_quaternion
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # A viewer that stands closer than this share of the photographs' distance is cut no more off at the near plane.
 LEAST_NEAR = 0.01

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.rendering.blending import background_colors, blend
-from nerf_lightning.types import Background, Scene
+from nerf_lightning.types.scene import Background, Scene
 
 THUMBNAIL = 96
 # More frusta hide each other, and the page takes long to build.

@@ -16,7 +16,7 @@ from nerf_lightning.geometry.clipping import Clip
 from nerf_lightning.geometry.ndc import world_distance
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import render_rays
-from nerf_lightning.types import Background, Cameras
+from nerf_lightning.types.scene import Background, Cameras
 from nerf_lightning.viewer.look import Look, camera_of
 
 # How long a slice takes, about: a person may change the wish between two.

@@ -5,14 +5,9 @@ import time
 
 import pytest
 import torch
-from running import FAST, start
+from running import FAST, FAST_PATH, start
 
-TINY = (
-    "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
-    "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
-    "data.batch_rays=256", "data.sample_budget=2000", "data.crop_steps=0",
-)  # fmt: skip
-QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *TINY)
+QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
 STEPS = 120
 
 
@@ -114,10 +109,11 @@ def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overri
 @pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
 def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp_path, model):
     """The order of the levels is part of what it keeps."""
-    small = [x for x in TINY if not x.startswith(("model", "data.sample_budget"))]
+    small = [x for x in FAST_PATH if not x.startswith(("model", "data.sample_budget"))]
     result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *[x for x in QUIET if x not in TINY], *small, f"model={model}",
-        "trainer.max_steps=2", "final.evaluate=false", "final.video=false", f"paths.output_dir={tmp_path}/run",
+        "train", "scene=npz", f"scene.path={capture}", *[x for x in QUIET if x not in FAST_PATH], *small,
+        f"model={model}", "trainer.max_steps=2", "final.evaluate=false", "final.video=false",
+        f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     assert result.code == 0, result.err
     last = tmp_path / "run/checkpoints/last.ckpt"
@@ -129,7 +125,7 @@ def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp
 def test_bench_measures_a_packed_model(nerf, tmp_path):
     result = nerf(
         "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",
-        f"scene.cache_dir={tmp_path}/cache", *TINY, "rounds=1", "warmup_steps=20", "render_rays=64",
+        f"scene.cache_dir={tmp_path}/cache", *FAST_PATH, "rounds=1", "warmup_steps=20", "render_rays=64",
         "trainer.tile_points=4096", f"paths.output_dir={tmp_path}/bench",
     )  # fmt: skip
     assert result.code == 0, result.err

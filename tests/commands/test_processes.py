@@ -7,7 +7,7 @@ import time
 
 import pytest
 import torch
-from running import FAST, start, start_module
+from running import FAST, FAST_PATH, start, start_module
 
 from nerf_lightning.commands import processes
 from nerf_lightning.commands.processes import num_processes
@@ -15,11 +15,6 @@ from nerf_lightning.errors import InputError
 
 STEPS = 50
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
-FAST_MODEL = (
-    "model=fast_small", "encoder.num_levels=3", "encoder.log2_table_size=9", "encoder.max_resolution=32",
-    "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
-    "data.batch_rays=256", "data.sample_budget=2000", "data.crop_steps=0",
-)  # fmt: skip
 
 
 def arguments(capture, *extra):
@@ -105,7 +100,7 @@ def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path,
 @pytest.mark.slow
 def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
     for name, extra in (("one", ()), ("two", TWO)):
-        code, output = finished(start(*arguments(capture, *FAST_MODEL, *extra, f"paths.output_dir={tmp_path / name}")))
+        code, output = finished(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))
         assert code == 0, output
     one, two = saved(tmp_path / "one")["nerf_lightning"], saved(tmp_path / "two")["nerf_lightning"]
     assert one["progress"] == two["progress"]

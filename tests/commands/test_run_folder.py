@@ -3,12 +3,15 @@
 import json
 
 import pytest
+import torch
 from configs import composed
 from omegaconf import OmegaConf
 from running import FAST
+from scenes import ball_scene
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from nerf_lightning.commands.run_folder import open_run, write_config
+from nerf_lightning.checkpoints import make_record
+from nerf_lightning.commands.run_folder import ResumePoint, open_run, write_config
 from nerf_lightning.errors import InputError
 
 
@@ -86,6 +89,31 @@ def test_resume_of_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no run in"):
         open_run(config(tmp_path, f"resume={tmp_path}/nothing"), 100, None)
     assert not (tmp_path / "nothing").exists()
+
+
+def save(path, step):
+    path.parent.mkdir(exist_ok=True)
+    record = make_record(ball_scene(), config="", choices={}) | {"precision": "bf16-mixed", "tile_points": 100 + step}
+    torch.save({"state_dict": {}, "global_step": step, "nerf_lightning": record}, path)
+
+
+def resume_point(tmp_path, resume="auto"):
+    run = open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here", f"resume={resume}"), 100, None)
+    run.release()
+    return run.resume_point()
+
+
+def test_a_run_goes_on_as_its_newest_whole_checkpoint_says(tmp_path):
+    assert resume_point(tmp_path) is None
+    folder = tmp_path / "here/checkpoints"
+    for name, step in (("last", 8), ("previous", 7), ("best", 5)):
+        save(folder / f"{name}.ckpt", step)
+    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 8, "bf16-mixed", 108)
+    assert resume_point(tmp_path, folder / "best.ckpt") == ResumePoint(folder / "best.ckpt", 5, "bf16-mixed", 105)
+    assert resume_point(tmp_path, folder / "previous.ckpt").checkpoint == folder / "previous.ckpt"
+    (folder / "last.ckpt").write_bytes(b"damaged")
+    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 7, "bf16-mixed", 107)
+    assert {path.name for path in folder.iterdir()} == {"last.ckpt", "damaged.ckpt", "best.ckpt"}
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):

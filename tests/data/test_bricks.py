@@ -22,7 +22,7 @@ from nerf_lightning.data.cache_folder import default_folder
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import all_pixels, project, rays_through_pixels
 from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 SIZES = {
     "box": (BOX, [0.5, 0.8, 0.3]),

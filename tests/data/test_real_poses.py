@@ -12,7 +12,7 @@ from nerf_lightning.data.colmap import ColmapReader
 from nerf_lightning.data.llff import LlffReader
 from nerf_lightning.data.transforms import TransformsReader
 from nerf_lightning.geometry.cameras import project, rays_through_pixels
-from nerf_lightning.types import PixelIndex
+from nerf_lightning.types.rays import PixelIndex
 
 pytestmark = pytest.mark.data
 LARGEST_MEDIAN = 1.5

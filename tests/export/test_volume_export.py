@@ -58,11 +58,11 @@ def test_what_rays_pass_by_has_no_density(kind):
     model, points = RadianceModel({"fine": level}).eval(), some_rays(500).origins / 4
     with torch.no_grad():
         assert bool((model.last.density(points) > 0).all())
-        level.sampler._occupy(torch.zeros_like(level.sampler.possible))
+        level.sampler.occupy(torch.zeros_like(level.sampler.possible))
         assert not bool(model.last.density(points).any())
         half = torch.zeros_like(level.sampler.possible)
         half[:, 4:] = True
-        level.sampler._occupy(half)
+        level.sampler.occupy(half)
         found = model.last.density(points)
         torch.testing.assert_close(found > 0, points[:, 0] >= 0)
         torch.testing.assert_close(found[found > 0], field.density(points)[found > 0])

@@ -12,7 +12,7 @@ from nerf_lightning.geometry.cameras import (
     resized,
 )
 from nerf_lightning.geometry.poses import is_rigid, look_at
-from nerf_lightning.types import PixelIndex
+from nerf_lightning.types.rays import PixelIndex
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

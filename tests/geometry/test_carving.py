@@ -14,7 +14,7 @@ from nerf_lightning.samplers.occupancy import OccupancySampler
 def cells(scene, resolution=24):
     sampler = OccupancySampler(resolution=resolution)
     sampler.aabb.copy_(scene.aabb)
-    return sampler._cell_centers(0)
+    return sampler.cell_centers(0)
 
 
 def test_what_the_alpha_shows_empty_is_carved_and_what_is_there_is_kept():

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.geometry.ndc import ndc_points, ndc_rays, world_distance
-from nerf_lightning.types import RayBundle
+from nerf_lightning.types.rays import RayBundle
 
 SCALE = torch.tensor([1.7, 2.3], dtype=torch.float64)
 

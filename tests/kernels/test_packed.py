@@ -6,7 +6,7 @@ import torch
 from nerf_lightning.kernels.packed import integrate, num_visible
 from nerf_lightning.kernels.packed_torch import integrate_torch, transmittance_torch
 from nerf_lightning.rendering.quadrature import weights_from_density
-from nerf_lightning.types import PackedSamples
+from nerf_lightning.types.rays import PackedSamples
 
 
 def packed(counts, dtype=torch.float32):

@@ -7,7 +7,8 @@ from scenes import some_rays
 from nerf_lightning.geometry.spacing import spread
 from nerf_lightning.losses.proposal import ProposalLoss, distortion_loss, interlevel_loss, outer_weights
 from nerf_lightning.rendering.quadrature import composite
-from nerf_lightning.types import FieldOutput, RaySamples
+from nerf_lightning.types.rays import RaySamples
+from nerf_lightning.types.renderings import FieldOutput
 
 
 def rendering(edges, density, requires_grad=False):

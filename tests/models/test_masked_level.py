@@ -19,7 +19,7 @@ def both(**sampler):
     for step in (4, 8, 12):
         packed.update(step, step)
     grid = packed.levels["fine"].sampler
-    grid._occupy(grid.density > grid.density.quantile(0.7))
+    grid.occupy(grid.density > grid.density.quantile(0.7))
     state = packed.state_dict()
     masked.place(scene)
     masked.load_state_dict({key: state[key] for key in masked.state_dict()})

@@ -18,7 +18,7 @@ def a_level(**settings):
     sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
     level = PackedLevel(sampler, field)
     level.place(ball_scene(num_views=12))
-    level.sampler._occupy(torch.ones_like(level.sampler.possible))
+    level.sampler.occupy(torch.ones_like(level.sampler.possible))
     return level
 
 

@@ -12,7 +12,7 @@ from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.models.proposal_level import ProposalLevel
 from nerf_lightning.samplers.stratified import StratifiedSampler
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types.renderings import FieldOutput
 
 
 class Wall(Field):

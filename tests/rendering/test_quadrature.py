@@ -9,7 +9,8 @@ from scenes import some_rays
 from torch.autograd import gradcheck
 
 from nerf_lightning.rendering.quadrature import closed_weights, composite, weights_from_density
-from nerf_lightning.types import FieldOutput, RaySamples
+from nerf_lightning.types.rays import RaySamples
+from nerf_lightning.types.renderings import FieldOutput
 
 
 def loop_weights(density, deltas):
@@ -122,7 +123,7 @@ def test_a_closed_ray_takes_all_light():
 def test_interval_lengths_are_distances_so_opacity_does_not_depend_on_how_a_direction_was_written():
     """The fault: lengths in units of an unnormalised direction. Here directions are unit, so length is distance."""
     import nerf_lightning.geometry.cameras as cameras
-    from nerf_lightning.types import PixelIndex
+    from nerf_lightning.types.rays import PixelIndex
 
     c2w = torch.eye(4)[None, :3].double()
     wide = cameras.pinhole_cameras(c2w, focal=5.0, width=20, height=20)  # corners 60 degrees off axis

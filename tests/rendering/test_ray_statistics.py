@@ -3,7 +3,8 @@ import torch
 from scenes import some_rays
 
 from nerf_lightning.rendering.ray_statistics import effective_samples, weight_along
-from nerf_lightning.types import DenseRendering, PackedRendering, PackedSamples, RayBundle, RaySamples
+from nerf_lightning.types.rays import PackedSamples, RayBundle, RaySamples
+from nerf_lightning.types.renderings import DenseRendering, PackedRendering
 
 
 def straight_rays(count, near=0.0, far=1.0):

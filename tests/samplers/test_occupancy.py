@@ -38,7 +38,7 @@ def learn(sampler, density_fn, steps=320):
 
 def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
     sampler = learn(a_sampler(), ball_density())
-    centers, _ = sampler._cell_centers(0)
+    centers, _ = sampler.cell_centers(0)
     occupied = sampler.cells.flatten().bool()
     cell = 2.0 / 16
     assert bool(occupied[centers.norm(dim=-1) < 0.5 - cell].all())

@@ -9,7 +9,7 @@ from nerf_lightning.randomness import batch_random
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.proposal import ProposalSampler
 from nerf_lightning.samplers.stratified import StratifiedSampler
-from nerf_lightning.types import FieldOutput
+from nerf_lightning.types.renderings import FieldOutput
 
 
 def proposal(rays, place=4.0):

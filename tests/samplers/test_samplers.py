@@ -9,7 +9,8 @@ from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.importance import ImportanceSampler
 from nerf_lightning.samplers.stratified import StratifiedSampler
-from nerf_lightning.types import FieldOutput, RaySamples
+from nerf_lightning.types.rays import RaySamples
+from nerf_lightning.types.renderings import FieldOutput
 
 
 def coarse_rendering(rays, density_at):

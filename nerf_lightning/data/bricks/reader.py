@@ -21,7 +21,7 @@ from nerf_lightning.data.bricks.views import bricks_cameras
 from nerf_lightning.data.cache_folder import default_folder
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
-from nerf_lightning.types import Background, Cameras, PixelStore, Scene, Truth
+from nerf_lightning.types.scene import Background, Cameras, PixelStore, Scene, Truth
 
 RENDER_VERSION = 1
 """Part of the cache's key: raise it whenever a pixel changes."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 DISTANCE = 4.0311
 """From each camera to the origin, as in the Blender scenes."""

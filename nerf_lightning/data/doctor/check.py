@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.doctor.looks import Looks
 from nerf_lightning.data.doctor.matches import Matches
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 Verdict = Literal["ok", "look", "wrong"]
 """`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be."""

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.doctor.matches import Matches
-from nerf_lightning.types import Cameras, Scene
+from nerf_lightning.types.scene import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
 SHIFT = "Shift the list of photographs against the poses by one; one end may lack a picture."

@@ -8,7 +8,7 @@ from nerf_lightning.data.doctor.features import Corners, find_corners, shrunk_ca
 from nerf_lightning.data.doctor.looks import look_at_view, stacked
 from nerf_lightning.data.doctor.matches import find_matches
 from nerf_lightning.data.pixel_store import in_threads
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 # More views than these are thinned out evenly to be compared with each other; that costs the square.
 MOST_COMPARED = 160

@@ -8,7 +8,7 @@ import torch
 from nerf_lightning.data.doctor import cameras, cost, extent, photographs, poses, views
 from nerf_lightning.data.doctor.check import Check, CheckFn, Evidence
 from nerf_lightning.data.doctor.evidence import gather
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 CHECKS: tuple[CheckFn, ...] = (
     *cameras.CHECKS,

@@ -9,7 +9,8 @@ from nerf_lightning.data.doctor.epipolar import distances, parallax, places
 from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.geometry.frames import unit_of
-from nerf_lightning.types import PixelIndex, Scene
+from nerf_lightning.types.rays import PixelIndex
+from nerf_lightning.types.scene import Scene
 
 # Rays that meet at a smaller angle (radians) say little of distances.
 LEAST_PARALLAX = 0.04

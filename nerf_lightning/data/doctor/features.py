@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.geometry.cameras import resized
-from nerf_lightning.types import Cameras, PixelStore
+from nerf_lightning.types.scene import Cameras, PixelStore
 
 LONGER_SIDE = 288
 """Pixels of the longer side of the pictures that are looked at."""

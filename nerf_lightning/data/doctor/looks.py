@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.data.doctor.features import brightness
-from nerf_lightning.types import PixelStore
+from nerf_lightning.types.scene import PixelStore
 
 THUMBNAIL = 24
 # Sharpness is judged at no more pixels than this along the longer side; finer detail is noise on many cameras.

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.data.doctor.features import Corners, match
 from nerf_lightning.data.pixel_store import in_threads
 from nerf_lightning.geometry.lenses import unproject
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # So many corners of each tell which pictures show the same.
 FEW_CORNERS = 64

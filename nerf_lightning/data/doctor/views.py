@@ -8,7 +8,7 @@ from torch.nn import functional
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.doctor.check import Check, Evidence
 from nerf_lightning.geometry.frames import focus_point, gaps_around
-from nerf_lightning.types import Scene
+from nerf_lightning.types.scene import Scene
 
 FEW, TOO_FEW = 15, 5
 FEW_MATCHES = 30

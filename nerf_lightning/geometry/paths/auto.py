@@ -11,7 +11,7 @@ from nerf_lightning.geometry.frames import gaps_around
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.geometry.paths.spiral import Spiral
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # The widest gap between photographs, seen from above, that a circle may cross.
 WIDEST_GAP = 75.0

@@ -18,7 +18,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.geometry.frames import points_from_user, unit_of
 from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # What a camera in front of a scene looks at, in units of the near plane's distance.
 NDC_FOCUS = 5.0

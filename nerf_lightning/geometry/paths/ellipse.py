@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.geometry.frames import focus_point
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 # So finely the ellipse is measured, to go around it at one speed.
 STEPS = 2048

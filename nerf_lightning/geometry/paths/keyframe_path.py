@@ -17,7 +17,7 @@ from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
 from nerf_lightning.geometry.paths.keyframes import Keyframe, read_keyframes
 from nerf_lightning.geometry.paths.spline import along, even_speed, frame_times, poses_along
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 FRAMES_WITHOUT_TIMES = 120
 

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 @final

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.geometry.paths.photographs import find_views
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 @final

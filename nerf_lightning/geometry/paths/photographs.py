@@ -9,7 +9,7 @@ from typing import final
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
 from nerf_lightning.geometry.paths.spline import even_speed, frame_times, poses_along
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 @final

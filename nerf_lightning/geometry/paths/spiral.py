@@ -9,7 +9,7 @@ import torch
 from nerf_lightning.geometry.frames import average_pose
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types import Cameras
+from nerf_lightning.types.scene import Cameras
 
 
 @final

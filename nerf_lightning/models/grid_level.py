@@ -1,0 +1,35 @@
+"""What levels with an occupancy grid share: the sampler's grid says where the field has any density at all."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.fields.base import Field
+from nerf_lightning.models.levels import AnyLevel
+from nerf_lightning.samplers.occupancy import OccupancySampler
+from nerf_lightning.types.scene import Scene
+
+
+class GridLevel(AnyLevel):
+    """The contract of a level that computes only what an occupancy grid does not rule out."""
+
+    sampler: OccupancySampler
+
+    def __init__(self, sampler: OccupancySampler, field: Field):
+        super().__init__()
+        self.sampler = sampler
+        self.field = field
+
+    def place(self, scene: Scene) -> None:
+        """Hand the scene's box to the field, and all of it to the sampler."""
+        super().place(scene)
+        self.sampler.place(scene)
+
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in the cells where rays look for it."""
+        return self.sampler.density_in_cells(self.field.density, positions)
+
+    def reset_parameters(self) -> None:
+        """Draw the field anew, empty the grid, and forget what was counted."""
+        super().reset_parameters()
+        self.sampler.reset()
+        self.forget_measurements()

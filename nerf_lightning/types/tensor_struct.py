@@ -1,0 +1,34 @@
+"""What structs of tensors can do."""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+# Not typing.Self, which runtime type checkers do not know.
+Struct = TypeVar("Struct", bound="TensorStruct")
+
+
+class TensorStruct:
+    """Mixin of the frozen dataclasses of this room: move or index every tensor at once, nested structs included."""
+
+    def map(self: Struct, fn: Callable[[Tensor], Tensor]) -> Struct:
+        """Return a copy with `fn` applied to each tensor."""
+        changed: dict[str, Any] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if isinstance(value, Tensor):
+                changed[each.name] = fn(value)
+            elif isinstance(value, TensorStruct):
+                changed[each.name] = value.map(fn)
+        return replace(self, **changed)  # type: ignore[type-var]
+
+    def to(self: Struct, device: torch.device | str, non_blocking: bool = False) -> Struct:
+        """Return a copy on `device`."""
+        return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def __getitem__(self: Struct, index: Any) -> Struct:
+        """Index the leading axes of every tensor."""
+        return self.map(lambda tensor: tensor[index])
