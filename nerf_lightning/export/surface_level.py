@@ -1,43 +1,49 @@
 """Which density counts as the surface: one that rays meet where rendering sees a surface."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.evaluation.geometry import surface_depth
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import render_rays
-from nerf_lightning.types.rays import PixelIndex
+from nerf_lightning.models.tiles import tile_rays_for, tiles
+from nerf_lightning.randomness import batch_random, fold
+from nerf_lightning.rendering.blending import background_colors
+from nerf_lightning.rendering.ray_statistics import median_distances
+from nerf_lightning.types.rays import PixelIndex, RayBundle
 
 # So many rays of the training views are asked.
 RAYS = 1 << 13
 # Rays that stop less light than this have met no surface.
 OPAQUE = 0.9
-# Where three quarters of them end it is denser than the level. At the median, thin and grazed surfaces have holes;
-# below the first quartile, surfaces swell.
-QUANTILE = 0.25
+# Where four fifths of the rays end it is denser than the level. At the median, thin and grazed surfaces have holes;
+# much lower, surfaces swell.
+QUANTILE = 0.2
 
 
 def surface_level(model: RadianceModel, record: SceneRecord, tile_points: int) -> float | None:
     """Return the density (per scene unit) at the surface, or None where no ray meets one in the scene's box.
 
-    Rays of the training views are rendered; at the expected depth of each opaque one the field is asked for its
-    density. Their first quartile puts the surface of the mesh where the depth of the pictures is, and leaves few holes.
+    Rays of the training views are rendered; where each opaque one has half of its light behind it the field is asked
+    for its density. Their first fifth puts the mesh where the pictures see the surface, and leaves few holes.
     """
-    seen = _surface_points(model, record, tile_points)
+    rays = _some_rays(record)
+    if not rays.near.numel():
+        return None
+    seen = torch.cat(list(_surface_points(model, rays, record, tile_points)))
     seen = seen[((seen >= record.aabb[0]) & (seen <= record.aabb[1])).all(dim=-1)]
     if not len(seen):
         return None
     device = next(model.parameters()).device
     density = torch.cat([model.last.density(part.to(device)).cpu() for part in seen.split(tile_points)])
-    # Where a ray's light ends partly before and partly behind empty space, there is nothing at the mean.
-    density = density[density > 0]
+    density = density[density > 0]  # on the very edge of an empty cell there may be none
     return float(density.quantile(QUANTILE)) if len(density) else None
 
 
-def _surface_points(model: RadianceModel, record: SceneRecord, tile_points: int) -> Float[Tensor, "points 3"]:
+def _some_rays(record: SceneRecord) -> RayBundle:
     generator = torch.Generator().manual_seed(0)
     train = torch.tensor(record.splits["train"])
     view = train[torch.randint(len(train), (RAYS,), generator=generator)]
@@ -46,6 +52,18 @@ def _surface_points(model: RadianceModel, record: SceneRecord, tile_points: int)
         for size in (record.cameras.width, record.cameras.height)
     )
     rays = rays_through_pixels(record.cameras, PixelIndex(view, x, y), record.near, record.far)
-    _, depth, opacity, *_ = render_rays(model, rays, record.background, tile_points)
-    at = rays.origins + surface_depth(depth, opacity, rays.far)[:, None] * rays.directions
-    return at[opacity > OPAQUE]
+    return rays[(rays.far > rays.near).nonzero()[:, 0]]
+
+
+def _surface_points(
+    model: RadianceModel, rays: RayBundle, record: SceneRecord, tile_points: int
+) -> Iterator[Float[Tensor, "points 3"]]:
+    device = next(model.parameters()).device
+    rays = rays.to(device)
+    # With random numbers, as in training: then every kind of level keeps its weights.
+    random = batch_random(fold(0, "surface"), rays.near.numel(), device)
+    behind = background_colors(record.background, rays.near.numel(), device, random)
+    for part in tiles(rays.near.numel(), tile_rays_for(model, tile_points, training=True)):
+        rendering = model(rays[part], None if behind is None else behind[part], random[part])[-1]
+        at = rays[part].origins + median_distances(rendering, rays[part])[:, None] * rays[part].directions
+        yield at[rendering.opacity > OPAQUE].cpu()

@@ -42,6 +42,21 @@ def weight_along(
     return total / rays.near.numel()
 
 
+def median_distances(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
+    """Return where each ray has half of its weight behind it; far, where it has none.
+
+    Unlike the expected distance it lies in what the ray sees, not between the haze before a surface and the surface.
+    """
+    ray, distance, weights = _samples_of(rendering)
+    ends = weights.double().cumsum(0)  # over all rays, so float32 would lose a ray's own
+    total = torch.zeros(rays.near.numel(), dtype=ends.dtype, device=ends.device).index_add_(0, ray, weights.double())
+    half = (total.cumsum(0) - 0.5 * total)[ray]
+    crossed = (ends >= half) & (ends - weights < half)
+    median = rays.far.reshape(-1).clone()
+    median[ray[crossed]] = distance[crossed].to(median)
+    return median
+
+
 def _samples_of(
     rendering: DenseRendering | PackedRendering,
 ) -> tuple[Int[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:

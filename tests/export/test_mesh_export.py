@@ -102,6 +102,16 @@ def test_the_surface_is_where_the_depth_of_the_pictures_is(tmp_path):
     assert np.linalg.norm(dense.vertices, axis=1).mean() > np.linalg.norm(thin.vertices, axis=1).mean() + 0.02
 
 
+def test_haze_in_front_of_a_surface_is_not_taken_for_it(tmp_path):
+    """A quarter of the light is stopped before it reaches the ball, so the expected depth lies in the haze."""
+    model = solid(ball(RADIUS), inside=50.0)
+    clear = model.last.field.density
+    model.last.field.density = lambda positions: clear(positions) + 0.1
+    mesh = exported(tmp_path, model, record())
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(np.median(radii) - RADIUS) < 0.05
+
+
 @pytest.mark.parametrize("space", ["bounded", "contracted"])
 def test_a_scene_in_another_frame_gives_the_same_mesh_in_the_new_place(tmp_path, space):
     def shape(positions):  # a ball with a nose: no turn brings it onto itself

@@ -2,7 +2,7 @@ import pytest
 import torch
 from scenes import some_rays
 
-from nerf_lightning.rendering.ray_statistics import effective_samples, weight_along
+from nerf_lightning.rendering.ray_statistics import effective_samples, median_distances, weight_along
 from nerf_lightning.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.types.renderings import DenseRendering, PackedRendering
 
@@ -55,6 +55,21 @@ def test_weight_lies_where_the_samples_are(kind):
     weights = torch.zeros(2, 8)
     weights[0, 1], weights[1, 6], weights[1, 7] = 1.0, 0.5, 0.25
     assert weight_along(*kind(weights, near=2.0, far=6.0), bins=4).tolist() == [0.5, 0.0, 0.0, 0.375]
+
+
+@pytest.mark.parametrize("kind", [dense, packed])
+def test_the_median_lies_in_what_is_seen_and_not_between(kind):
+    weights = torch.zeros(4, 10)
+    weights[0, 1], weights[0, 8] = 0.3, 0.6
+    weights[1, 1], weights[1, 8] = 0.6, 0.3
+    weights[3] = 0.1
+    assert median_distances(*kind(weights)).tolist() == pytest.approx([0.85, 0.15, 1.0, 0.45])
+
+
+def test_many_rays_do_not_blur_the_median():
+    weights = torch.full((20_000, 5), 1e-4)
+    weights[:, 3] = 0.9
+    assert bool((median_distances(*dense(weights)) - 0.7).abs().max() < 1e-6)
 
 
 def test_all_parts_together_are_the_mean_opacity():
