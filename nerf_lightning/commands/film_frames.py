@@ -8,7 +8,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from nerf_lightning.export.pictures import save_png
 from nerf_lightning.export.video import write_video
 
 Range = tuple[float, float]
+LOCK = "lock"
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ class FilmFrames:
         self.folder, self.films, self.count, self.form = folder, films, count, form
         self.hidden = folder / ".frames"
         self.root = self.hidden if form == "video" else folder
-        self.lock = FileLock(self.hidden / "lock")
+        self.lock = FileLock(self.hidden / LOCK)
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
         """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
@@ -96,9 +97,11 @@ class FilmFrames:
                         write_video(self.folder / f"{film}.mp4", self._read(film), fps, self.count)
                 except InputError as error:
                     raise InputError(f"{error} {self._cure()}") from error
+            self._remove()
         self.close()
         if self.form == "video":
-            shutil.rmtree(self.hidden)
+            with suppress(OSError):  # another process has come
+                self.hidden.rmdir()
 
     def close(self) -> None:
         """Let others have the folder; the frames stay."""
@@ -134,6 +137,16 @@ class FilmFrames:
                     f"{self.folder} is in use by another process that is filming there. Wait for it, stop it, or give "
                     "another folder with paths.output_dir=DIR."
                 ) from error
+
+    def _remove(self) -> None:
+        """Remove all that is hidden while it is ours, the lock's file last: released, it may be another process's."""
+        with suppress(OSError):  # the films are there, whatever stays
+            for place in self.hidden.iterdir():
+                if place.is_dir():
+                    shutil.rmtree(place)
+                elif place.name != LOCK:
+                    place.unlink()
+            (self.hidden / LOCK).unlink()
 
     def _discard(self) -> None:
         for folder in self.hidden.iterdir():

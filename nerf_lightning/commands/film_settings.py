@@ -30,6 +30,8 @@ class FilmSettings:
     """Lower and upper corner of a box, outside of which nothing is shown."""
     hold_camera: bool = False
     """Stay at the first camera, and let only the direction from which colour is looked up move."""
+    precision: str | None = None
+    """What the models compute in, as the caller has seen to; frames of another precision belong to another film."""
 
 
 def film_settings(config: DictConfig) -> FilmSettings:

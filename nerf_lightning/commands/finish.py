@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.film_settings import FilmSettings
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.protocol import measured_of
 from nerf_lightning.commands.scoring import Scoring
@@ -70,7 +71,8 @@ class Finish:
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
                 subject = Subject(model, scene_record(scene), scene.background)
-                video, depth = film([subject], self.path, tile_points, folder)
+                shown = FilmSettings(precision=settings.precision)
+                video, depth = film([subject], self.path, tile_points, folder, shown)
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")

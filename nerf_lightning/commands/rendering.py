@@ -1,5 +1,6 @@
 """`nerf render`: read checkpoints, follow a camera path, write what is seen."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ def render(config: DictConfig) -> None:
     ]
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoints[0].path, "render"))
     with settings.inference():
+        shown = replace(shown, precision=settings.precision)
         written = film(subjects, path, settings.inference_tile_points, folder, shown)
     print("\n".join(str(file) for file in written))
 

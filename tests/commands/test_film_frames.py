@@ -127,3 +127,32 @@ def test_two_processes_do_not_film_into_one_folder(tmp_path):
     (tmp_path / ".frames").mkdir()
     with FileLock(tmp_path / ".frames" / "lock"), pytest.raises(InputError, match="in use by another process"):
         opened(frames(tmp_path))
+
+
+def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    each, other = frames(tmp_path), frames(tmp_path)
+    opened(each)
+    release = each.close
+
+    def closed():
+        release()
+        opened(other, fingerprint="b")  # at the first chance
+        other.save("video", 0, PICTURE)
+
+    monkeypatch.setattr(each, "close", closed)
+    each.finish(fps=4)
+    assert (tmp_path / ".frames" / "video" / "frame_0000.png").is_file()
+    with pytest.raises(InputError, match="in use by another process"):
+        opened(frames(tmp_path), fingerprint="b")
+    other.close()
+    assert opened(frames(tmp_path, films=("video",)), fingerprint="b")[0] == [1, 2, 3]
+
+
+def test_nothing_hidden_stays_beside_a_finished_film(tmp_path):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    (tmp_path / ".frames" / ".film.json.77.part").write_text("of a process that was killed")
+    each = frames(tmp_path)
+    opened(each)
+    each.finish(fps=4)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]

@@ -11,8 +11,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from known_fields import INSIDE, solid
 from running import said, start
-from scenes import ball_scene, tiny_field, tiny_model
+from scenes import ball_scene, tiny_field
 
 from nerf_lightning import cli
 from nerf_lightning.checkpoints import scene_record
@@ -21,11 +22,14 @@ from nerf_lightning.commands.film_settings import FilmSettings
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.shots import Subject, make_shots
 from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
 from nerf_lightning.geometry.paths.look_at import LookAt
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.samplers.stratified import StratifiedSampler
 
+# Takes x to y, y to z and z to x: boxes stay boxes.
+CYCLE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 SMALL = ("path=orbit", "path.num_frames=2", "path.width=12", "trainer.tile_points=8192")
 
 
@@ -118,16 +122,51 @@ def test_a_model_of_one_level_has_no_difference_of_levels(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_models_with_other_working_frames_show_the_same_thing(tmp_path):
+def in_frame(first, to_user):
+    """The same capture as another reader would have it: moved, turned by whole axes and scaled."""
+    unit = unit_of(to_user)
+    corners = points_from_user(first.aabb, to_user)
+    return replace(
+        first,
+        to_user=to_user,
+        cameras=replace(first.cameras, c2w=poses_from_user(first.cameras.c2w, to_user)),
+        near=first.near / unit,
+        far=first.far / unit,
+        aabb=torch.stack([corners.amin(dim=0), corners.amax(dim=0)]),
+    )
+
+
+def egg_in(to_user):
+    """A model of what is there in the user's frame, wherever it was learnt: no two of its axes look alike."""
+
+    def distance(positions):
+        stretched = points_to_user(positions, to_user) / torch.tensor([0.9, 0.6, 0.4])
+        return 0.4 * (stretched.norm(dim=-1) - 1)
+
+    def color(positions):
+        return (0.5 + 0.5 * points_to_user(positions, to_user)).clamp(0, 1)
+
+    return solid(distance, color=color, inside=INSIDE * unit_of(to_user))
+
+
+def test_models_with_other_working_frames_show_the_same_thing():
     """A capture that was read otherwise has another working frame: the path is the first one's, seen from there."""
-    model, first = tiny_model(), scene_record(ball_scene())
-    to_user = torch.diag(torch.tensor([1.0, 1.0, 1.0, 1.0]))
-    to_user[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
-    other = replace(first, to_user=to_user)
-    path = LookAt(3, start=[4.0, 0.0, 1.0], end=[0.0, 4.0, 1.0], target=[0.0, 0.0, 0.0])
-    one, two = make_shots([Subject(model, first, "white"), Subject(model, other, "white")], path, 1000)
-    torch.testing.assert_close(two.cameras.c2w[:, :, 3], one.cameras.c2w[:, :, 3] - to_user[:3, 3])
-    torch.testing.assert_close(two.cameras.c2w[:, :, :3], one.cameras.c2w[:, :, :3])
+    user, first_frame = scene_record(ball_scene()), similarity(CYCLE.mT, torch.tensor([0.0, -1.0, 0.5]), 0.5)
+    other_frame = similarity(CYCLE, torch.tensor([1.0, 2.0, 3.0]), 2.5)
+    path = LookAt(3, start=[4.0, 0.0, 1.0], end=[0.0, 4.0, 1.0], target=[0.0, 0.0, 0.0], width=24)
+    subjects = [Subject(egg_in(each), in_frame(user, each), "white") for each in (first_frame, other_frame)]
+    one, two = make_shots(subjects, path, 1 << 15)
+    seen = poses_from_user(one.cameras.c2w, torch.linalg.inv(first_frame))
+    torch.testing.assert_close(seen[:, :, 3], torch.tensor([[4.0, 0.0, 1.0], [2.0, 2.0, 1.0], [0.0, 4.0, 1.0]]))
+    torch.testing.assert_close(two.cameras.c2w, poses_from_user(seen, other_frame))
+    for number in range(3):
+        here, there = one.picture(number), two.picture(number)
+        assert 0.03 < float(here.opacity.mean()) < 0.5
+        torch.testing.assert_close(here.rgb, there.rgb, atol=0.02, rtol=0)
+        hit = here.opacity > 0.99
+        torch.testing.assert_close(one.unit * here.depth[hit], two.unit * there.depth[hit], atol=0.02, rtol=0)
+        turned = one.normals(number, here)[hit] - two.normals(number, there)[hit]
+        assert float(turned.abs().mean()) < 0.02
 
 
 def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
@@ -169,6 +208,15 @@ def test_other_settings_begin_anew(nerf, last, tmp_path, rendered):
     before = rendered(last)["video"]
     after = rendered(last, "path.elevation=60.0")["video"]
     assert not np.array_equal(before, after)
+
+
+def test_a_film_is_of_one_precision(last, rendered):
+    """Frames that are there already are those of the same precision only."""
+    exact, mixed = ("trainer.precision=32-true", "trainer.precision=bf16-mixed")
+    before = rendered(last, exact)["video"]
+    after, alone = rendered(last, mixed)["video"], rendered(last, mixed, name="b")["video"]
+    assert not np.array_equal(before, alone)
+    assert np.array_equal(after, alone)
 
 
 @pytest.mark.slow

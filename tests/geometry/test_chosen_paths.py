@@ -61,7 +61,6 @@ def every_path(tmp_path):
     return [
         Orbit(5, radius=3.0, center=[0.0, 1.0, 2.0]),
         Spiral(5, target=[0.0, 1.0, 2.0]),
-        Ellipse(5, target=[0.0, 1.0, 2.0], rise=1.0),
         LookAt(5, start=[6.0, 1.0, 2.0], end=[7.0, 8.0, 9.0]),
         Pan(5, position=[6.0, 1.0, 2.0]),
         Pan(5, view="IMG_03*"),
@@ -71,15 +70,11 @@ def every_path(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("number", range(9))
-def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
-    """What the user gave in the user's frame is there, however the capture was moved, turned and scaled."""
-    path, user = every_path(tmp_path)[number], frame()
-    if isinstance(path, Spiral):  # it wants cameras that look the same way
-        user = replace(user, poses=user.poses[:3])
-    rotation = rotation_from_quaternion(torch.tensor([0.9, 0.1, -0.3, 0.2], dtype=torch.float64))
+def in_another_frame(user: PathFrame, quaternion: list[float]) -> PathFrame:
+    """The same capture, brought elsewhere, turned and 2.5 times smaller."""
+    rotation = rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64))
     to_user = similarity(rotation, torch.tensor([10.0, -3.0, 4.0], dtype=torch.float64), 2.5)
-    working = replace(
+    return replace(
         user,
         center=points_from_user(user.center[None], to_user)[0],
         up=rotation.mT @ user.up,
@@ -87,16 +82,43 @@ def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
         poses=poses_from_user(user.poses, to_user),
         to_user=to_user,
     )
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
+    """What the user gave in the user's frame is there, however the capture was moved, turned and scaled."""
+    path, user = every_path(tmp_path)[number], frame()
+    if isinstance(path, Spiral):  # it wants cameras that look the same way
+        user = replace(user, poses=user.poses[:3])
+    working = in_another_frame(user, [0.9, 0.1, -0.3, 0.2])
+    to_user = working.to_user
     wanted, found = path.cameras(user), path.cameras(working)
     assert is_rigid(found.c2w, tolerance=1e-9).all()
     if isinstance(path, Orbit):  # its azimuth 0 is the working frame's
         distance = (found.c2w[:, :, 3] - points_from_user(torch.tensor([[0.0, 1, 2]]).double(), to_user)).norm(dim=-1)
         torch.testing.assert_close(distance, torch.full_like(distance, 3.0 / 2.5))
-    elif isinstance(path, Ellipse):
-        pass  # where the long axis begins is the working frame's too
     else:
         torch.testing.assert_close(found.c2w, poses_from_user(wanted.c2w, to_user))
         torch.testing.assert_close(found.focal, wanted.focal)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "end"), [([0.9, 0.1, -0.3, 0.2], 0), ([0.2, 0.1, -0.1, 0.9], 1)], ids=["one end", "other end"]
+)
+@pytest.mark.parametrize("target", [None, [0.0, 1.0, 2.0]])
+def test_an_ellipse_does_not_depend_on_the_working_frame(quaternion, end, target):
+    """But for the end of the long axis at which it begins, where the working frame's own x axis points."""
+    user = replace(frame(), poses=torch.cat([frame(height=0.0).poses, frame(height=2.0).poses]))
+    working = in_another_frame(user, quaternion)
+    found = Ellipse(8, target=target, rise=0.5).cameras(working)
+    assert is_rigid(found.c2w, tolerance=1e-9).all()
+    # Begun at the other end, the first half of the way is the second, and what rose there sinks.
+    wanted = Ellipse(8, target=target, start=180.0 * end, rise=0.5 * (1 - 2 * end)).cameras(user)
+    torch.testing.assert_close(found.c2w, poses_from_user(wanted.c2w, working.to_user))
+    torch.testing.assert_close(found.focal, wanted.focal)
+    aim = MIDDLE if target is None else torch.tensor(target, dtype=torch.float64)
+    for view in range(8):
+        torch.testing.assert_close(project(wanted, view, aim), wanted.center[view], atol=1e-3, rtol=0)
 
 
 def test_an_ellipse_goes_through_the_cameras_at_one_speed():
