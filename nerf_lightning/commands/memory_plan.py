@@ -3,14 +3,12 @@
 import logging
 from dataclasses import dataclass
 
-import psutil
-import torch
-
 from nerf_lightning.commands.memory_trial import Trial, try_out
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixel_file import MappedPixelStore
 from nerf_lightning.data.residence import GIGABYTE, num_bytes
+from nerf_lightning.free_memory import free_memory
 from nerf_lightning.system import RadianceFieldSystem
 
 # What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.
@@ -75,7 +73,7 @@ class MemoryPlan:
 def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> MemoryPlan:
     """Plan by short trials: what a step and a picture hold is counted and scaled up."""
     device, tile = settings.device, settings.tile_points
-    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+    free = free_memory(device)
     trial = try_out(settings, system, data.batches, tile)
     pixels = data.scene.pixels
     moves = data.fits(device)

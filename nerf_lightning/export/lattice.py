@@ -1,10 +1,10 @@
 """A regular grid of points over a scene's box, and what a model says there."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Float
 from numpy import ndarray
@@ -12,14 +12,13 @@ from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.errors import InputError
+from nerf_lightning.free_memory import require_memory
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import tiles
 
 Report = Callable[[str, float], None]
 """Takes the name of a stage, and how much of it is done, from 0 to 1."""
 
-# Of the memory that is free, so much may be taken.
-SHARE_OF_FREE = 0.8
 # Points of which coordinates are held at a time; a report follows each.
 CHUNK = 1 << 18
 
@@ -50,7 +49,7 @@ class Lattice:
     @property
     def num_points(self) -> int:
         """How many points there are."""
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)
 
     def points(self, part: slice) -> Float[Tensor, "points 3"]:
         """Return the points numbered from `part.start` to `part.stop`, the last axis running first."""
@@ -91,12 +90,10 @@ def require_resolution(record: SceneRecord, resolution: int, bytes_per_point: in
     if resolution < 2:
         raise InputError(f"what.resolution={resolution}: give the number of cells along the longest side, 2 or more.")
     lattice = Lattice.over(record.aabb, resolution)
-    needed, free = bytes_per_point * lattice.num_points, SHARE_OF_FREE * psutil.virtual_memory().available
-    if needed > free:
-        fitting = max(2, int(resolution * (free / needed) ** (1 / 3)))
-        size = " x ".join(map(str, lattice.shape))
-        raise InputError(
-            f"what.resolution={resolution} makes a grid of {size} points, which takes {needed / 1e9:.1f} GB, and "
-            f"{free / 1e9:.1f} GB of memory can be had. what.resolution={fitting} would fit."
-        )
+    require_memory(
+        f"what.resolution={resolution} makes a grid of {' x '.join(map(str, lattice.shape))} points",
+        resolution,
+        lambda cells: bytes_per_point * Lattice.over(record.aabb, cells).num_points,
+        lambda cells: f"what.resolution={max(2, cells)}",
+    )
     return lattice

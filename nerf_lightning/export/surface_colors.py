@@ -5,10 +5,10 @@ from typing import Literal
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.nn import functional
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.lattice import Report
+from nerf_lightning.export.looks import looks_from_facing
 from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import tiles
@@ -18,8 +18,6 @@ from nerf_lightning.types.rays import RayBundle, RaySamples
 SeenFrom = Literal["cameras", "normal"]
 # Of a short ray.
 SAMPLES = 8
-# Cameras whose views of a point are averaged.
-NEAREST = 3
 
 
 def surface_colors(
@@ -52,18 +50,11 @@ def surface_colors(
     colors = torch.zeros(len(points), 3, dtype=torch.uint8)
     for part in tiles(len(points), max(1, tile_points // SAMPLES)):
         at, normal = points[part], normals[part]
-        looks = [-normal] if seen_from == "normal" else _from_cameras(at, normal, eyes)
+        looks = -normal[None] if seen_from == "normal" else looks_from_facing(at, normal, eyes)
         rgb = [_short_rays(model, at.to(device), look.to(device), reach) for look in looks]
         colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
         report(stage, part.stop / max(1, len(points)))
     return colors
-
-
-def _from_cameras(at: Tensor, normal: Tensor, eyes: Float[Tensor, "cameras 3"]) -> list[Float[Tensor, "points 3"]]:
-    towards = functional.normalize(eyes - at[:, None], dim=-1)
-    facing = (towards * normal[:, None]).sum(dim=-1)
-    best = facing.topk(min(NEAREST, len(eyes)), dim=-1).indices
-    return [-towards[torch.arange(len(at)), each] for each in best.T]
 
 
 def _short_rays(model: RadianceModel, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:

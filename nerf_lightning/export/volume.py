@@ -8,24 +8,22 @@ import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
-from torch.nn import functional
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export, refuse_ndc
 from nerf_lightning.export.lattice import Lattice, Report, require_resolution, sample_density
+from nerf_lightning.export.looks import looks_from_nearest
 from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.geometry.frames import unit_of
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import tiles
 
-# Density, colour, and as much again while the file is written.
+# Density, colour, and the density again in the user's units.
 BYTES_PER_POINT = 12
 # A cell less opaque than this has no colour.
 LEAST_ALPHA = 1e-3
-# Cameras from which a point's colour is taken.
-NEAREST = 3
 COSTS = {"density": 2.0, "colours": 3.0}
 
 
@@ -79,10 +77,11 @@ def _colors(
     report: Report,
 ) -> UInt8[ndarray, "x y z 3"]:
     rgb = np.zeros((lattice.num_points, 3), np.uint8)
-    visible = -np.expm1(-density.reshape(-1) * lattice.spacing) > LEAST_ALPHA
+    densities = density.reshape(-1)
     eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
     for chunk in lattice.chunks():
-        kept = torch.from_numpy(np.flatnonzero(visible[chunk]))
+        visible = -np.expm1(-densities[chunk] * lattice.spacing) > LEAST_ALPHA
+        kept = torch.from_numpy(np.flatnonzero(visible))
         points = lattice.points(chunk)[kept]
         parts = [_seen(model, points[part], eyes) for part in tiles(len(points), tile_points)]
         rgb[chunk.start + kept.numpy()] = torch.cat(parts).numpy()
@@ -93,11 +92,12 @@ def _colors(
 def _seen(
     model: RadianceModel, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
-    away = points[:, None] - eyes
-    nearest = away.norm(dim=-1).topk(min(NEAREST, len(eyes)), dim=-1, largest=False).indices
-    device, colors = next(model.parameters()).device, torch.zeros(len(points), 3)
-    for each in nearest.T:
-        look = functional.normalize(away[torch.arange(len(points)), each], dim=-1)
+    device, colors, looks = (
+        next(model.parameters()).device,
+        torch.zeros(len(points), 3),
+        looks_from_nearest(points, eyes),
+    )
+    for look in looks:
         output = model.last.field(points[:, None].to(device), look[:, None].to(device), None)
-        colors += output.rgb[:, 0].cpu() / len(nearest.T)
+        colors += output.rgb[:, 0].cpu() / len(looks)
     return to_bytes(colors)

@@ -202,7 +202,9 @@ def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypat
     with pytest.raises(InputError, match=r"2049 x 2049 x 2049 points, which takes 68\.\d GB, and 0\.8 GB") as error:
         exported(tmp_path, solid(ball()), record(), resolution=2048)
     fitting = int(str(error.value).split("what.resolution=")[2].split(" ")[0])
-    assert 400 < fitting < 500
+    assert (fitting + 1) ** 3 <= 1e8 < (fitting + 2) ** 3
+    with pytest.raises(InputError, match="4194304 x 4194304 x 4194304 points"):  # 64 bits count none
+        exported(tmp_path, solid(ball()), record(), resolution=2**22 - 1)
     exported(tmp_path, solid(ball()), record(), resolution=20)
 
 

@@ -1,6 +1,7 @@
 """Grids: the density where it is, in the user's units, and colours where something is."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,13 @@ from known_fields import INSIDE, ball, solid
 from scenes import ball_scene, some_rays
 
 from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.commands.peak_bytes import peak_bytes
 from nerf_lightning.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.volume import VolumeExport
+from nerf_lightning.export.lattice import CHUNK
+from nerf_lightning.export.looks import PAIRS, looks_from_facing, looks_from_nearest
+from nerf_lightning.export.volume import BYTES_PER_POINT, VolumeExport
 from nerf_lightning.fields.hash_field import HashField
 from nerf_lightning.geometry.frames import similarity
 from nerf_lightning.models.levels import RadianceModel
@@ -66,6 +70,33 @@ def test_what_rays_pass_by_has_no_density(kind):
         found = model.last.density(points)
         torch.testing.assert_close(found > 0, points[:, 0] >= 0)
         torch.testing.assert_close(found[found > 0], field.density(points)[found > 0])
+
+
+def test_a_grid_takes_no_more_memory_than_is_asked_for(tmp_path, monkeypatch):
+    points = 97**3
+    # It writes 16 MB at a time, more than all here.
+    monkeypatch.setattr(np, "savez_compressed", lambda part, **arrays: part.write_bytes(b""))
+    tracemalloc.start()
+    VolumeExport(96).export(solid(ball(), inside=0.0), record(), tmp_path, CHUNK)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0.8 * BYTES_PER_POINT * points < most < BYTES_PER_POINT * points + 4 * CHUNK
+
+
+@pytest.mark.parametrize("look", [looks_from_nearest, lambda at, eyes: looks_from_facing(at, at, eyes)])
+def test_many_cameras_are_asked_a_part_of_the_points_at_a_time(look):
+    points, eyes = torch.rand(20_000, 3), torch.rand(500, 3) + 2.0
+    parts = torch.cat([look(part, eyes) for part in points.split(37)], dim=1)
+    torch.testing.assert_close(look(points, eyes), parts)
+    assert peak_bytes(lambda: look(points, eyes), torch.device("cpu")) < 40 * PAIRS + 100 * len(points)
+
+
+def test_points_are_looked_at_from_the_nearest_cameras_and_from_those_they_face():
+    eyes = torch.tensor([[1.0, 0, 0], [0, 2, 0], [0, 0, 3], [0, 0, -9]])
+    at, normal = torch.zeros(1, 3), torch.tensor([[0.0, 0.6, -0.8]])
+    assert looks_from_nearest(at, eyes)[:, 0].tolist() == [[-1, 0, 0], [0, -1, 0], [0, 0, -1]]
+    assert looks_from_facing(at, normal, eyes)[:, 0].tolist() == [[0, 0, 1], [0, -1, 0], [-1, 0, 0]]
+    assert looks_from_nearest(at, eyes[:2]).shape == (2, 1, 3)
 
 
 def test_refusals(tmp_path, monkeypatch):
