@@ -13,6 +13,7 @@ from torch import Tensor
 from nerf_lightning import ranks
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.film_frames import FilmFrames, Range
+from nerf_lightning.commands.film_memory import require_room
 from nerf_lightning.commands.film_settings import FilmSettings
 from nerf_lightning.commands.shots import Shot, Subject, depth_range, make_shots
 from nerf_lightning.errors import InputError
@@ -42,6 +43,7 @@ def film(
     settings = FilmSettings() if settings is None else settings
     _check(subjects, settings)
     shots = make_shots(subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera)
+    require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
     frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form)
     try:

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.film_memory import require_room
 from nerf_lightning.commands.film_settings import FilmSettings
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.protocol import measured_of
@@ -47,13 +48,14 @@ class Finish:
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
 
     def require_film(self, scene: Scene) -> None:
-        """Refuse a path that cannot be laid around the scene.
+        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory.
 
         Raises:
             InputError: why not.
         """
         if self.path is not None:
-            lay_path(self.path, scene_record(scene))
+            record = scene_record(scene)
+            require_room(lay_path(self.path, record), FilmSettings(), [record])
 
     def __call__(
         self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path

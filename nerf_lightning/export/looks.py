@@ -27,7 +27,7 @@ def looks_from_nearest(
 def looks_from_facing(
     points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> Float[Tensor, "looks points 3"]:
-    """Return unit directions to each point from the cameras that its surface, of unit `normals`, faces most squarely."""
+    """Return unit directions to each point from the cameras that its unit normal points at most squarely."""
     parts = []
     for part in _handy(points, eyes):
         away = functional.normalize(points[part, None] - eyes, dim=-1)

@@ -92,11 +92,8 @@ def _colors(
 def _seen(
     model: RadianceModel, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
-    device, colors, looks = (
-        next(model.parameters()).device,
-        torch.zeros(len(points), 3),
-        looks_from_nearest(points, eyes),
-    )
+    device, colors = next(model.parameters()).device, torch.zeros(len(points), 3)
+    looks = looks_from_nearest(points, eyes)
     for look in looks:
         output = model.last.field(points[:, None].to(device), look[:, None].to(device), None)
         colors += output.rgb[:, 0].cpu() / len(looks)
