@@ -14,10 +14,16 @@ from nerf_lightning.export.base import Export
 from nerf_lightning.export.pictures import to_bytes
 from nerf_lightning.export.point_file import save_points
 from nerf_lightning.export.seen_views import SeenView, at_most, nearest_views, num_agreeing, see
+from nerf_lightning.free_memory import require_memory
 from nerf_lightning.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.geometry.spread import spread
 from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.types.scene import Cameras
 
+# What all views' points are held in until they are confirmed, and the picture of each; then once more, as one cloud.
+BYTES_PER_PIXEL = 90
+# And of those that are written: in the user's frame, in double precision, and as rows of the file.
+BYTES_PER_POINT = 150
 # So many of the nearest other views are asked whether they agree.
 NEIGHBOURS = 8
 COSTS = {"depth": 10.0, "agreement": 1.0}
@@ -65,44 +71,69 @@ class PointsExport(Export):
 
     def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
-        cameras = at_most(record.cameras, self.longest)
         views = spread(record.splits["train"], self.max_views)
+        self._require_memory(record.cameras[views])
+        cameras = at_most(record.cameras, self.longest)
+        clouds: dict[int, Tensor] = {}
+        depths: dict[int, Tensor] = {}
+        opacities, candidates = [], 0
         with StageProgress(COSTS) as report:
-            seen: dict[int, SeenView] = {}
             for number, view in enumerate(views):
-                seen[view] = see(model, record, cameras, view, tile_points)
+                seen = see(model, record, cameras, view, tile_points)
+                opaque = (seen.opacity > self.min_opacity) & seen.depth.isfinite()
+                clouds[view], depths[view] = _cloud(seen, opaque), torch.where(opaque, seen.depth, torch.inf)
+                candidates += int(opaque.sum())
+                opacities += [float(seen.opacity.min()), float(seen.opacity.max())]
                 report("depth", (number + 1) / len(views))
-            opaque = {view: (each.opacity > self.min_opacity) & each.depth.isfinite() for view, each in seen.items()}
-            depths = {view: torch.where(opaque[view], each.depth, torch.inf) for view, each in seen.items()}
             least = min(self.agreement, len(views) - 1)
-            found = []
             for number, view in enumerate(views):
-                cloud = _cloud(seen[view], opaque[view])
                 others = nearest_views(cameras, view, views, NEIGHBOURS)
-                count = num_agreeing(cloud[:, :3], cameras, depths, others, self.tolerance)
-                found.append(cloud[count >= least])
+                count = num_agreeing(clouds[view][:, :3], cameras, depths, others, self.tolerance)
+                clouds[view] = clouds[view][count >= least]
                 report("agreement", (number + 1) / len(views))
-        cloud = torch.cat(found)
+        del depths
+        cloud = torch.cat(list(clouds.values()))
+        del clouds
         if not len(cloud):
-            raise InputError(self._nothing(record, seen, sum(int(mask.sum()) for mask in opaque.values())))
-        candidates = sum(int(mask.sum()) for mask in opaque.values())
+            raise InputError(self._nothing(record, min(opacities), max(opacities), candidates))
         log.info("%d of %d points are confirmed by other views", len(cloud), candidates)
+        return [self._save(cloud, record, folder)]
+
+    def _save(self, cloud: Float[Tensor, "points 9"], record: SceneRecord, folder: Path) -> Path:
         if len(cloud) > self.num_points:
             cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[: self.num_points]]
         to_user, path = record.to_user.double(), folder / "points.ply"
         points = points_to_user(cloud[:, :3].double(), to_user)
         normals = directions_to_user(cloud[:, 3:6].double(), to_user)
         save_points(path, points.numpy(), normals.numpy(), to_bytes(cloud[:, 6:]).numpy())
-        return [path]
+        return path
 
-    def _nothing(self, record: SceneRecord, seen: dict[int, SeenView], candidates: int) -> str:
+    def _require_memory(self, cameras: Cameras) -> None:
+        """Refuse more pixels than memory holds, were they all opaque and confirmed."""
+
+        def num_pixels(longest: int) -> int:
+            small = at_most(cameras, longest)
+            return int((small.width * small.height).sum())
+
+        def needed(longest: int) -> int:
+            pixels = num_pixels(longest)
+            return BYTES_PER_PIXEL * pixels + BYTES_PER_POINT * min(pixels, self.num_points)
+
+        largest = int(torch.maximum(cameras.width, cameras.height).max())
+        count = len(cameras.width)
+        require_memory(
+            f"what.longest={self.longest} makes {num_pixels(self.longest):,} points of {count} views",
+            min(self.longest, largest),
+            needed,
+            lambda longest: f"what.longest={longest} (or a smaller what.max_views)",
+        )
+
+    def _nothing(self, record: SceneRecord, lowest: float, highest: float, candidates: int) -> str:
         if candidates:
             return (
                 f"{candidates} pixels of {record.name} are opaque, but no point is confirmed by {self.agreement} other "
                 "views. Train longer, or give a smaller what.agreement or a larger what.tolerance."
             )
-        lowest = min(float(each.opacity.min()) for each in seen.values())
-        highest = max(float(each.opacity.max()) for each in seen.values())
         return (
             f"There is no surface to export: the opacities of {record.name}'s training views go from {lowest:.3g} to "
             f"{highest:.3g}, and what.min_opacity={self.min_opacity:g}. Train longer, or lower it."

@@ -87,7 +87,7 @@ def test_a_frame_beyond_memory_is_refused_with_what_would_fit(monkeypatch):
     assert height == round(width / 2)
     assert width * height * bytes_per_pixel(settings, [scene]) == pytest.approx(0.8e9, rel=0.01)
     require_room(cameras(width, height), settings, [scene])
-    with pytest.raises(InputError, match="path.width="):
+    with pytest.raises(InputError, match=r"path\.width="):
         require_room(cameras(width, height), settings, 2 * [scene])
 
 

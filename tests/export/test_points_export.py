@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 import torch
 import trimesh
@@ -11,8 +12,9 @@ from posed_captures import Known, read, wall, write_llff
 from scenes import ball_scene
 
 from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.commands.peak_bytes import peak_bytes
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.points import PointsExport
+from nerf_lightning.export.points import BYTES_PER_PIXEL, BYTES_PER_POINT, PointsExport
 from nerf_lightning.export.seen_views import num_agreeing, see
 from nerf_lightning.geometry.frames import similarity, upright_rotation
 
@@ -102,6 +104,32 @@ def test_an_empty_field_is_refused_with_the_opacities_seen(tmp_path):
     with pytest.raises(InputError, match=r"no point is confirmed by 5 other views"):
         exported(tmp_path, solid(ball()), record(), agreement=5, tolerance=1e-7)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cloud_takes_no_more_memory_than_is_asked_for(tmp_path):
+    scene = scene_record(ball_scene(num_views=24, size=64))
+    wall = solid(lambda positions: -torch.ones_like(positions[..., 0]), samples=4)  # all pixels are opaque
+    num_pixels = len(scene.splits["train"]) * 64**2
+
+    def each(num_points):
+        export = PointsExport(num_points, agreement=0)
+        return peak_bytes(lambda: export.export(wall, scene, tmp_path, 1 << 10), torch.device("cpu")) / num_pixels
+
+    assert 0.7 * BYTES_PER_PIXEL < each(10) < BYTES_PER_PIXEL
+    # The rows of the file are numpy's, and not counted here: 54 bytes.
+    assert 0.5 * (BYTES_PER_PIXEL + BYTES_PER_POINT) < each(num_pixels) < BYTES_PER_PIXEL + BYTES_PER_POINT - 54
+
+
+def test_a_cloud_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 10**6}))
+    scene = scene_record(ball_scene(num_views=12, size=64))
+    with pytest.raises(InputError, match=r"what\.longest=400 makes 24,576 points of 6 views, .* can be had") as error:
+        PointsExport().export(solid(ball()), scene, tmp_path, TILE)
+    longest = int(str(error.value).split("what.longest=")[2].split(" ")[0])
+    assert 6 * longest**2 * (BYTES_PER_PIXEL + BYTES_PER_POINT) <= 8e5
+    assert 6 * (longest + 1) ** 2 * (BYTES_PER_PIXEL + BYTES_PER_POINT) > 8e5
+    assert not list(tmp_path.iterdir())
+    PointsExport(longest=longest, agreement=0).export(solid(ball()), scene, tmp_path, TILE)
 
 
 @pytest.mark.parametrize(
