@@ -14,10 +14,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.sweep_record import read_sweep, sweep_record
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 OF_ONE_START = ("resume", "paths", "init_from", "sweep")
 """What belongs to one start of a run, not to the run."""

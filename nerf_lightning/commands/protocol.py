@@ -14,8 +14,8 @@ import torch
 from torch import nn
 
 from nerf_lightning import __version__
-from nerf_lightning.commands.plain_yaml import plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, is_identity
+from nerf_lightning.plain_yaml import plain_yaml
 from nerf_lightning.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]

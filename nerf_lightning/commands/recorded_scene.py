@@ -8,9 +8,9 @@ import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.overrides import quoted
-from nerf_lightning.commands.plain_yaml import plain_yaml, read_plain_yaml
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import plain_yaml, read_plain_yaml
 
 # Settings of scenes that say where a capture lies.
 PLACES = ("root", "path")

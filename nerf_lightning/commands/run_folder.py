@@ -22,12 +22,12 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nerf_lightning.commands.metrics_files import METRICS
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_summary import RunSummary, number, read_json_object, read_note, read_run
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 Measured = Literal["run", "eval"]
 FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
