@@ -14,18 +14,27 @@ def beside_checkpoint(checkpoint: Path, name: str) -> Path:
     return (beside.parent if beside.name == "checkpoints" else beside) / name
 
 
-def output_folder(given: str | None, default: Path) -> Path:
-    """Return where a command that does not train writes: as given, else by default.
+def chosen_folder(given: str | None, default: Path) -> Path:
+    """Return where a command that does not train is to write: as given, else by default. Nothing is made yet.
 
     The jobs of a sweep have folders of their own.
 
     Raises:
-        InputError: the folder cannot be made or written.
+        InputError: links lead out of it.
     """
-    folder = job_folder() or Path(given or default)
     if given is None:
         # Beside a checkpoint that may come from anybody.
         require_no_way_out(default.parent if default.is_symlink() else default)
+    return job_folder() or Path(given or default)
+
+
+def output_folder(given: str | None, default: Path) -> Path:
+    """Return the folder that `chosen_folder` names, made and tried.
+
+    Raises:
+        InputError: the folder cannot be made or written, or links lead out of it.
+    """
+    folder = chosen_folder(given, default)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{os.getpid()}.probe"
