@@ -55,6 +55,40 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
     assert "paths.output_dir" not in rows[0]
 
 
+def test_what_was_swept_within_model_or_scene_is_shown(table, tmp_path):
+    for resolution, space in ((32, "bounded"), (64, "bounded"), (64, "contracted")):
+        leave_measured_run(
+            tmp_path / "runs" / f"{resolution}_{space}",
+            overrides=(f"model.levels.fine.sampler.resolution={resolution}", f"scene.space={space}", "model=fast"),
+            origin={"config": f"{resolution} {space}"},
+        )
+    _, rows = table("published=false")
+    shown = {(row["model.levels.fine.sampler.resolution"], row["scene.space"]) for row in rows}
+    assert shown == {("32", "bounded"), ("64", "bounded"), ("64", "contracted")}
+
+
+BESIDE_THE_RESULT = (
+    *("model={}", "scene={}", "scene@scene={}", "resume={}", "path={}", "path.num_frames={}", "logger={}"),
+    *(
+        "logger.tensorboard.name={}",
+        "~logger.tensorboard={}",
+        "paths.output_dir={}",
+        "sweep.resume={}",
+        "final.video={}",
+    ),
+    *("evaluation.num_worst={}", "scene.root={}/lego", "scene.name={}", "scene.cache_dir={}"),
+)
+
+
+def test_where_things_lie_and_what_is_said_of_a_run_makes_no_row(table, tmp_path):
+    for seed in (0, 1):
+        overrides = tuple(override.format(seed) for override in BESIDE_THE_RESULT)
+        leave_measured_run(tmp_path / "runs" / str(seed), 30.0, seed, overrides)
+    _, (row,) = table("published=false")
+    assert row["seeds"] == "0 1"
+    assert not [column for column in row if "=" in column or "." in column]
+
+
 def test_published_numbers_stand_below_with_their_source(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a", 33.0)
     leave_measured_run(tmp_path / "runs" / "b", 20.0, protocol={"scene": "bricks"}, origin={"scene": "bricks"})
@@ -78,6 +112,18 @@ def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder(table, tmp_
     assert len(rows) == 6
 
 
+@pytest.mark.parametrize(
+    ("place", "names"),
+    [("scene.root=data/room.{}", ["room.v2", "room.v3"]), ("scene.path='data/room.{}.npz'", ["room.v2", "room.v3"])],
+)
+def test_the_dots_of_a_folders_name_belong_to_it(table, tmp_path, place, names):
+    for version in ("v2", "v3"):
+        overrides = ("scene=blender", place.format(version))
+        leave_measured_run(tmp_path / "runs" / version, protocol={"scene": "blender"}, overrides=overrides)
+    _, rows = table("published=false")
+    assert [row["scene"] for row in rows] == names
+
+
 def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a")
     leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
@@ -88,6 +134,23 @@ def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     assert len(ours(rows)) == 2
     assert "Not all of these were measured alike" in result.out
     assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_force_names_every_difference_once(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
+    leave_measured_run(tmp_path / "runs" / "c", protocol={"pixels": "8-bit", "background": "black"})
+    leave_measured_run(tmp_path / "runs" / "d", protocol={"scene": "chair", "split": "val"})
+    result, _ = table("force=true")
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert result.code == 0, result.err
+    notes = [line for line in text.splitlines() if "measured alike" in line]
+    assert [note.split(": ", 2)[2] for note in notes] == [
+        "pixels: float and 8-bit.",
+        "background: white and black.",
+        "split: test and val.",
+    ]
+    assert [note.count(f"/{run}") for note, run in zip(notes, "bcd", strict=True)] == [1, 1, 1]
 
 
 def test_scenes_that_were_measured_differently_are_refused_too(table, tmp_path):
@@ -156,7 +219,7 @@ def test_nothing_to_show_is_said(nerf, table, tmp_path):
     (tmp_path / "runs").mkdir()
     said(table()[0], "no run in")
     leave_measured_run(tmp_path / "runs" / "a", None)
-    said(table()[0], "None of the 1 runs has metrics.json")
+    said(table()[0], "None of the 1 runs has a PSNR in metrics.json")
     said(nerf("table"), "runs has no value")
 
 
@@ -194,13 +257,24 @@ def test_damaged_metrics_are_no_numbers(table, tmp_path, content):
     assert "runs/b" in " ".join(result.out.split())
 
 
-def test_damaged_parts_of_metrics_are_left_out(table, tmp_path):
+DAMAGED_ORIGINS = [
+    {"seed": [1], "parameters": "x", "model": {"a": 1}},
+    {"seed": None, "config": ["a", {"b": []}], "scene": [], "version": {}, "megabytes": True},
+    *({"seed": seed} for seed in ("--5", "-", "\u0663", "\u00b2", "9" * 5000, 1.5, True)),
+    {"seed": None, "model": "\ud800", "scene": "\ud800", "device": "\ud800"},
+]
+
+
+@pytest.mark.parametrize("origin", DAMAGED_ORIGINS, ids=lambda origin: ascii(origin)[:40])
+def test_damaged_parts_of_metrics_are_left_out(table, tmp_path, origin):
     run = leave_measured_run(tmp_path / "runs" / "a", started=7, finished_at_step=["x"], training_seconds={})
-    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": {"seed": [1], "parameters": "x", "model": {"a": 1}}}
+    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": origin}
     (run / "metrics.json").write_text(json.dumps(content))
-    result, rows = table()
+    leave_measured_run(tmp_path / "runs" / "b", 19.0, seed=1)
+    result, rows = table("force=true")
     assert result.code == 0, result.err
-    assert rows[0]["PSNR"] == "20.0"
+    assert "20.0" in [row["PSNR"] for row in rows]
+    assert all(row["seeds"] in ("", "1") for row in ours(rows))
 
 
 @pytest.mark.slow
