@@ -38,6 +38,8 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
     """
     first_of: dict[str, RunResult] = {}
     pairs: dict[str, str] = {}
+    # A result without LPIPS agrees with all backbones: what is compared with is one that has a backbone.
+    results = sorted(results, key=lambda result: result.protocol.get("lpips") is None)
     for result in results:
         first = first_of.setdefault(result.scene, result)
         for other, same_scene in ((first, True), (results[0], False)):
