@@ -1,5 +1,6 @@
 """`nerf table`: find the runs, hold their protocols against each other, print and write the table."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -66,7 +67,7 @@ def folder_for(folders: Sequence[Path]) -> Path:
     That is the one that holds the others, else the folder that they lie beside each other in; where there is none, or
     it is the root of the disk, the working folder.
     """
-    places = [folder.absolute() for folder in folders]
+    places = [Path(os.path.abspath(folder)) for folder in folders]
     outermost = min(places, key=lambda place: len(place.parts))
     if all(place.is_relative_to(outermost) for place in places):
         return outermost

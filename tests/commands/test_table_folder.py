@@ -34,6 +34,13 @@ def test_the_table_of_several_folders_lies_beside_them_or_here(nerf, tmp_path, m
     assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "here", "runs"]
 
 
+def test_a_way_around_names_the_same_folder():
+    runs = Path("runs").absolute()
+    assert folder_for([Path("runs/a"), Path("runs/a/../b")]) == runs
+    assert folder_for([Path("runs/a"), runs / "b"]) == runs
+    assert folder_for([Path("runs/../runs")]) == runs
+
+
 def test_no_table_lies_in_the_root():
     assert folder_for([Path("/data"), Path("/runs")]) == Path()
     assert folder_for([Path("/data/a"), Path("/home/b")]) == Path()
