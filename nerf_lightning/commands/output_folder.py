@@ -1,6 +1,6 @@
 """Where a command that does not train writes: as the user says, or beside the checkpoint."""
 
-import os
+import tempfile
 from pathlib import Path
 
 from nerf_lightning.commands.links import require_no_way_out
@@ -37,9 +37,9 @@ def output_folder(given: str | None, default: Path) -> Path:
     folder = chosen_folder(given, default)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{os.getpid()}.probe"
-        probe.touch()
-        probe.unlink()
+        # Under a name that nobody can have planted a link at.
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".probe"):
+            pass
     except OSError as error:
         raise InputError(
             f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."

@@ -139,5 +139,11 @@ class Gathering:
         """Leave out what cannot be read, and say why."""
         try:
             add()
-        except InputError as error:
-            self.report.missing.append(f"{what}: {error}")
+        except (InputError, OSError) as error:
+            self.report.missing.append(f"{what}: {_reason(error)}")
+
+
+def _reason(error: InputError | OSError) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
