@@ -19,6 +19,7 @@ from torch import Tensor
 
 from nerf_lightning import __version__
 from nerf_lightning.errors import InputError
+from nerf_lightning.geometry.reach import near_and_far
 from nerf_lightning.record_checks import require_sound_scene
 from nerf_lightning.tensor_files import load_tensors
 from nerf_lightning.types.scene import Background, Cameras, Scene, Space
@@ -46,6 +47,12 @@ class SceneRecord:
     background: Background
     to_user: Float[Tensor, "4 4"]
     space: Space = "bounded"
+
+    def near_and_far(self, eyes: Float[Tensor, "frames 3"]) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
+        """Return between which distances cameras that stand anywhere see the content (scene units)."""
+        if self.space != "bounded" or self.cameras.ndc is not None:
+            return self.near.min().expand(len(eyes)), self.far.max().expand(len(eyes))
+        return near_and_far(eyes, self.cameras.c2w[:, :, 3], self.aabb.mean(dim=0), self.near, self.far)
 
 
 @dataclass(frozen=True)

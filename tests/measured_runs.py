@@ -54,3 +54,8 @@ def leave_measured_run(
         content["origin"] = ORIGIN | {"seed": seed} | (origin or {})
         (folder / "metrics.json").write_text(json.dumps(content))
     return folder
+
+
+def ours(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a table that nobody has published."""
+    return [row for row in rows if not row.get("source")]

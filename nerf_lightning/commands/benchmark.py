@@ -7,7 +7,6 @@ is the same mathematics as one would first write it: float32, whole batches, tor
 screening of what lies behind opaque samples.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress, RayBatches
-from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.json_file import write_json
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.packed_level import PackedLevel
@@ -121,8 +120,7 @@ def benchmark(config: DictConfig) -> float:
     }
     print_table(result)
     folder = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
-    with whole_file(folder / "bench.json") as part:
-        part.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(folder / "bench.json", result)
     print(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])
 

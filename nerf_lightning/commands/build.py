@@ -10,7 +10,6 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint
 from nerf_lightning.commands import xla
-from nerf_lightning.commands.plain_yaml import plain_yaml
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress
@@ -18,6 +17,7 @@ from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import AnyLevel, RadianceModel
+from nerf_lightning.plain_yaml import plain_yaml
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.scene import Scene

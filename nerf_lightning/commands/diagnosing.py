@@ -1,6 +1,5 @@
 """`nerf doctor`: read a scene as training does, examine it, print, write `doctor.json` and `doctor.png`."""
 
-import json
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -16,8 +15,8 @@ from nerf_lightning.commands.console import StdoutConsole
 from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.data.doctor.examine import examine
-from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.doctor_picture import doctor_picture
+from nerf_lightning.export.json_file import write_json
 from nerf_lightning.export.pictures import save_png
 
 STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
@@ -30,7 +29,7 @@ def diagnose(config: DictConfig) -> int:
     default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
-    _write_json(folder / "doctor.json", scene.name, checks)
+    write_json(folder / "doctor.json", {"scene": scene.name, "checks": [asdict(check) for check in checks]})
     save_png(folder / "doctor.png", doctor_picture(evidence, checks))
     print_checks(checks)
     seconds = time.monotonic() - started
@@ -60,9 +59,3 @@ def print_checks(checks: Sequence[Check]) -> None:
         console.print(line)
         if check.cure:
             console.print(Text(f"{'':<{width + 9}}cure: {check.cure}"))
-
-
-def _write_json(path: Path, name: str, checks: Sequence[Check]) -> None:
-    content = {"scene": name, "checks": [asdict(check) for check in checks]}
-    with whole_file(path) as part:
-        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

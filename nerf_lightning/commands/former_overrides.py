@@ -14,13 +14,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.sweep_record import read_sweep, sweep_record
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import read_plain_yaml
 
-OF_ONE_START = ("resume", "paths", "init_from", "sweep")
-"""What belongs to one start of a run, not to the run."""
+OF_ONE_START = ("resume", "paths", "init_from", "sweep", "viewer")
+"""What belongs to one start of a run, not to the run: the viewer opens a server, for whoever sits there then."""
 OF_THE_USER = ("hydra", "logger", "scene.download", "scene.cache_dir", "scene.allow_outside", "scene.max_gigabytes")
 """Where to write, what to fetch, and what to trust."""
 DOWNLOADED = "scene.path"

@@ -1,7 +1,6 @@
 """What the rows of all scored views come to, and the files that say it: `metrics.json` and `metrics.csv`."""
 
 import csv
-import json
 import statistics
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from nerf_lightning.commands.bench_table import peak_memory
 from nerf_lightning.evaluation.lpips import LPIPS_HINT
 from nerf_lightning.evaluation.metrics import mean_over_images, median_over_images, worst_of_images
 from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.json_file import write_json
 
 METRICS = ("psnr", "ssim", "lpips", "depth_error", "normal_error")
 COLUMNS = ("name", *METRICS, "seconds")
@@ -42,8 +42,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def write_metrics(folder: Path, result: dict[str, Any]) -> None:
     """Write `metrics.json`, and `metrics.csv` with a row per picture."""
-    with whole_file(folder / "metrics.json") as part:
-        part.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(folder / "metrics.json", result)
     with whole_file(folder / "metrics.csv") as part, part.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()

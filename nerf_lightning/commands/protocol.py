@@ -14,8 +14,8 @@ import torch
 from torch import nn
 
 from nerf_lightning import __version__
-from nerf_lightning.commands.plain_yaml import plain_yaml
-from nerf_lightning.commands.run_identity import fingerprint, is_identity
+from nerf_lightning.commands.run_identity import UNWATCHED, fingerprint, is_identity
+from nerf_lightning.plain_yaml import plain_yaml
 from nerf_lightning.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]
@@ -111,7 +111,7 @@ def config_hash(settings: Any) -> str:
         for key, value in leaves.items()
         if key.startswith(SETTINGS) or (is_identity(key) and not key.startswith(NOT_SETTINGS))
     }
-    return fingerprint(kept)
+    return fingerprint(kept | UNWATCHED)
 
 
 def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:

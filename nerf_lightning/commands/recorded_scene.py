@@ -8,14 +8,18 @@ import yaml
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.overrides import quoted
-from nerf_lightning.commands.plain_yaml import plain_yaml, read_plain_yaml
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import plain_yaml, read_plain_yaml
 
 # Settings of scenes that say where a capture lies.
 PLACES = ("root", "path")
 # Settings that say where to write, what to fetch and how far to trust: the user's alone.
 OF_THE_USER = ("download", "cache_dir", "allow_outside", "max_gigabytes")
+
+
+class UnknownScene(InputError):
+    """Report a checkpoint that is sound, but does not say what it was trained on."""
 
 
 def scene_overrides(path: str) -> list[str]:
@@ -24,20 +28,21 @@ def scene_overrides(path: str) -> list[str]:
     A relative place that is not found from here is taken from where the run was started, if its folder still says.
 
     Raises:
-        InputError: the checkpoint cannot be read, or was trained on a scene that our conf/ lacks.
+        UnknownScene: it was trained on a scene that our conf/ lacks.
+        InputError: the checkpoint cannot be read.
     """
     checkpoint = read_checkpoint(path.strip("'\""))
     name = checkpoint.choices.get("scene", "")
     known = {file.stem: file for file in (conf_folder() / "scene").glob("*.yaml")}
     if name not in known:
-        raise InputError(
+        raise UnknownScene(
             f"{path} was trained on the scene '{name}', which conf/scene/ lacks. Name the scene: "
-            f"nerf eval ckpt={path} scene=... ({', '.join(sorted(known))})."
+            f"add scene=... ({', '.join(sorted(known))})."
         )
     config = plain_yaml(checkpoint.config, f"The config in {path}")
     recorded = config.get("scene") if isinstance(config, dict) else None
     if not isinstance(recorded, dict):
-        raise InputError(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
+        raise UnknownScene(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}

@@ -11,7 +11,6 @@ from nerf_lightning.commands.build import build
 from nerf_lightning.commands.links import require_nothing_from_outside
 from nerf_lightning.commands.measured_parts import facts, per_image, tables, views_on_page
 from nerf_lightning.commands.output_folder import output_folder
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.recorded_scene import scene_overrides
 from nerf_lightning.commands.run_curves import read_curves
 from nerf_lightning.commands.run_results import FILES
@@ -21,6 +20,7 @@ from nerf_lightning.data.doctor.examine import examine
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.plain_yaml import read_plain_yaml
 from nerf_lightning.reports.coverage import coverage
 from nerf_lightning.reports.curves import curve_drawings
 from nerf_lightning.reports.embedding import embedded_file, embedded_video
@@ -139,5 +139,11 @@ class Gathering:
         """Leave out what cannot be read, and say why."""
         try:
             add()
-        except InputError as error:
-            self.report.missing.append(f"{what}: {error}")
+        except (InputError, OSError) as error:
+            self.report.missing.append(f"{what}: {_reason(error)}")
+
+
+def _reason(error: InputError | OSError) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)

@@ -6,7 +6,6 @@ A run folder has `run.json` (its config's fingerprint, and what it came to), `.h
 
 import contextlib
 import itertools
-import json
 import os
 import time
 from dataclasses import dataclass, field
@@ -22,12 +21,13 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.json_file import write_json
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class RunFolder:
         now = time.monotonic()
         seconds: float = round(note.get("seconds", 0.0) + now - self.began, 1)
         self.began = now
-        _write_json(self.path / "run.json", note | {"seconds": seconds} | values)
+        write_json(self.path / "run.json", note | {"seconds": seconds} | values)
         return seconds
 
 
@@ -125,7 +125,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
         key: note[key] for key in ("started", "seconds") if key in note
     }
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
-    _write_json(
+    write_json(
         folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings_digest(config)} | kept | job
     )
     sweep_leftovers(folder / "checkpoints")
@@ -225,8 +225,3 @@ def _fresh(parent: Path) -> Path:
             (parent / name).mkdir(parents=True)
             return parent / name
     raise AssertionError("unreachable: the names never end")
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    with whole_file(path) as part:
-        part.write_text(json.dumps(content, indent=2) + "\n")

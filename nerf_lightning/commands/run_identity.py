@@ -20,12 +20,14 @@ NOT_IDENTITY = (
 )
 IDENTITY = ("callbacks.collapse_guard.",)
 # What may differ between two starts of which the second has nothing left to do.
-OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "scene.cache_dir")
+OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "viewer", "scene.cache_dir")
+# What viewer=off leaves of its group: a run that is watched is the same run.
+UNWATCHED: dict[str, Any] = {"viewer": {}}
 
 
 def run_identity(config: DictConfig) -> dict[str, Any]:
     """Return the settings that make a run what it is: two of the same identity and length compute the same."""
-    return {key: value for key, value in flatten(config).items() if is_identity(key)}
+    return {key: value for key, value in flatten(config).items() if is_identity(key)} | UNWATCHED
 
 
 def is_identity(key: str) -> bool:
@@ -42,7 +44,8 @@ def settings_digest(config: DictConfig) -> str:
     """Return a short name of everything that a run does, its length and its evaluation included."""
     resolved = copy.deepcopy(config)
     OmegaConf.resolve(resolved)
-    return fingerprint({key: value for key, value in flatten(resolved).items() if not key.startswith(OF_ONE_START)})
+    kept = {key: value for key, value in flatten(resolved).items() if not key.startswith(OF_ONE_START)}
+    return fingerprint(kept | UNWATCHED)
 
 
 def finished_run(folders: Iterable[Path], config: DictConfig) -> Path | None:

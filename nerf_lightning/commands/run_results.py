@@ -1,32 +1,28 @@
 """Results as they lie in run folders: what was reached, by which model, on which scene, and how it was measured."""
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from nerf_lightning.commands.metrics_files import METRICS
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.commands.run_summary import RunSummary, number, read_json_object, read_note, read_run
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 Measured = Literal["run", "eval"]
 FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
-# Settings by which rows do not differ: where things lie, what is said of a run, and what has a column of its own.
-NOT_SHOWN = (
-    "seed",
-    "model",
-    "scene",
-    "paths.",
-    "resume",
-    "sweep.",
-    "final.",
-    "evaluation.",
-    "logger",
-    "hydra.",
-    "path",
+# Settings by which rows do not differ: where things lie, what is said of a run, and what has a column of its own. What
+# lies below a model or a scene is what was swept.
+NOT_SHOWN = ("seed", "model", "scene", "resume", "path", "logger")
+NOT_SHOWN_BELOW = (
+    *("paths.", "path.", "sweep.", "final.", "evaluation.", "hydra.", "logger."),
+    *("scene.root", "scene.path", "scene.name", "scene.cache_dir", "scene.verify", "scene.allow_outside"),
+    "scene.max_gigabytes",
 )
+SEED = re.compile(r"-?\d{1,18}", re.ASCII)
 MOST_FOLDERS = 1_000_000
 
 
@@ -86,7 +82,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     run, note = read_run(folder), read_note(folder)
     protocol = _mapping(metrics.get("protocol"))
     origin = _choices(folder) | _mapping(metrics.get("origin"))
-    seed = origin.get("seed", run.overrides.get("seed", "0"))
+    seed = str(origin.get("seed", run.overrides.get("seed", "0")))
     values = {metric: number(metrics.get(metric)) for metric in METRICS}
     values["frames_per_second"] = number(metrics.get("frames_per_second"))
     values |= {key: number(origin.get(key)) for key in ("parameters", "megabytes")}
@@ -95,21 +91,26 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
         summary=run,
         scene=_scene_name(protocol, origin, run.overrides),
         model=str(origin.get("model") or run.overrides.get("model", "")) or "not said",
-        seed=int(seed) if str(seed).lstrip("-").isdecimal() and len(str(seed)) < 20 else None,
+        seed=int(seed) if SEED.fullmatch(seed) else None,
         values=values,
-        settings={key: value for key, value in run.overrides.items() if not key.lstrip("+~").startswith(NOT_SHOWN)},
+        settings={key: value for key, value in run.overrides.items() if _is_shown(key.lstrip("+~"))},
         protocol=protocol,
         origin=origin,
     )
 
 
+def _is_shown(key: str) -> bool:
+    # `scene@PACKAGE` picks from the group that `scene` picks from.
+    return key.partition("@")[0] not in NOT_SHOWN and not key.startswith(NOT_SHOWN_BELOW)
+
+
 def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
     """Return the scene's name; where it bears its format's alone, that of the folder or file it was read from."""
     name = str(protocol.get("scene", "")) or "not said"
-    place = overrides.get("scene.root") or overrides.get("scene.path")
-    if name == str(origin.get("scene", overrides.get("scene"))) and place:
-        return Path(place.strip("'\"")).stem or name
-    return name
+    if name != str(origin.get("scene", overrides.get("scene"))):
+        return name
+    root, file = (Path(overrides.get(key, "").strip("'\"")) for key in ("scene.root", "scene.path"))
+    return root.name or file.stem or name
 
 
 def _choices(folder: Path) -> dict[str, Any]:

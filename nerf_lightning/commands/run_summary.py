@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.commands.plain_yaml import read_plain_yaml
 from nerf_lightning.data.json_files import read_json
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import read_plain_yaml
 
 LARGEST = 1e30
 

@@ -31,28 +31,28 @@ Group = list[RunResult]
 
 
 def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
-    """Return what is to be said of how the results were measured.
+    """Return what is to be said of how the results were measured, a line for each difference.
 
     Raises:
         InputError: not all in the same way, and not `force`.
     """
     first_of: dict[str, RunResult] = {}
+    pairs: dict[str, str] = {}
+    # A result without LPIPS agrees with all backbones: what is compared with is one that has a backbone.
+    results = sorted(results, key=lambda result: result.protocol.get("lpips") is None)
     for result in results:
         first = first_of.setdefault(result.scene, result)
-        apart = differences(first.protocol, result.protocol)
-        other = first
-        if not apart:
-            other = results[0]
-            apart = differences(other.protocol, result.protocol, same_scene=False)
-        if apart and not force:
-            raise InputError(
-                f"{other.folder} and {result.folder} were not measured alike ({'; '.join(apart)}), so their numbers do "
-                "not belong into one table. Leave one out (scenes=..., models=..., or fewer runs), measure both alike "
-                "with nerf eval and add measured=eval, or add force=true."
-            )
-        if apart:
-            return [f"Not all of these were measured alike: {other.folder} and {result.folder}: {'; '.join(apart)}."]
-    return []
+        for other, same_scene in ((first, True), (results[0], False)):
+            apart = differences(other.protocol, result.protocol, same_scene)
+            if apart and not force:
+                raise InputError(
+                    f"{other.folder} and {result.folder} were not measured alike ({'; '.join(apart)}), so their "
+                    "numbers do not belong into one table. Leave one out (scenes=..., models=..., or fewer runs), "
+                    "measure both alike with nerf eval and add measured=eval, or add force=true."
+                )
+            for difference in apart:
+                pairs.setdefault(difference, f"{other.folder} and {result.folder}")
+    return [f"Not all of these were measured alike: {pair}: {difference}." for difference, pair in pairs.items()]
 
 
 def noted_origins(results: Sequence[RunResult]) -> list[str]:
@@ -71,7 +71,7 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
     left_out = []
     for result in sorted(results, key=lambda result: (result.summary.started or "", str(result.folder)), reverse=True):
         key = (
-            *(result.scene, result.model, result.origin.get("config"), result.summary.steps),
+            *(result.scene, result.model, str(result.origin.get("config")), result.summary.steps),
             *sorted(result.settings.items()),
         )
         seeds = groups.setdefault(key, {})

@@ -113,20 +113,20 @@ def make_shots(
         scene = subject.scene
         moved = _in_frame_of(cameras, first, scene)
         held = replace(moved, c2w=moved.c2w[:1].expand_as(moved.c2w)) if hold_camera else moved
-        count = len(moved.c2w)
         clip = None
         if near is not None or crop is not None:
             box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
             clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
+        near_end, far_end = scene.near_and_far(held.c2w[:, :, 3])
         _check_outside(held, clip)
-        _check_near(scene, clip)
+        _check_near(scene, clip, far_end)
         shots.append(
             Shot(
                 subject=subject,
                 cameras=_bent(held, scene),
                 seen_from=moved if hold_camera else None,
-                near=scene.near.min().expand(count),
-                far=scene.far.max().expand(count),
+                near=near_end,
+                far=far_end,
                 clip=clip,
                 tile_points=tile_points,
             )
@@ -205,10 +205,10 @@ def _check_outside(cameras: Cameras, clip: Clip | None) -> None:
         )
 
 
-def _check_near(scene: SceneRecord, clip: Clip | None) -> None:
+def _check_near(scene: SceneRecord, clip: Clip | None, far_end: Float[Tensor, "frames"]) -> None:
     if clip is None or clip.near is None or scene.cameras.ndc is not None:
         return
-    far = float(scene.far.max())
+    far = float(far_end.max())
     if clip.near >= far:
         unit = unit_of(scene.to_user)
         raise InputError(

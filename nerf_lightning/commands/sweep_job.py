@@ -21,7 +21,7 @@ from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.commands.suggestions import paragraph
 from nerf_lightning.conf_folder import conf_folder
-from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.export.json_file import write_json
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,7 @@ class JobRecord:
 
     def write(self, sweep_folder: Path) -> None:
         """Leave the record for the sweep's own process."""
-        with whole_file(records_folder(sweep_folder) / f"{self.number}.json") as part:
-            part.write_text(json.dumps(asdict(self), indent=2) + "\n")
+        write_json(records_folder(sweep_folder) / f"{self.number}.json", asdict(self))
 
 
 def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import yaml
 
-from nerf_lightning.commands.plain_yaml import CURE, read_plain_yaml
 from nerf_lightning.errors import InputError
+from nerf_lightning.plain_yaml import CURE, read_plain_yaml
 
 JOB_NUMBER = "${hydra.job.num}"
 MADE = ("hydra.mode=", "hydra.sweep.dir=", "sweep.", f"hydra.sweep.subdir='{JOB_NUMBER}")

@@ -41,7 +41,8 @@ def print_rows(rows: list[Row], title: str) -> None:
 def write_rows(rows: list[Row], folder: Path, name: str, notes: tuple[str, ...] = ()) -> None:
     """Write `NAME.csv` with all digits, and `NAME.md` with the notes below."""
     columns = list(rows[0])
-    with whole_file(folder / f"{name}.csv") as part, part.open("w", newline="") as file:
+    # Texts from json may hold halves of letters, which UTF-8 has no bytes for.
+    with whole_file(folder / f"{name}.csv") as part, part.open("w", -1, "utf-8", "replace", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(map(_cell, columns))
         writer.writerows([_cell(value) for value in row.values()] for row in rows)

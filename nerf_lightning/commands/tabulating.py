@@ -49,8 +49,8 @@ def tabulate(config: DictConfig) -> int:
     if left_out:
         notes.append(f"Left out, since newer runs of the same settings and seed are there: {_names(left_out)}.")
     if gathered.unmeasured:
-        notes.append(f"Without {FILES[config.measured]}, and so without numbers: {listed(gathered.unmeasured, cap=5)}.")
-    folder = output_folder(config.paths.output_dir or _common(folders), Path())
+        notes.append(f"Without a PSNR in {FILES[config.measured]}: {listed(gathered.unmeasured, cap=5)}.")
+    folder = output_folder(config.paths.output_dir or str(folder_for(folders)), Path())
     write_rows(rows, folder, "table", tuple(notes))
     # A source is longer than a terminal has room for; the files have it.
     short = [
@@ -61,13 +61,27 @@ def tabulate(config: DictConfig) -> int:
     return len(rows)
 
 
+def folder_for(folders: Sequence[Path]) -> Path:
+    """Return where the table of these folders is written.
+
+    That is the one that holds the others, else the folder that they lie beside each other in; where there is none, or
+    it is the root of the disk, the working folder.
+    """
+    places = [Path(os.path.abspath(folder)) for folder in folders]
+    outermost = min(places, key=lambda place: len(place.parts))
+    if all(place.is_relative_to(outermost) for place in places):
+        return outermost
+    beside = outermost.parent
+    return beside if beside.name and all(place.parent == beside for place in places) else Path()
+
+
 def _gather(folders: list[Path], config: DictConfig) -> Gathered:
     read = {run: read_result(run, config.measured) for run in find_runs(folders)}
     measured = [result for result in read.values() if result is not None]
     if not measured:
         raise InputError(
-            f"None of the {len(read)} runs has {FILES[config.measured]}. A run is measured at its end, and by "
-            "nerf eval ckpt=RUN/checkpoints/last.ckpt (then with measured=eval)."
+            f"None of the {len(read)} runs has a PSNR in {FILES[config.measured]}. A run is measured at its end, and "
+            "by nerf eval ckpt=RUN/checkpoints/last.ckpt (then with measured=eval)."
         )
     chosen = [
         result for result in measured if _fits(result.scene, config.scenes) and _fits(result.model, config.models)
@@ -106,10 +120,6 @@ def _fits(name: str, patterns: object) -> bool:
 
 def _listed(value: object) -> list[object]:
     return list(OmegaConf.to_container(value)) if isinstance(value, ListConfig) else [value]  # type: ignore[arg-type]
-
-
-def _common(folders: list[Path]) -> str:
-    return os.path.commonpath([folder.absolute() for folder in folders])
 
 
 def _names(results: Sequence[RunResult]) -> str:

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
-from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
@@ -37,7 +37,8 @@ def view(config: DictConfig) -> None:
     record = checkpoint.scene
     background = known_background(config.background or record.background)
     scene = _scene(config, record) if config.photographs else None
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
+    # Made when somebody saves something: a checkpoint may lie where nothing can be written.
+    folder = chosen_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
     renderer = SlicedRenderer(model, record, background, settings.inference_tile_points, settings.inference)
     warm_up(renderer)
     studio = Studio(renderer)
@@ -71,9 +72,10 @@ def open_browser(address: str) -> None:
     if not opened:
         log.warning(
             "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
-            "ssh -L %s:127.0.0.1:%s THIS_MACHINE.",
+            "ssh -L %s:%s THIS_MACHINE.",
             address,
-            *2 * [address.rpartition(":")[2]],
+            address.rpartition(":")[2],
+            address.removeprefix("http://"),
         )
 
 

@@ -13,17 +13,21 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
+LEAST_MSE = 1e-10
+"""Errors below count as this one, a PSNR of 100 dB."""
 HIGHER_IS_BETTER = ("psnr", "ssim")
 """Of the others, which are errors, the lower is better."""
 
 
 def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
-    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; inf where mse is 0.
+    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; at most 100.
+
+    Equal pictures (a view of background alone) would have an infinite one, and no mean or file could hold it.
 
     >>> round(float(psnr(torch.tensor(0.01))), 3)
     20.0
     """
-    return -10.0 * torch.log10(mse)
+    return -10.0 * torch.log10(mse.clamp(min=LEAST_MSE))
 
 
 def masked_out(

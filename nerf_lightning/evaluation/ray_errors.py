@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning import ranks
+from nerf_lightning.evaluation.metrics import LEAST_MSE, psnr
 
 
 class RayErrors:
@@ -30,6 +31,6 @@ class RayErrors:
         mean = first / count
         standard_error = ((second / count - mean.square()).clamp(min=0) / (count - 1).clamp(min=1)).sqrt()
         return {
-            "val/psnr": float(-10.0 * torch.log10(mean)),
-            "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean),
+            "val/psnr": float(psnr(mean)),
+            "val/psnr_standard_error": float(10.0 / math.log(10.0) * standard_error / mean.clamp(min=LEAST_MSE)),
         }

@@ -15,6 +15,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
+        part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
         yield part
         os.replace(part, path)
     finally:

@@ -40,7 +40,8 @@ class MaskedLevel(GridLevel):
     ) -> DenseRendering:
         """Render rays; without a background they are open in front of black, as those of `PackedLevel` are."""
         state = self.sampler.start(rays, random)
-        occupied, edges = occupied_intervals(rays, state, self.sampler.lattice, self.sampler.grid)
+        lattice = self.sampler.lattice if random is not None else self.sampler.lattice_over(rays)
+        occupied, edges = occupied_intervals(rays, state, lattice, self.sampler.grid)
         samples = RaySamples(edges)
         along = samples.midpoints[..., None] * rays.directions[:, None]
         output = self.field(rays.origins[:, None] + along, rays.view_directions[:, None], random)

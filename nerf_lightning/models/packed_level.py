@@ -127,7 +127,7 @@ class PackedLevel(GridLevel):
         return FieldOutput(density=density, rgb=rgb)
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
-        state, lattice, grid = self.sampler.start(rays, None), self.sampler.lattice, self.sampler.grid
+        state, lattice, grid = self.sampler.start(rays, None), self.sampler.lattice_over(rays), self.sampler.grid
         rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
         light = torch.ones_like(rays.near)  # what no sample has absorbed yet
         alive = torch.arange(rays.near.shape[0], device=rays.near.device)

@@ -1,6 +1,7 @@
 """An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989)."""
 
 import logging
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,8 @@ log = logging.getLogger(__name__)
 CELLS_AT_ONCE = 1 << 18
 # Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
 CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
+# Devices on which a number may be read on the host between two kernels while rendering.
+HOSTS = ("cpu", "cuda")
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
 
@@ -186,6 +189,24 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             self._lattice = torch.tensor(edges)
         self._lattice = self._lattice.to(self.aabb.device)
         return self._lattice
+
+    def lattice_over(self, rays: RayBundle) -> Float[Tensor, "edges"]:
+        """Return the lattice for rendering from anywhere: from afar, or from close by.
+
+        It is `lattice` where that reaches; elsewhere it is shifted by whole intervals. On devices that compile for
+        fixed shapes (XLA) it is always `lattice`.
+        """
+        # Contracted scenes, whose intervals grow with the distance, have one near and far for all cameras.
+        if rays.near.device.type not in HOSTS or self.cone_angle or not rays.near.numel():
+            return self.lattice
+        near, far = self.range.tolist()
+        nearest, farthest = float(rays.near.min()), float(rays.far.max())
+        if near <= nearest and farthest <= far:
+            return self.lattice
+        step = self.step_size
+        first = max(math.floor((nearest - near) / step), math.ceil(-near / step))
+        number = torch.arange(first, math.ceil((farthest - near) / step) + 3, dtype=torch.float64)
+        return (near + step * number).float().to(rays.near.device)
 
     @torch.no_grad()
     def update(self, density_fn: DensityFn, step: int, key: int) -> None:

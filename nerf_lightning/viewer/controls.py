@@ -10,12 +10,13 @@ from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.pictures import save_png
 from nerf_lightning.geometry.clipping import CropBox
 from nerf_lightning.viewer.channels import CHANNELS
-from nerf_lightning.viewer.free_name import free_name
+from nerf_lightning.viewer.free_name import free_name, not_saved
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.recorded_path import RecordedPath
 from nerf_lightning.viewer.session import Session
 
 AXES = ("x", "y", "z")
+NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
 
 class Controls:
@@ -124,10 +125,12 @@ class Controls:
             said.content = self.path.save()
 
     def _add_crop(self) -> None:
-        if self.session.photographs.record.space == "ndc":
-            return
-        low, high = in_user_frame(self.session.photographs.record)
+        record = self.session.photographs.record
         with self.gui.add_folder("Crop box", expand_by_default=False):
+            if record.space == "ndc":
+                self.gui.add_markdown(NO_CROP)
+                return
+            low, high = in_user_frame(record)
             on = self.gui.add_checkbox("Show only what is in the box", False)
             sliders = [
                 self.gui.add_multi_slider(axis, a, b, (b - a) / 100, (a, b), min_range=(b - a) / 100)
@@ -136,8 +139,7 @@ class Controls:
 
         def update(_: Any) -> None:
             lower, upper = zip(*(slider.value for slider in sliders), strict=True)
-            to_user = self.session.photographs.record.to_user
-            self.session.crop = CropBox.from_user(lower, upper, to_user) if on.value else None
+            self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
             self.frusta.draw_box(self.session.crop)
             self.session.look()
 
@@ -149,9 +151,13 @@ class Controls:
         if not self._wants_snapshot or picture is None:
             return
         self._wants_snapshot = False
-        path = free_name(self.folder, "snapshot", ".png")
-        save_png(path, picture)
-        self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+        try:
+            path = free_name(self.folder, "snapshot", ".png")
+            save_png(path, picture)
+        except OSError as error:  # nothing that is clicked ends a training
+            self.session.client.add_notification("Snapshot", not_saved(error), color="red")
+        else:
+            self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
 
 
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:

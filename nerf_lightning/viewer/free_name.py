@@ -1,4 +1,4 @@
-"""Names for files that are written again and again."""
+"""Files that are written again and again: their names, and what is said where they cannot be written."""
 
 from pathlib import Path
 
@@ -9,3 +9,8 @@ def free_name(folder: Path, stem: str, suffix: str) -> Path:
     while (folder / f"{stem}_{number:03d}{suffix}").exists():
         number += 1
     return folder / f"{stem}_{number:03d}{suffix}"
+
+
+def not_saved(error: OSError) -> str:
+    """Return what to tell a person whose file could not be written."""
+    return f"It could not be saved: {error}. Make room, or start again with another paths.output_dir=DIR."

@@ -9,12 +9,8 @@ from torch import Tensor
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.geometry.cameras import focal_from_fov, pinhole_cameras, resized
 from nerf_lightning.geometry.clipping import CropBox
-from nerf_lightning.geometry.paths.base import frame_of
 from nerf_lightning.geometry.poses import rotation_from_quaternion
 from nerf_lightning.types.scene import Cameras
-
-# A viewer that stands closer than this share of the photographs' distance is cut no more off at the near plane.
-LEAST_NEAR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +54,6 @@ def camera_of(look: Look, record: SceneRecord, height: int) -> tuple[Cameras, Te
         return resized(cameras, *sizes), near, far
     width = max(2, round(height * look.width / look.height))
     cameras = pinhole_cameras(look.c2w[None], focal_from_fov(height, look.fov), width, height)
-    near, far = record.near.min(), record.far.max()
     if record.cameras.ndc is not None:
         cameras = replace(cameras, ndc=record.cameras.ndc[:1])
-    elif record.space == "bounded":
-        # Near and far go with the person, so that the box is neither cut off from close by nor lost from afar.
-        around = frame_of(record.cameras, record.aabb)
-        beyond = (look.c2w[:, 3] - around.center).norm() - around.radius
-        near, far = (near + beyond).clamp(min=LEAST_NEAR * around.radius), far + beyond.clamp(min=0.0)
-    return cameras, near[None], far[None]
+    return cameras, *record.near_and_far(look.c2w[None, :, 3])

@@ -71,8 +71,7 @@ class Page:
     @property
     def address(self) -> str:
         """Where a browser finds the page."""
-        host = self.server.get_host()
-        return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+        return address_of(self.server.get_host(), self.server.get_port())
 
     def close(self) -> None:
         """Stop listening; open pages say that the connection is lost."""
@@ -96,6 +95,16 @@ class Page:
         session = Session(client, self.studio, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
         Controls(session, self.folder)
+
+
+def address_of(host: str, port: int) -> str:
+    """Return where a browser on this machine finds what listens there.
+
+    >>> address_of("0.0.0.0", 80), address_of("::", 80), address_of("fd00::2", 80)
+    ('http://127.0.0.1:80', 'http://[::1]:80', 'http://[fd00::2]:80')
+    """
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 class _quietly:

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.geometry.paths.keyframes import Keyframe, Point, write_keyframes
-from nerf_lightning.viewer.free_name import free_name
+from nerf_lightning.viewer.free_name import free_name, not_saved
 from nerf_lightning.viewer.session import Session
 
 
@@ -54,9 +54,12 @@ class RecordedPath:
         """Write the yaml; return what to say."""
         if len(self.keyframes) < 2:
             return "A path needs two keyframes or more."
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path = free_name(self.folder, "camera_path", ".yaml")
-        write_keyframes(path, self.keyframes)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            path = free_name(self.folder, "camera_path", ".yaml")
+            write_keyframes(path, self.keyframes)
+        except OSError as error:
+            return not_saved(error)
         return f"Saved. To film it, add to nerf render: path=keyframes path.file={path}"
 
     def _count(self) -> str:

@@ -1,5 +1,6 @@
 """A capture that a command can read, a finished run on it, and ways to call `nerf`."""
 
+import csv
 import sys
 from dataclasses import dataclass
 
@@ -63,3 +64,16 @@ def finished_run(tmp_path_factory, capture):
     assert process.returncode == 0, output
     (folder / "output.txt").write_text(output)
     return folder
+
+
+@pytest.fixture
+def table(nerf, tmp_path):
+    """Call `nerf table` on tmp_path/runs; return what it printed and the rows of its CSV."""
+
+    def call(*arguments):
+        out = tmp_path / "out"
+        result = nerf("table", tmp_path / "runs", f"paths.output_dir={out}", *arguments)
+        written = out / "table.csv"
+        return result, list(csv.DictReader(written.read_text().splitlines())) if result.code == 0 else []
+
+    return call

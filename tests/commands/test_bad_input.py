@@ -145,7 +145,7 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),
         ("path=photographs path.views=[nobody,0]", "path.views: the capture has no photograph nobody"),
-        ("path=keyframes path.file=none.yaml", "The keyframe file none.yaml cannot be read"),
+        ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("evaluation.split=all", "evaluation.split=all does not fit"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),

@@ -95,11 +95,24 @@ def test_a_planted_override_is_not_repeated(run, line):
 
 
 @pytest.mark.parametrize(
-    "line", ["paths.output_dir=/x", "++paths.root_dir=/x", "resume=auto", "+init_from=/x.ckpt", "paths={root_dir:/x}"]
+    "line",
+    [
+        "paths.output_dir=/x",
+        "++paths.root_dir=/x",
+        "resume=auto",
+        "+init_from=/x.ckpt",
+        "paths={root_dir:/x}",
+        "viewer=on",
+        "viewer@callbacks=on",
+        "viewer.live_view.host=0.0.0.0",
+        "++viewer.live_view.port=80",
+        "viewer={live_view:{host:0.0.0.0}}",
+    ],
 )
 def test_what_belongs_to_one_start_is_left_out(run, line):
     write_overrides(run, line, "seed=1")
     assert former_overrides(run, []) == ["seed=1"]
+    assert to_give_again([line]) == []
 
 
 def test_what_the_user_types_again_is_the_users(run):

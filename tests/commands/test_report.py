@@ -104,6 +104,19 @@ def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
     assert "capture" in sections(text)
 
 
+def test_photographs_on_a_disk_that_fails_are_left_out(nerf, finished_run, tmp_path, monkeypatch):
+    from nerf_lightning.commands import reporting
+
+    def fail(*_):
+        raise OSError(5, "Input/output error", "photographs/IMG_7.jpg")
+
+    monkeypatch.setattr(reporting, "examine", fail)
+    result = nerf("report", finished_run, f"paths.output_dir={tmp_path}")
+    assert result.code == 0, result.err
+    assert "left out     The doctor: photographs/IMG_7.jpg: Input/output error" in result.out
+    assert "capture" in sections((tmp_path / "report.html").read_text())
+
+
 def test_a_bare_run_is_a_page_that_says_what_is_missing(nerf, tmp_path):
     run = leave_measured_run(tmp_path / "run", None)
     result = nerf("report", run)

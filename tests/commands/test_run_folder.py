@@ -11,7 +11,9 @@ from scenes import ball_scene
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerf_lightning.checkpoints import make_record
+from nerf_lightning.commands.protocol import config_hash
 from nerf_lightning.commands.run_folder import ResumePoint, open_run, write_config
+from nerf_lightning.commands.run_identity import settings_digest
 from nerf_lightning.errors import InputError
 
 
@@ -73,6 +75,18 @@ def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path
     with pytest.raises(InputError, match=r"already holds a run of this very config. Add resume=auto"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here"), 100, None)
     assert json.loads((tmp_path / "here/run.json").read_text()) == before
+
+
+def test_a_run_that_is_watched_is_the_same_run(tmp_path):
+    alone, watched = config(tmp_path), config(tmp_path, "viewer=on", "viewer.live_view.port=9000")
+    run = begin(alone)
+    run.release()
+    again = begin(config(tmp_path, "viewer=on", "resume=auto"))
+    assert again.path == run.path
+    again.release()
+    assert settings_digest(watched) == settings_digest(alone)
+    hashes = {config_hash(OmegaConf.to_container(each, resolve=True)) for each in (alone, watched)}
+    assert len(hashes) == 1
 
 
 def test_where_decoded_pictures_are_kept_does_not_make_another_run(tmp_path):

@@ -1,29 +1,12 @@
-"""`nerf table`: which runs it finds, what it puts together, what it refuses, and that texts stay texts."""
+"""`nerf table`: which runs it finds, what it puts together, what it refuses."""
 
 import csv
 import json
 import statistics
 
 import pytest
-from measured_runs import PROTOCOL, leave_measured_run
+from measured_runs import PROTOCOL, leave_measured_run, ours
 from running import said
-
-
-@pytest.fixture
-def table(nerf, tmp_path):
-    """Call `nerf table` on tmp_path/runs; return what it printed and the rows of its CSV."""
-
-    def call(*arguments):
-        out = tmp_path / "out"
-        result = nerf("table", tmp_path / "runs", f"paths.output_dir={out}", *arguments)
-        written = out / "table.csv"
-        return result, list(csv.DictReader(written.read_text().splitlines())) if result.code == 0 else []
-
-    return call
-
-
-def ours(rows):
-    return [row for row in rows if not row.get("source")]
 
 
 def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
@@ -55,6 +38,34 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
     assert "paths.output_dir" not in rows[0]
 
 
+def test_what_was_swept_within_model_or_scene_is_shown(table, tmp_path):
+    for resolution, space in ((32, "bounded"), (64, "bounded"), (64, "contracted")):
+        leave_measured_run(
+            tmp_path / "runs" / f"{resolution}_{space}",
+            overrides=(f"model.levels.fine.sampler.resolution={resolution}", f"scene.space={space}", "model=fast"),
+            origin={"config": f"{resolution} {space}"},
+        )
+    _, rows = table("published=false")
+    shown = {(row["model.levels.fine.sampler.resolution"], row["scene.space"]) for row in rows}
+    assert shown == {("32", "bounded"), ("64", "bounded"), ("64", "contracted")}
+
+
+BESIDE_THE_RESULT = (
+    *("model={}", "scene={}", "scene@scene={}", "resume={}", "path={}", "path.num_frames={}", "logger={}"),
+    *("logger.tensorboard.name={}", "~logger.tensorboard={}", "paths.output_dir={}", "sweep.resume={}"),
+    *("final.video={}", "evaluation.num_worst={}", "scene.root={}/lego", "scene.name={}", "scene.cache_dir={}"),
+)
+
+
+def test_where_things_lie_and_what_is_said_of_a_run_makes_no_row(table, tmp_path):
+    for seed in (0, 1):
+        overrides = tuple(override.format(seed) for override in BESIDE_THE_RESULT)
+        leave_measured_run(tmp_path / "runs" / str(seed), 30.0, seed, overrides)
+    _, (row,) = table("published=false")
+    assert row["seeds"] == "0 1"
+    assert not [column for column in row if "=" in column or "." in column]
+
+
 def test_published_numbers_stand_below_with_their_source(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a", 33.0)
     leave_measured_run(tmp_path / "runs" / "b", 20.0, protocol={"scene": "bricks"}, origin={"scene": "bricks"})
@@ -78,6 +89,18 @@ def test_a_scene_that_bears_its_formats_name_is_called_by_its_folder(table, tmp_
     assert len(rows) == 6
 
 
+@pytest.mark.parametrize(
+    ("place", "names"),
+    [("scene.root=data/room.{}", ["room.v2", "room.v3"]), ("scene.path='data/room.{}.npz'", ["room.v2", "room.v3"])],
+)
+def test_the_dots_of_a_folders_name_belong_to_it(table, tmp_path, place, names):
+    for version in ("v2", "v3"):
+        overrides = ("scene=blender", place.format(version))
+        leave_measured_run(tmp_path / "runs" / version, protocol={"scene": "blender"}, overrides=overrides)
+    _, rows = table("published=false")
+    assert [row["scene"] for row in rows] == names
+
+
 def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a")
     leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
@@ -90,11 +113,34 @@ def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
 
 
+def test_force_names_every_difference_once(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", protocol={"pixels": "8-bit"}, origin={"config": "b"})
+    leave_measured_run(tmp_path / "runs" / "c", protocol={"pixels": "8-bit", "background": "black"})
+    leave_measured_run(tmp_path / "runs" / "d", protocol={"scene": "chair", "split": "val"})
+    result, _ = table("force=true")
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert result.code == 0, result.err
+    notes = [line for line in text.splitlines() if "measured alike" in line]
+    assert [note.split(": ", 2)[2] for note in notes] == [
+        "pixels: float and 8-bit.",
+        "background: white and black.",
+        "split: test and val.",
+    ]
+    assert [note.count(f"/{run}") for note, run in zip(notes, "bcd", strict=True)] == [1, 1, 1]
+
+
 def test_scenes_that_were_measured_differently_are_refused_too(table, tmp_path):
     leave_measured_run(tmp_path / "runs" / "a")
     leave_measured_run(tmp_path / "runs" / "b", protocol={"scene": "chair", "background": "black", "split": "val"})
     said(table()[0], "split: test and val")
     assert "background" not in table()[0].err
+
+
+def test_another_backbone_of_lpips_is_refused_whatever_the_first_run_has(table, tmp_path):
+    for name, backbone in (("a", None), ("b", "alex, version 0.1"), ("c", "vgg, version 0.1")):
+        leave_measured_run(tmp_path / "runs" / name, protocol={"lpips": backbone}, origin={"config": name})
+    said(table()[0], "runs/b", "runs/c", "lpips: alex, version 0.1 and vgg, version 0.1")
 
 
 def test_what_was_measured_before_the_stamp_was_whole_is_refused(table, tmp_path):
@@ -156,51 +202,8 @@ def test_nothing_to_show_is_said(nerf, table, tmp_path):
     (tmp_path / "runs").mkdir()
     said(table()[0], "no run in")
     leave_measured_run(tmp_path / "runs" / "a", None)
-    said(table()[0], "None of the 1 runs has metrics.json")
+    said(table()[0], "None of the 1 runs has a PSNR in metrics.json")
     said(nerf("table"), "runs has no value")
-
-
-def test_texts_of_strangers_stay_texts(table, tmp_path):
-    names = ("=cmd|' /C calc'!A0", "<script>alert(1)</script>", "[/red]\x1b[2J| a\nb")
-    for number, name in enumerate(names):
-        leave_measured_run(tmp_path / "runs" / str(number), origin={"model": name, "config": name})
-    result, rows = table("published=false")
-    assert result.code == 0, result.err
-    assert "\x1b[2J" not in result.out
-    assert {row["model"][0] for row in rows} == {"'", "<", "["}
-    text = (tmp_path / "out" / "table.md").read_text()
-    assert "<script>" not in text
-    assert len(text.splitlines()) == 2 + len(names)
-
-
-DAMAGED = {
-    "not json": "{",
-    "a list": "[]",
-    "no numbers": '{"psnr": "30"}',
-    "a huge number": f'{{"psnr": 1{"0" * 400}}}',
-    "NaN": '{"psnr": NaN}',
-    "deep": "[" * 100 + "]" * 100,
-}
-
-
-@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
-def test_damaged_metrics_are_no_numbers(table, tmp_path, content):
-    leave_measured_run(tmp_path / "runs" / "a")
-    run = leave_measured_run(tmp_path / "runs" / "b")
-    (run / "metrics.json").write_text(content)
-    result, rows = table()
-    assert result.code == 0, result.err
-    assert len(ours(rows)) == 1
-    assert "runs/b" in " ".join(result.out.split())
-
-
-def test_damaged_parts_of_metrics_are_left_out(table, tmp_path):
-    run = leave_measured_run(tmp_path / "runs" / "a", started=7, finished_at_step=["x"], training_seconds={})
-    content = {"psnr": 20.0, "ssim": [], "protocol": 3, "origin": {"seed": [1], "parameters": "x", "model": {"a": 1}}}
-    (run / "metrics.json").write_text(json.dumps(content))
-    result, rows = table()
-    assert result.code == 0, result.err
-    assert rows[0]["PSNR"] == "20.0"
 
 
 @pytest.mark.slow

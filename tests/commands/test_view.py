@@ -9,10 +9,12 @@ from subprocess import Popen
 import numpy as np
 import pytest
 from browser import drag, opened, wait_until
+from planted import write_checkpoint
 from running import said, start
 from viser_client import ViserClient
 
-from nerf_lightning.commands import viewing
+from nerf_lightning.commands import view, viewing
+from nerf_lightning.errors import InputError
 from nerf_lightning.viewer import page as page_module
 
 
@@ -131,6 +133,56 @@ def test_a_missing_checkpoint_and_a_port_that_is_none_are_said(finished_run, ner
     arguments = [f"ckpt={checkpoint}", f"paths.output_dir={tmp_path}", "photographs=false"]
     said(nerf("view", *arguments, "port=0"), "port=0: give a number from 1 to 65535")
     said(nerf("view", *arguments, "host=192.0.2.1"), "host=192.0.2.1: this machine cannot listen there")
+
+
+@pytest.fixture
+def folder_of_page(monkeypatch):
+    """Where the page would write; it is not opened."""
+    folders = []
+
+    def opened(studio, photographs, folder, *where):
+        folders.append(folder)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewing, "Page", opened)
+    return folders
+
+
+def test_nothing_is_written_before_somebody_saves(nerf, tmp_path, folder_of_page):
+    """A file in the folder's place stands for all that cannot be written: root may write anywhere."""
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    checkpoint = write_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    (tmp_path / "run" / "viewer").write_text("")
+    assert nerf("view", f"ckpt={checkpoint}", "photographs=false").code == 130
+    assert folder_of_page == [tmp_path / "run" / "viewer"]
+    assert (tmp_path / "run" / "viewer").read_text() == ""
+
+
+def test_a_link_beside_a_checkpoint_is_refused_before_the_page_opens(nerf, tmp_path, folder_of_page):
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    checkpoint = write_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    (tmp_path / "run" / "viewer").symlink_to(tmp_path)
+    said(nerf("view", f"ckpt={checkpoint}", "photographs=false"), "is a symbolic link to")
+    assert folder_of_page == []
+
+
+@pytest.fixture
+def of_unknown_scene(tmp_path):
+    return write_checkpoint(tmp_path / "x.ckpt", lambda content: content["nerf_lightning"]["choices"].update(scene="x"))
+
+
+def test_why_there_are_no_photographs_is_said(of_unknown_scene, caplog):
+    given = [f"ckpt={of_unknown_scene}", "port=9000"]
+    assert view.prepare(given) == ["photographs=false", *given]
+    assert "shown without their photographs" in caplog.text
+    assert "was trained on the scene 'x', which conf/scene/ lacks. Name the scene: add scene=" in caplog.text
+
+
+def test_photographs_that_nobody_knows_are_not_guessed(of_unknown_scene, caplog):
+    with pytest.raises(InputError, match="was trained on the scene 'x'"):
+        view.prepare([f"ckpt={of_unknown_scene}", "photographs=true"])
+    assert view.prepare([f"ckpt={of_unknown_scene}", "photographs=false"])[0] == "photographs=false"
+    assert not caplog.text
 
 
 def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):

@@ -1,11 +1,12 @@
 """Keyframe files and the curves through them."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
-from test_chosen_paths import MIDDLE, frame, keyframe_file, keys
+from test_chosen_paths import MIDDLE, UP, frame, keyframe_file, keys
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import project
@@ -34,6 +35,8 @@ def test_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
 
 
 GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
+# Each line has twice the keys of the one before, and all of them are walked through while the file is read.
+MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n}, *a{n}]}}\n" for n in range(35))
 
 
 @pytest.mark.parametrize(
@@ -41,7 +44,7 @@ GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
     [
         ("", "has no list of keyframes"),
         ("keyframes: 3", "has no list of keyframes"),
-        ("keyframes: [", "is not usable yaml"),
+        ("keyframes: [", "is not readable yaml"),
         (f"- {GOOD}", r"has 1 keyframe\(s\), and a path needs two"),
         (f"- {GOOD}\n- 7", "keyframe 2 is 7, but must name a position"),
         (f"- {GOOD}\n- {{position: [1, 0]}}", "keyframe 2: position is .1, 0., but must be three finite numbers"),
@@ -55,11 +58,21 @@ GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
         (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "keyframe 2: position is"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}", "is not usable yaml"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}", "is not usable yaml"),
-        ("[" * 5000, "is not usable yaml"),
-        ("- &a [x, x]\n" + "".join(f"- &{n} [{', '.join(9 * [f'*{m}'])}]\n" for m, n in pairwise("abcdefghijk")), "is"),
-        ("- !!python/object/apply:os.system [ls]", "is not usable yaml"),
+        (
+            f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}",
+            "holds a number that cannot be read",
+        ),
+        (
+            f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}",
+            "holds a value that cannot be read",
+        ),
+        ("[" * 5000, "it nests more than 50 deep"),
+        (
+            "- &a [x, x]\n" + "".join(f"- &{n} [{', '.join(9 * [f'*{m}'])}]\n" for m, n in pairwise("abcdefghijk")),
+            "holds",
+        ),
+        (MERGE_BOMB, r"it holds references \(\*name\)"),
+        ("- !!python/object/apply:os.system [ls]", "is not readable yaml"),
     ],
 )
 def test_a_bad_file_is_named(tmp_path, text, words):
@@ -95,6 +108,45 @@ def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
     ahead = -cameras.c2w[10, :, 2]
     torch.testing.assert_close(ahead, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     assert len(KeyframePath(file, num_frames=7).cameras(frame()).c2w) == 7
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("closed", [False, True])
+def test_seconds_count_from_any_beginning(tmp_path, dtype, closed):
+    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
+    around = replace(frame(), center=MIDDLE.to(dtype), up=UP.to(dtype), poses=frame().poses.to(dtype))
+
+    def cameras(beginning):
+        keyframes = (
+            Keyframe(place, look_at=(1.0, 2.0, 3.0), fov=40.0, time=beginning + second)
+            for place, second in zip(places, (0.0, 2.0, 2.25), strict=True)
+        )
+        return KeyframePath(keyframe_file(tmp_path, *keyframes), closed=closed, fps=8).cameras(around)
+
+    plain, late = cameras(0.0), cameras(1.7e9)
+    assert len(plain.c2w) == (27 if closed else 19)
+    assert plain.c2w.dtype == plain.focal.dtype == dtype
+    assert torch.equal(late.c2w, plain.c2w)
+    assert torch.equal(late.focal, plain.focal)
+
+
+def test_keys_close_together_on_a_long_path_are_passed(tmp_path):
+    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
+    file = keyframe_file(
+        tmp_path,
+        *(Keyframe(p, look_at=(1.0, 2.0, 3.0), time=t) for p, t in zip(places, (0.0, 1e9, 1e9 + 1), strict=True)),
+    )
+    around = replace(frame(), center=MIDDLE.float(), up=UP.float(), poses=frame().poses.float())
+    cameras = KeyframePath(file, num_frames=3).cameras(around)
+    torch.testing.assert_close(cameras.c2w[[0, 2], :, 3], torch.tensor(places)[[0, 2]])
+
+
+def test_times_that_are_no_seconds_make_no_endless_film(tmp_path):
+    keyframes = (Keyframe((x, 0.0, 5.0), look_at=(1.0, 2.0, 3.0), time=1000 * 3600 * x) for x in (0.0, 1.0))
+    file = keyframe_file(tmp_path, *keyframes)
+    with pytest.raises(InputError, match=r"3\.6e\+06 seconds, which makes 108,000,001 frames at path.fps=30"):
+        KeyframePath(file)
+    assert len(KeyframePath(file, num_frames=5).cameras(frame()).c2w) == 5
 
 
 def test_what_all_keyframes_look_at_stays_in_the_middle(tmp_path):

@@ -5,6 +5,7 @@ import torch
 from scenes import ball_scene, some_rays, tiny_field
 
 from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.masked_level import MaskedLevel
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.randomness import batch_random
@@ -45,6 +46,26 @@ def test_rendering_in_rounds_equals_rendering_at_once():
         rounds = level(rays, background, [], None)
     for name in ("rgb", "foreground", "opacity", "depth"):
         torch.testing.assert_close(getattr(rounds, name), getattr(whole, name).detach(), atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("level", [PackedLevel, MaskedLevel])
+@pytest.mark.parametrize("distance", [2.5, 3.0, 8.0, 800.0])
+def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
+    """Rays that lie on the same lines, of photographs 4 units away and of a camera elsewhere, see the same."""
+    packed = a_level(resolution=8, num_steps=200, opaque_below=0.0)
+    level = packed if level is PackedLevel else MaskedLevel(packed.sampler, packed.field)
+    rays = some_rays(60)
+    moved = distance - 4.0
+    elsewhere = replace(
+        rays, origins=rays.origins - moved * rays.directions,
+        near=(rays.near + moved).clamp(min=0.01), far=rays.far + moved,
+    )  # fmt: skip
+    background = torch.zeros(60, 3)
+    with torch.no_grad():
+        here, there = level(rays, background, [], None), level(elsewhere, background, [], None)
+    assert float(here.opacity.max()) > 0.5
+    torch.testing.assert_close(there.opacity, here.opacity, atol=0.03, rtol=0)
+    torch.testing.assert_close(there.depth - moved, here.depth, atol=0.05, rtol=0)
 
 
 def test_tiles_change_nothing_but_rounding():

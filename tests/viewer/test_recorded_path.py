@@ -67,6 +67,14 @@ def test_a_recorded_path_is_read_back_in_the_models_frame(session, record, tmp_p
     assert frames[0].fov == pytest.approx(np.degrees(0.7), abs=1e-3)  # square photographs
 
 
+def test_a_place_that_cannot_be_written_is_said(session, tmp_path):
+    (tmp_path / "file").write_text("")
+    path = RecordedPath(session, tmp_path / "file", lambda *_: None)
+    path.add(1.0)
+    path.add(1.0)
+    assert "It could not be saved: [Errno 17] File exists" in path.save()
+
+
 def test_files_are_never_overwritten(session, tmp_path):
     path = RecordedPath(session, tmp_path, lambda *_: None)
     path.add(1.0)

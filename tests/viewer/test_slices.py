@@ -1,13 +1,16 @@
 """Views in slices are the same views; crops and photographs' cameras are kept."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
 from scenes import ball_scene, tiny_model
+from static_models import fast_model
 
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.geometry.clipping import CropBox
+from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.viewer import slices
 from nerf_lightning.viewer.look import Look, camera_of, pose_of
@@ -22,6 +25,14 @@ def scene():
 @pytest.fixture
 def renderer(scene):
     return SlicedRenderer(tiny_model().eval(), scene_record(scene), "white", 4096, nullcontext)
+
+
+@pytest.fixture
+def behind_grid(scene):
+    """A model that asks its field only in occupied cells: those in which the photographs' alpha leaves something."""
+    model = fast_model(PackedLevel).eval()
+    model.place(scene)
+    return SlicedRenderer(model, scene_record(scene), "white", 4096, nullcontext)
 
 
 def finished(generator):
@@ -72,10 +83,11 @@ def test_the_near_plane_goes_with_somebody_who_comes_closer(scene):
     c2w = scene.cameras.c2w[0].clone()
     _, near, far = camera_of(Look(c2w, 0.6, 8, 8), record, 8)
     c2w[:, 3] *= 0.5
-    _, nearer, same_far = camera_of(Look(c2w, 0.6, 8, 8), record, 8)
+    _, nearer, less_far = camera_of(Look(c2w, 0.6, 8, 8), record, 8)
     assert float(near) == pytest.approx(2.0, abs=1e-4)
     assert 0 < float(nearer) < 0.1
-    assert float(far) == pytest.approx(float(same_far), abs=1e-4)
+    walked = float(c2w[:, 3].norm())
+    assert float(far) - float(less_far) == pytest.approx(walked, abs=1e-4)
 
 
 def test_a_tall_photograph_fits_into_a_wide_window(scene):
@@ -100,3 +112,28 @@ def test_the_speed_that_was_seen_decides_the_size_while_moving(scene, renderer):
     assert renderer.height_while_moving(look) == 94  # 12,000 rays, 4 to 3
     renderer.rays_per_second = 10.0
     assert renderer.height_while_moving(look) == slices.LEAST_HEIGHT
+
+
+def test_behind_an_occupancy_grid_slices_are_the_whole_picture(scene, behind_grid):
+    behind_grid.rays_per_second = 64 / slices.SLICE_SECONDS
+    view, count = finished(behind_grid.slices(Look(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1), 16))
+    whole = render_picture(behind_grid.model, scene.cameras, 1, scene.near, scene.far, "white", 4096)
+    assert count >= 2
+    assert torch.allclose(view.rgb, whole.rgb, atol=2e-3)  # a ray may end when its light is below 1e-3
+    assert torch.allclose(view.opacity, whole.opacity, atol=2e-3)
+    assert float(view.opacity[8, 8]) > 0.1
+    assert float(view.opacity[0].max()) == 0.0  # empty cells
+
+
+def test_behind_an_occupancy_grid_a_crop_box_only_takes_away(scene, behind_grid):
+    look = Look(scene.cameras.c2w[0], 0.6, 32, 32)
+    whole, _ = finished(behind_grid.slices(look, 32))
+    all_of_it = CropBox.from_user((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), torch.eye(4))
+    uncut, _ = finished(behind_grid.slices(replace(look, crop=all_of_it), 32))
+    assert torch.allclose(uncut.rgb, whole.rgb, atol=2e-3)
+    upper = CropBox.from_user((-1.0, -1.0, 0.0), (1.0, 1.0, 1.0), torch.eye(4))
+    half, _ = finished(behind_grid.slices(replace(look, crop=upper), 32))
+    assert bool((half.opacity <= whole.opacity + 2e-3).all())
+    assert torch.equal(half.rgb[-8:], torch.ones(8, 32, 3))
+    assert float(whole.opacity[-10].max()) > 0.1
+    assert float(half.opacity[10].max()) > 0.1

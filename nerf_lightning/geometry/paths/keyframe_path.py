@@ -20,6 +20,8 @@ from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types.scene import Cameras
 
 FRAMES_WITHOUT_TIMES = 120
+MOST_FRAMES = 100_000
+"""An hour at 24 frames per second is less."""
 
 
 @final
@@ -55,42 +57,52 @@ class KeyframePath(CameraPath):
         super().__init__(1 if num_frames is None else num_frames, width=width, height=height, fov=fov, fps=fps)
         self.asked_frames, self.closed = num_frames, closed
         self.keyframes = read_keyframes(Path(file).expanduser())
+        self.times = _times(self.keyframes, closed)
+        if num_frames is None:
+            self._check_length(file)
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras between the keyframes."""
-        keys = _poses(self.keyframes, around)
+        keys = _poses(self.keyframes, around).double()  # times may lie close together for a long path
         knots = self._knots(keys, around)
-        at = frame_times(knots, self._count(knots), self.closed)
+        at = frame_times(knots, self._count(), self.closed)
         c2w = poses_along(knots, keys, at)
         targets = [around.point("file", each.look_at) for each in self.keyframes]
         if all(target is not None for target in targets):
-            held = along(knots, torch.stack([target for target in targets if target is not None]), at)
+            held = along(knots, torch.stack([target for target in targets if target is not None]).double(), at)
             eyes = c2w[:, :, 3]
             back = normalize(eyes - held, dim=-1)
             right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
             c2w = torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
-        cameras = self.pinholes(c2w, around)
+        cameras = self.pinholes(c2w.to(around.center), around)
         return cameras if self.fov is not None else self._zoomed(cameras, knots, at, around)
 
     def _knots(self, keys: Tensor, around: PathFrame) -> Float[Tensor, "knots"]:
-        times = [each.time for each in self.keyframes if each.time is not None]
-        if not times:
+        if not self.times:
             return even_speed(keys, around.radius, self.closed)
-        back = [times[-1] + (times[-1] - times[0]) / (len(times) - 1)] if self.closed else []
-        return torch.tensor(times + back, dtype=keys.dtype)
+        return torch.tensor(self.times, dtype=keys.dtype)
 
-    def _count(self, knots: Float[Tensor, "knots"]) -> int:
+    def _count(self) -> int:
         if self.asked_frames is not None:
             return self.asked_frames
-        if self.keyframes[0].time is None:
+        if not self.times:
             return FRAMES_WITHOUT_TIMES
-        return max(1, round(float(knots[-1] - knots[0]) * self.fps) + (not self.closed))
+        return max(1, round(self.times[-1] * self.fps) + (not self.closed))
+
+    def _check_length(self, file: str) -> None:
+        if self._count() > MOST_FRAMES:
+            raise InputError(
+                f"{file}: the times of its keyframes last {self.times[-1]:,.6g} seconds, which makes {self._count():,} "
+                f"frames at path.fps={self.fps}; more than {MOST_FRAMES:,} are not taken from times. Give them in "
+                "seconds, or the number of frames with path.num_frames."
+            )
 
     def _zoomed(self, cameras: Cameras, knots: Tensor, at: Tensor, around: PathFrame) -> Cameras:
         """Return the cameras with the keyframes' focal lengths, between them even in ratio."""
         logs = torch.tensor([[math.log(_focal(each, around))] for each in self.keyframes], dtype=knots.dtype)
         scale = cameras.width[0] / around.width
-        return replace(cameras, focal=(scale * along(knots, logs, at).exp()).expand(-1, 2).contiguous())
+        focal = (scale * along(knots, logs, at).exp()).expand(-1, 2).to(cameras.focal)
+        return replace(cameras, focal=focal.contiguous())
 
 
 def _poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "keys 3 4"]:
@@ -107,6 +119,13 @@ def _poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "k
             )
         poses.append(pose)
     return torch.stack(poses)
+
+
+def _times(keyframes: Sequence[Keyframe], closed: bool) -> list[float]:
+    """Return when each keyframe is passed, and at the end when the first one is again, in seconds from the first."""
+    given = [each.time for each in keyframes if each.time is not None]
+    times = [time - given[0] for time in given]
+    return [*times, times[-1] + times[-1] / (len(times) - 1)] if closed and times else times
 
 
 def _focal(keyframe: Keyframe, around: PathFrame) -> float:

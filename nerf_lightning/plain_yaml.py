@@ -1,7 +1,7 @@
 """Yaml from strangers: plain values, without references, of bounded size.
 
 `yaml.safe_load` makes no objects, but twelve lines of anchors and aliases become a billion entries as soon as somebody
-walks through them. No config that this program writes has any.
+walks through them, and merge keys (`<<`) do so while the file is read. No file that this program writes has any.
 """
 
 from pathlib import Path
@@ -14,6 +14,7 @@ from nerf_lightning.errors import InputError
 MOST_CHARACTERS = 1 << 20
 """A hundred times what a run's config takes."""
 MOST_DEPTH = 50
+CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -32,27 +33,28 @@ class _PlainLoader(yaml.SafeLoader):
         return node
 
 
-def plain_yaml(text: str, where: str) -> Any:
+def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
     """Return what a yaml text holds.
 
     Args:
         text: from a file that anybody may have written.
         where: file and place, for the message.
+        cure: what to do about a bad one, for the message.
 
     Raises:
         InputError: it is no yaml, too long, or holds references.
     """
     if len(text) > MOST_CHARACTERS:
-        raise InputError(f"{where} has {len(text):,} characters of yaml, more than any config of this program. {CURE}")
+        raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except yaml.YAMLError as error:
-        raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {CURE}") from error
+        raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {cure}") from error
     except Exception as error:  # a date of the 99th month, a number of no digits: PyYAML lets many kinds through
-        raise InputError(f"{where} holds a value that cannot be read ({type(error).__name__}). {CURE}") from error
+        raise InputError(f"{where} holds a value that cannot be read ({type(error).__name__}). {cure}") from error
 
 
-def read_plain_yaml(path: Path) -> Any:
+def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     """Return what a yaml file holds.
 
     Raises:
@@ -61,13 +63,10 @@ def read_plain_yaml(path: Path) -> Any:
     try:
         size = path.stat().st_size
         if size > 4 * MOST_CHARACTERS:
-            raise InputError(f"{path} has {size:,} bytes, more than any config of this program. {CURE}")
+            raise InputError(f"{path} has {size:,} bytes, more than any file of this program. {cure}")
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. {CURE}") from error
+        raise InputError(f"{path} cannot be read: {error.strerror}. {cure}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {CURE}") from error
-    return plain_yaml(text, str(path))
-
-
-CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
+        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
+    return plain_yaml(text, str(path), cure)
