@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -16,32 +16,20 @@ from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.ray_errors import RayErrors
 from nerf_lightning.losses.base import Loss
+from nerf_lightning.models.gradients import Share, add_gradients
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.optimizers.step_guard import StepGuard, first_not_finite
 from nerf_lightning.randomness import batch_random, fold
 from nerf_lightning.rendering.blending import background_colors, blend
 from nerf_lightning.schedules.base import Schedule
-from nerf_lightning.types.rays import Batch, RayBundle
-from nerf_lightning.types.renderings import Rendering
+from nerf_lightning.types.rays import Batch
 from nerf_lightning.types.scene import Background
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Share:
-    """A process's part of a step's batch."""
-
-    first: int
-    """Its first ray's slot in the batch."""
-    num_rays: int
-    """Rays of the whole batch."""
-    weight: Tensor
-    """Sum of the weights of the whole batch."""
 
 
 class RadianceFieldSystem(LightningModule):
@@ -147,7 +135,7 @@ class RadianceFieldSystem(LightningModule):
             progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
 
     def accumulate_gradients(
-        self, batch: Batch, backward: Callable[[Tensor], None], share: "Share | None" = None
+        self, batch: Batch, backward: Callable[[Tensor], None], share: Share | None = None
     ) -> dict[str, Tensor]:
         """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
 
@@ -173,25 +161,12 @@ class RadianceFieldSystem(LightningModule):
             for count, before in zip(self.model.counts(), counts, strict=True):
                 count.copy_(before)
 
-    def _accumulate(self, batch: Batch, backward: Callable[[Tensor], None], share: "Share") -> dict[str, Tensor]:
+    def _accumulate(self, batch: Batch, backward: Callable[[Tensor], None], share: Share) -> dict[str, Tensor]:
         num_rays = batch.rays.near.numel()
         key = fold(self.seed, self.progress.attempt, self.progress.step)
         random = batch_random(key, num_rays, self.device, share.first)
-        background = background_colors(self.background, num_rays, self.device, random)
-        target = blend(batch.rgba, background)
-        # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
-        weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
-        losses, foreground = [], []
-        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
-            behind = None if background is None else background[tile]
-            renderings = self.model(batch.rays[tile], behind, random[tile])
-            loss = self.loss(renderings, target[tile], weight[tile])
-            part = torch.stack(loss) * (target[tile].shape[0] / share.num_rays)
-            backward(part.sum())
-            losses.append(part.detach())
-            foreground.append(renderings[-1].foreground.detach())
-        seen = {"foreground": torch.cat(foreground), "target": target, "weight": batch.weight}
-        return {"losses": torch.stack(losses).sum(0)} | seen
+        tile_rays = self._tile_rays(num_rays, training=True)
+        return add_gradients(self.model, self.loss, backward, batch, share, random, self.background, tile_rays)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.rays.near.numel(), training=True) == 1:
@@ -235,7 +210,8 @@ class RadianceFieldSystem(LightningModule):
         background = background_colors(self.background, batch.rays.near.numel(), self.device, None)
         target = blend(batch.rgba, background)
         for tile in tiles(target.shape[0], self._tile_rays(target.shape[0])):
-            rendering = self._render(batch.rays[tile], None if background is None else background[tile])
+            behind = None if background is None else background[tile]
+            rendering = self.model(batch.rays[tile], behind, random=None)[-1]
             self.val_errors.add(rendering.rgb, target[tile], batch.weight[tile])
 
     def on_validation_epoch_end(self) -> None:
@@ -268,9 +244,6 @@ class RadianceFieldSystem(LightningModule):
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)
-
-    def _render(self, rays: RayBundle, background: Tensor | None) -> Rendering:
-        return self.model(rays, background, random=None)[-1]
 
     def _update(self, optimizer: Any) -> None:
         self.gradient_norms = self.model.gradient_norms() if self.measures_gradients else {}

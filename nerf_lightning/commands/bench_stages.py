@@ -9,7 +9,7 @@ from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.kernels.march import march
 from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.samplers.occupancy import positions_of
+from nerf_lightning.rendering.packed import positions_of
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.rays import Batch
 

@@ -10,8 +10,8 @@ from nerf_lightning.fields.base import Field
 from nerf_lightning.kernels.march import march
 from nerf_lightning.models.grid_level import GridLevel
 from nerf_lightning.randomness import RayRandom
-from nerf_lightning.rendering.packed import composite_packed
-from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
+from nerf_lightning.rendering.packed import composite_packed, positions_of
+from nerf_lightning.samplers.occupancy import OccupancySampler
 from nerf_lightning.types.rays import PackedSamples, RayBundle
 from nerf_lightning.types.renderings import FieldOutput, PackedRendering, Rendering
 

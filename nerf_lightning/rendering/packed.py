@@ -1,6 +1,7 @@
 """Volume rendering of packed samples: the quadrature of `rendering.quadrature`, in the other layout."""
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels.packed import integrate
@@ -32,3 +33,15 @@ def composite_packed(
         weights=weights,
         samples=samples,
     )
+
+
+def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:
+    """Return the samples' midpoints in space."""
+    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
+    return rays.origins[samples.ray_index] + along
+
+
+def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
+    """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
+    kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]
+    return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
@@ -17,6 +17,7 @@ from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march
 from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
+from nerf_lightning.rendering.packed import first_of_each_ray, positions_of
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.types.rays import PackedSamples, RayBundle
@@ -250,15 +251,3 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         self._fit_to_space()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._lattice = self._numbers = None
-
-
-def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:
-    """Return the samples' midpoints in space."""
-    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
-    return rays.origins[samples.ray_index] + along
-
-
-def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
-    """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
-    kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]
-    return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -6,7 +6,8 @@ from scenes import ball_scene, some_rays
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.randomness import batch_random, fold
-from nerf_lightning.samplers.occupancy import OccupancySampler, positions_of
+from nerf_lightning.rendering.packed import positions_of
+from nerf_lightning.samplers.occupancy import OccupancySampler
 
 
 def a_sampler(scene=None, **settings):
