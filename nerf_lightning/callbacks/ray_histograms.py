@@ -11,9 +11,8 @@ from nerf_lightning.callbacks.validation_view import WHOLE_BATCH_POINTS
 from nerf_lightning.callbacks.watcher import Watcher
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.errors import require_positive
-from nerf_lightning.models.tiles import tile_rays_for, tiles
-from nerf_lightning.randomness import batch_random, fold
-from nerf_lightning.rendering.blending import background_colors
+from nerf_lightning.models.weighted_renderings import weighted_renderings
+from nerf_lightning.randomness import fold
 from nerf_lightning.rendering.ray_statistics import effective_samples, weight_along
 from nerf_lightning.types.rays import Batch, RayBundle
 
@@ -58,22 +57,16 @@ def look_along(
     system: Any, rays: RayBundle, step: int, endless: bool
 ) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
     """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
-    model, num_rays = system.model, rays.near.numel()
-    tile = tile_rays_for(model, system.tile_points or WHOLE_BATCH_POINTS, training=True)
-    # With random numbers a level that leaves out what is empty takes the way of training, and keeps its weights.
-    random = batch_random(fold(system.seed, step, "histograms"), num_rays, rays.near.device)
-    counts = [count.clone() for count in model.counts()]
-    seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in model.level_names}
-    behind = background_colors(system.background, num_rays, rays.near.device, random)
+    names, num_rays = system.model.level_names, rays.near.numel()
+    key = fold(system.seed, step, "histograms")
+    tile_points = system.tile_points or WHOLE_BATCH_POINTS
+    seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in names}
     system.eval()
-    for part in tiles(num_rays, tile):
-        renderings = model(rays[part], None if behind is None else behind[part], random[part])
-        for name, rendering in zip(model.level_names, renderings, strict=True):
-            along = weight_along(rendering, rays[part], PARTS, endless) * rays[part].near.numel() / num_rays
-            seen[name].append((along.cpu(), effective_samples(rendering, rays[part]).cpu()))
+    for part, renderings in weighted_renderings(system.model, rays, system.background, key, tile_points):
+        for name, rendering in zip(names, renderings, strict=True):
+            along = weight_along(rendering, part, PARTS, endless) * part.near.numel() / num_rays
+            seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))
     system.train()
-    for count, before in zip(model.counts(), counts, strict=True):
-        count.copy_(before)
     return {
         name: (torch.stack([along for along, _ in parts]).sum(0), torch.cat([samples for _, samples in parts]))
         for name, parts in seen.items()

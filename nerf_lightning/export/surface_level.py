@@ -9,9 +9,8 @@ from torch import Tensor
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.tiles import tile_rays_for, tiles
-from nerf_lightning.randomness import batch_random, fold
-from nerf_lightning.rendering.blending import background_colors
+from nerf_lightning.models.weighted_renderings import weighted_renderings
+from nerf_lightning.randomness import fold
 from nerf_lightning.rendering.ray_statistics import median_distances
 from nerf_lightning.types.rays import PixelIndex, RayBundle
 
@@ -58,12 +57,7 @@ def _some_rays(record: SceneRecord) -> RayBundle:
 def _surface_points(
     model: RadianceModel, rays: RayBundle, record: SceneRecord, tile_points: int
 ) -> Iterator[Float[Tensor, "points 3"]]:
-    device = next(model.parameters()).device
-    rays = rays.to(device)
-    # With random numbers, as in training: then every kind of level keeps its weights.
-    random = batch_random(fold(0, "surface"), rays.near.numel(), device)
-    behind = background_colors(record.background, rays.near.numel(), device, random)
-    for part in tiles(rays.near.numel(), tile_rays_for(model, tile_points, training=True)):
-        rendering = model(rays[part], None if behind is None else behind[part], random[part])[-1]
-        at = rays[part].origins + median_distances(rendering, rays[part])[:, None] * rays[part].directions
-        yield at[rendering.opacity > OPAQUE].cpu()
+    rays, key = rays.to(next(model.parameters()).device), fold(0, "surface")
+    for part, renderings in weighted_renderings(model, rays, record.background, key, tile_points):
+        at = part.origins + median_distances(renderings[-1], part)[:, None] * part.directions
+        yield at[renderings[-1].opacity > OPAQUE].cpu()

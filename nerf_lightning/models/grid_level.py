@@ -6,7 +6,6 @@ from torch import Tensor
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import AnyLevel
 from nerf_lightning.samplers.occupancy import OccupancySampler
-from nerf_lightning.types.scene import Scene
 
 
 class GridLevel(AnyLevel):
@@ -15,14 +14,7 @@ class GridLevel(AnyLevel):
     sampler: OccupancySampler
 
     def __init__(self, sampler: OccupancySampler, field: Field):
-        super().__init__()
-        self.sampler = sampler
-        self.field = field
-
-    def place(self, scene: Scene) -> None:
-        """Hand the scene's box to the field, and all of it to the sampler."""
-        super().place(scene)
-        self.sampler.place(scene)
+        super().__init__(sampler, field)
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density in the cells where rays look for it."""

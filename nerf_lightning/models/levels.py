@@ -10,7 +10,7 @@ from torch.nn.utils import get_total_norm
 from nerf_lightning.fields.base import Field
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
-from nerf_lightning.samplers.base import Sampler
+from nerf_lightning.samplers.base import AnySampler, Sampler
 from nerf_lightning.types.rays import RayBundle
 from nerf_lightning.types.renderings import DenseRendering, FieldOutput, Rendering
 from nerf_lightning.types.scene import Scene
@@ -19,12 +19,18 @@ from nerf_lightning.types.scene import Scene
 class AnyLevel(nn.Module):
     """The contract of a level: one round of sampling and rendering."""
 
+    sampler: AnySampler
     field: Field
     has_color = True
     """Whether its rendering is a picture."""
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+
+    def __init__(self, sampler: AnySampler, field: Field):
+        super().__init__()
+        self.sampler = sampler
+        self.field = field
 
     @abstractmethod
     def forward(
@@ -43,6 +49,7 @@ class AnyLevel(nn.Module):
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
         self.field.place(scene)
+        self.sampler.place(scene)
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density per unit length, as rendering sees it."""
@@ -81,14 +88,7 @@ class Level(AnyLevel):
     sampler: Sampler
 
     def __init__(self, sampler: Sampler, field: Field):
-        super().__init__()
-        self.sampler = sampler
-        self.field = field
-
-    def place(self, scene: Scene) -> None:
-        """Hand the scene to the field and to the sampler."""
-        super().place(scene)
-        self.sampler.place(scene)
+        super().__init__(sampler, field)
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
