@@ -3,7 +3,6 @@
 import logging
 from typing import Literal
 
-import psutil
 import torch
 from lightning.pytorch import LightningDataModule
 
@@ -11,6 +10,7 @@ from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
 from nerf_lightning.errors import InputError
+from nerf_lightning.free_memory import free_memory
 from nerf_lightning.types.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -93,7 +93,7 @@ class RayDataModule(LightningDataModule):
         if self.fits(device):
             self.batches.take_from(on_device(self.scene, device))
             return
-        from_disk = num_bytes(self.scene.pixels) > psutil.virtual_memory().available
+        from_disk = num_bytes(self.scene.pixels) > free_memory()
         helps = device.type != "cpu" or from_disk
         self.batches.prefetch_for = device if (helps if self.prefetch == "auto" else self.prefetch) else None
 

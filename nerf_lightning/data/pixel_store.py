@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import psutil
 import torch
 from jaxtyping import Int
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
@@ -16,6 +15,7 @@ from nerf_lightning.cores import num_cores
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
+from nerf_lightning.free_memory import free_memory
 from nerf_lightning.types.scene import PixelStore
 
 # Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.
@@ -37,7 +37,7 @@ def layout(
 def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
     """Return a store with room for opaque pictures of these sizes (width, height), its pixels not yet written."""
     num_pixels = sum(width * height for width, height in sizes)
-    free = psutil.virtual_memory().available
+    free = free_memory()
     if 4 * num_pixels > free:
         raise InputError(
             f"{len(sizes)} pictures of {num_pixels / 1e6:,.0f} megapixels in all need {4 * num_pixels / 1e9:.1f} GB of "

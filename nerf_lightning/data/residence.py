@@ -9,6 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
 from torch import Tensor
 
 from nerf_lightning.data.progress import progress_bar
+from nerf_lightning.free_memory import free_memory
 from nerf_lightning.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9
@@ -26,7 +27,7 @@ def budget_bytes(budget: int | float | Literal["auto"], device: torch.device) ->
     """Return how much of the device's memory the pixels may take: gigabytes, or half of what is free."""
     if budget != "auto":
         return int(budget * GIGABYTE)
-    return int(AUTO_SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
+    return int(AUTO_SHARE * free_memory(device)) if device.type == "cuda" else 0
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:

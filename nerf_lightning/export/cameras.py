@@ -1,6 +1,5 @@
 """The cameras, in the user's frame, as other programs read them."""
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.colmap_files import beyond_colmap, colmap_files
+from nerf_lightning.export.json_file import write_json
 from nerf_lightning.geometry.frames import poses_from_user
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.types.scene import Cameras, LensModel
@@ -39,8 +39,7 @@ class CamerasExport(Export):
         """Write the files."""
         cameras = in_user_frame(record)
         transforms = folder / "transforms.json"
-        with whole_file(transforms) as part:
-            part.write_text(json.dumps(self._transforms(record, cameras), indent=2) + "\n", encoding="utf-8")
+        write_json(transforms, self._transforms(record, cameras))
         reason = beyond_colmap(cameras)
         if reason:
             log.warning("%s No COLMAP model is written, only transforms.json.", reason)

@@ -1,6 +1,5 @@
 """Depth, opacity and normals of the views, as pictures and arrays."""
 
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +16,7 @@ from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
+from nerf_lightning.export.json_file import write_json
 from nerf_lightning.export.pictures import save_png, to_bytes
 from nerf_lightning.export.seen_views import SeenView, see
 from nerf_lightning.geometry.cameras import camera_coordinates
@@ -66,8 +66,7 @@ class ImagesExport(Export):
                 _save_depth(folder / "depth", names[view], scale)
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
-        with whole_file(about) as part:
-            part.write_text(json.dumps(self._described(record, names, scale), indent=2) + "\n", encoding="utf-8")
+        write_json(about, self._described(record, names, scale))
         return [*(folder / name for name in ("depth", "opacity", "normals")), about]
 
     def _views(self, record: SceneRecord) -> list[int]:

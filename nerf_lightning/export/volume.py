@@ -1,6 +1,5 @@
 """Density and colour on a regular grid over the scene's box."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export, refuse_ndc
+from nerf_lightning.export.json_file import write_json
 from nerf_lightning.export.lattice import Lattice, Report, require_resolution, sample_density
 from nerf_lightning.export.looks import looks_from_nearest
 from nerf_lightning.export.pictures import to_bytes
@@ -48,8 +48,7 @@ class VolumeExport(Export):
         arrays, about = folder / "volume.npz", folder / "volume.json"
         with whole_file(arrays) as part:
             np.savez_compressed(part, density=density / np.float32(unit), rgb=rgb)
-        with whole_file(about) as part:
-            part.write_text(json.dumps(_described(record, lattice), indent=2) + "\n", encoding="utf-8")
+        write_json(about, _described(record, lattice))
         return [arrays, about]
 
 

@@ -4,6 +4,7 @@ import pickle
 import threading
 from dataclasses import replace
 
+import psutil
 import pytest
 import torch
 from scenes import ball_scene
@@ -141,7 +142,7 @@ def test_the_budget_decides(monkeypatch):
     ],
 )
 def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, expected):
-    monkeypatch.setattr(datamodule.psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
     data = RayDataModule(ball_scene(), Progress(), seed=0, num_steps=1, device_budget=0, prefetch=prefetch)
     data.settle(torch.device(kind))
     assert data.batches.prefetch_for == (None if expected is None else torch.device(expected))

@@ -1,8 +1,7 @@
 """What training will take."""
 
-import psutil
-
 from nerf_lightning.data.doctor.check import Check, Evidence
+from nerf_lightning.free_memory import free_memory
 
 # Bytes that training takes beside the pixels, by measurement of model=fast on a CPU.
 BESIDE_PIXELS = 1.0e9
@@ -15,7 +14,7 @@ def memory(evidence: Evidence) -> Check:
     pixels = evidence.scene.pixels
     count = len(pixels.rgba)
     store = pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
-    needed, free = store + BESIDE_PIXELS, psutil.virtual_memory().available
+    needed, free = store + BESIDE_PIXELS, free_memory()
     message = (
         f"{count / 1e6:.1f} million pixels take {store / 1e9:.2f} GB; training with model=fast takes about "
         f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
