@@ -69,7 +69,6 @@ class LiveView(Callback):
             scene_record(scene),
             scene.background,
             pl_module.tile_points or WHOLE_BATCH_POINTS,
-            trainer.precision_plugin.forward_context,
             self.share,
             MOVING_SECONDS,
         )

@@ -41,8 +41,7 @@ class RayHistograms(Watcher):
         if not writers:
             return
         step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
-        with trainer.precision_plugin.forward_context():
-            seen = look_along(system, batch.rays[: self.num_rays], step, endless)
+        seen = look_along(system, batch.rays[: self.num_rays], step, endless)
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:

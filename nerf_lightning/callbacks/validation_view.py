@@ -14,9 +14,6 @@ def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int,
     view = views[number % len(views)]
     tile_points = system.tile_points or WHOLE_BATCH_POINTS
     system.eval()
-    with trainer.precision_plugin.forward_context():
-        picture = render_picture(
-            system.model, scene.cameras, view, scene.near, scene.far, scene.background, tile_points
-        )
+    picture = render_picture(system.model, scene.cameras, view, scene.near, scene.far, scene.background, tile_points)
     system.train()
     return view, picture

@@ -1,8 +1,8 @@
 """`nerf bench`: what it costs that a run can be watched in TensorBoard."""
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +24,6 @@ def watching_seconds(
     system: RadianceFieldSystem,
     data: RayDataModule,
     batch: Batch,
-    forward_context: Callable[[], AbstractContextManager[Any]],
 ) -> dict[str, float]:
     """Return the seconds that each watcher adds to a step: those of one look, spread over the steps between two.
 
@@ -33,10 +32,9 @@ def watching_seconds(
         system: the model in training.
         data: its scene and rays.
         batch: the rays of a step.
-        forward_context: the precision of training.
     """
     seconds = {}
-    with _trainer(data, forward_context) as trainer:
+    with _trainer(data) as trainer:
         for watcher in watchers:
             look = partial(_look, watcher, trainer, system, batch)
             first = seconds_of(look)
@@ -52,7 +50,7 @@ def _look(watcher: Watcher, trainer: Any, system: RadianceFieldSystem, batch: Ba
 
 
 @contextmanager
-def _trainer(data: RayDataModule, forward_context: Callable[[], AbstractContextManager[Any]]) -> Iterator[Any]:
+def _trainer(data: RayDataModule) -> Iterator[Any]:
     """Stand in for Lightning's trainer, with what watchers ask of it."""
     with tempfile.TemporaryDirectory() as folder:
         logger = TensorBoardLogger(folder)
@@ -63,6 +61,5 @@ def _trainer(data: RayDataModule, forward_context: Callable[[], AbstractContextM
             default_root_dir=folder,
             datamodule=data,
             loggers=[logger],
-            precision_plugin=SimpleNamespace(forward_context=forward_context),
         )
         logger.finalize("success")

@@ -68,16 +68,14 @@ class Bench:
         """Compute gradients and update, and nothing else."""
         optimizer = self.plain_optimizer if plain else self.optimizer
         optimizer.zero_grad()
-        with nullcontext() if plain else self.settings.autocast():
-            self.system.accumulate_gradients(batch, lambda loss: loss.backward())
+        self.system.accumulate_gradients(batch, lambda loss: loss.backward())
         optimizer.step()
 
     def take_step(self) -> None:
         """Take one step of training, loading and all."""
         progress = self.batches.progress
         batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
-        with self.settings.autocast():
-            self.system.training_step(batch, 0)
+        self.system.training_step(batch, 0)
 
 
 def benchmark(config: DictConfig) -> float:
@@ -142,6 +140,7 @@ def _prepare(config: DictConfig) -> Bench:
     progress = Progress()
     num_steps = max(1, config.warmup_steps)
     system = build_system(config, settings, scene, progress, num_steps, {}).to(settings.device)
+    settings.prepare(system.model)
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     data.settle(settings.device)
@@ -197,11 +196,13 @@ def _plainly(bench: Bench) -> Iterator[None]:
     samplers = [level.sampler for level in bench.system.model.modules() if isinstance(level, PackedLevel)]
     former = [sampler.opaque_below for sampler in samplers]
     bench.system.tile_points = None
+    bench.system.model.multiply_in("float32")
     for sampler in samplers:
         sampler.opaque_below = 0.0
     _release_gradients(bench)
     with without("march_numba", "packed_numba", "mlp_tiles", "adam_numba"):
         yield
+    bench.settings.prepare(bench.system.model)
     for sampler, value in zip(samplers, former, strict=True):
         sampler.opaque_below = value
     _release_gradients(bench)
@@ -227,7 +228,7 @@ def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
     watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
     system, data = bench.system, bench.data
     bench.take_step()  # losses to look at
-    seconds = watching_seconds(watchers, system, data, bench.batch, bench.settings.autocast)
+    seconds = watching_seconds(watchers, system, data, bench.batch)
     return {"watching, share of a step": sum(seconds.values())} | {
         f"watching: {name}, share of a step": value for name, value in seconds.items()
     }
@@ -236,7 +237,7 @@ def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
     rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
     size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
-    with torch.no_grad(), _plainly(bench) if plain else bench.settings.autocast():
+    with torch.no_grad(), _plainly(bench) if plain else nullcontext():
         for part in tiles(num_rays, size):
             _render_tile(bench.system.model, rays[part], bench)
 

@@ -1,5 +1,6 @@
 """`nerf eval`: read a checkpoint and a scene, measure, print."""
 
+import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import read_checkpoint
@@ -16,12 +17,12 @@ def evaluate(config: DictConfig) -> float:
     settings.prepare_machine()
     checkpoint = read_checkpoint(config.ckpt)
     settings.keep_tile(checkpoint.tile_points)
-    model = load_model(checkpoint).to(settings.device)
+    model = settings.prepare(load_model(checkpoint))
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
     scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
     origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
     scoring, tile_points = build(config.evaluation), settings.inference_tile_points
-    with settings.inference():
+    with torch.no_grad():
         metrics = scoring.score(model, scene, scene.background, tile_points, folder, origin)
     print("\n".join(metric_lines(metrics, folder)))
     return float(metrics["psnr"])

@@ -61,10 +61,10 @@ class Finish:
         self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
     ) -> float | None:
         """Evaluate, film, print a summary, and return the test PSNR (else the validation's)."""
-        model.to(settings.device).eval()
+        settings.prepare(model).eval()
         lines, psnr = [], trainer.callback_metrics.get("val/psnr")
         tile_points = settings.inference_tile_points
-        with settings.inference():
+        with torch.no_grad():
             if self.scoring is not None:
                 origin = _origin(trainer, model, settings)
                 metrics = self.scoring.score(model, scene, scene.background, tile_points, folder, origin)

@@ -18,8 +18,16 @@ M_TRIM_THRESHOLD = -1
 def prepare_machine(num_threads: int | None) -> None:
     """Set threads and the allocator, once per process; None: one thread per core."""
     torch.set_num_threads(num_threads or ALL_THREADS)
+    _keep_float32()
     _keep_large_blocks()
     _quiet_libraries()
+
+
+def _keep_float32() -> None:
+    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (products.py). cuDNN would
+    # lower convolutions, SSIM's among them, unless it is told not to.
+    torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = False
 
 
 def _keep_large_blocks() -> None:

@@ -93,8 +93,7 @@ def _step(
 
         def work() -> None:
             optimizer.zero_grad()
-            with settings.autocast():
-                system.accumulate_gradients(some, lambda loss: loss.backward())
+            system.accumulate_gradients(some, lambda loss: loss.backward())
 
         model.zero_grad(set_to_none=True)
         return peak_bytes(work, settings.device)
@@ -127,7 +126,7 @@ def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: Ra
 
     def rendered(count: int) -> int:
         some = rays[torch.arange(count, device=settings.device) % rays.near.numel()]
-        with settings.inference():
+        with torch.no_grad():
             behind = background_colors(system.background, count, settings.device, None)
             return peak_bytes(lambda: model(some, behind, None), settings.device)
 

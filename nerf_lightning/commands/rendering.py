@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
@@ -27,7 +28,7 @@ def render(config: DictConfig) -> None:
     path = build(config.path)
     subjects = [
         Subject(
-            load_model(checkpoint).to(settings.device),
+            settings.prepare(load_model(checkpoint)),
             checkpoint.scene,
             known_background(config.background or checkpoint.scene.background),
             label,
@@ -35,7 +36,7 @@ def render(config: DictConfig) -> None:
         for checkpoint, label in zip(checkpoints, labels, strict=True)
     ]
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoints[0].path, "render"))
-    with settings.inference():
+    with torch.no_grad():
         shown = replace(shown, precision=settings.precision)
         written = film(subjects, path, settings.inference_tile_points, folder, shown)
     print("\n".join(str(file) for file in written))

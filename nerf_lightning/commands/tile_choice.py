@@ -47,5 +47,4 @@ def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch:
 def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
     system.tile_points = tile
     some = batch[:num_rays]
-    with settings.autocast():
-        return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))
+    return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))

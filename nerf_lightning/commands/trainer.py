@@ -1,7 +1,6 @@
 """The machine's part of a config: devices, precision, tiles, threads; and Lightning's Trainer made from it."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +17,10 @@ from nerf_lightning.commands.devices import LIGHTNING_NAMES, Accelerator, Precis
 from nerf_lightning.commands.machine import prepare_machine
 from nerf_lightning.commands.strategy import Launcher, OneSumPerStep, cluster_environment, processes_here
 from nerf_lightning.errors import InputError
+from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.products import Products
 
+PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
 MOST_CPU_TILE_POINTS = 1 << 18
@@ -31,8 +33,9 @@ class TrainerSettings:
         max_steps: steps in all.
         max_epochs: epochs in all, an epoch being every training ray once; None: no bound. The smaller bound counts.
         accelerator: auto takes a GPU where there is one.
-        precision: auto is bf16-mixed (float32 weights, bfloat16 products) where the device computes it natively, else
-            32-true; tf32 is float32 with products in TensorFloat-32 on NVIDIA GPUs.
+        precision: of the products of the fields' weights, and of nothing else. bf16-mixed rounds their factors to
+            bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively,
+            else 32-true.
         tile_points: most points that a step sends through a field at once; auto takes the fastest of a few sizes,
             measured at the start of a run and kept; None trains a batch whole. The result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
@@ -88,12 +91,10 @@ class TrainerSettings:
         return min(self.max_steps, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
 
     def prepare_machine(self) -> None:
-        """Set threads, the allocator and the kind of products, once per process."""
+        """Set threads and the allocator, once per process."""
         prepare_machine(self.num_threads)
         if self.device_type == "xla":
             self.devices = xla.use_cores(self.devices)
-        if self.device_type == "cuda":
-            torch.set_float32_matmul_precision("high" if self.precision == "tf32" else "highest")
 
     def build(self, folder: Path, num_steps: int, callbacks: Sequence[Callback], loggers: Sequence[Logger]) -> Trainer:
         """Return Lightning's Trainer for this process's device, one of several where processes are joined."""
@@ -116,7 +117,7 @@ class TrainerSettings:
 
     def _placement(self) -> dict[str, Any]:
         if self.device_type == "xla":
-            return xla.trainer_arguments(self.precision, int(self.devices))
+            return xla.trainer_arguments(int(self.devices))
         several = distributed.is_initialized()
         # Else Lightning would find Slurm by itself, save in the midst of a step and requeue.
         environment = [cluster_environment()] if several or SLURMEnvironment.detect() else []
@@ -125,7 +126,7 @@ class TrainerSettings:
             "devices": processes_here() if several else 1,
             "num_nodes": distributed.get_world_size() // processes_here() if several else 1,
             "strategy": OneSumPerStep() if several else "auto",
-            "precision": "32-true" if self.precision == "tf32" else self.precision,
+            "precision": "32-true",  # Lightning's would lower whatever stands in a step; fields know their own
             "plugins": [AtomicCheckpointIO(), *environment],
         }
 
@@ -146,15 +147,10 @@ class TrainerSettings:
         """Most points at once when rendering without gradients."""
         return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
 
-    @contextmanager
-    def inference(self) -> Iterator[None]:
-        """Render in the precision of training, without gradients."""
-        with torch.no_grad(), self.autocast():
-            yield
-
-    def autocast(self) -> torch.autocast:
-        """Multiply in the precision of training, where Lightning does not see to it."""
-        return torch.autocast(self.device_type, torch.bfloat16, enabled=self.precision.startswith("bf16"))
+    def prepare(self, model: RadianceModel) -> RadianceModel:
+        """Put a model on the device, let its fields multiply in this precision, and return it."""
+        model.multiply_in(PRODUCTS[self.precision])
+        return model.to(self.device)
 
     def describe(self) -> str:
         """Say device and precision, with the reason where they were chosen."""

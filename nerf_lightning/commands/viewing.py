@@ -33,13 +33,13 @@ def view(config: DictConfig) -> None:
     settings.prepare_machine()
     checkpoint = read_checkpoint(config.ckpt)
     settings.keep_tile(checkpoint.tile_points)
-    model = load_model(checkpoint).to(settings.device)
+    model = settings.prepare(load_model(checkpoint))
     record = checkpoint.scene
     background = known_background(config.background or record.background)
     scene = _scene(config, record) if config.photographs else None
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
-    renderer = SlicedRenderer(model, record, background, settings.inference_tile_points, settings.inference)
+    renderer = SlicedRenderer(model, record, background, settings.inference_tile_points)
     warm_up(renderer)
     studio = Studio(renderer)
     page = Page(studio, Photographs(record, scene, background), folder, config.host, config.port, config.max_height)

@@ -5,8 +5,6 @@ gradients (SPMD, single program, multiple data). So nothing else has to know how
 """
 
 import importlib.util
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Literal
 
 import torch
@@ -91,17 +89,16 @@ def use_cores(wanted: int | Literal["auto"]) -> int:
     return found
 
 
-def trainer_arguments(precision: str, cores: int) -> dict[str, Any]:
+def trainer_arguments(cores: int) -> dict[str, Any]:
     """Return what Lightning's Trainer has to know."""
-    return {"accelerator": ACCELERATOR(), "devices": 1, "strategy": ManyCores(precision, cores)}
+    return {"accelerator": ACCELERATOR(), "devices": 1, "strategy": ManyCores(cores)}
 
 
 class ManyCores(SingleDeviceXLAStrategy):
     """Spread the rays of each batch over the cores."""
 
-    def __init__(self, precision: str, cores: int):
-        plugin = XLAMixedPrecision() if precision == "bf16-mixed" else XLAPrecision("32-true")
-        super().__init__(0, checkpoint_io=AtomicXLACheckpointIO(), precision_plugin=plugin)
+    def __init__(self, cores: int):
+        super().__init__(0, checkpoint_io=AtomicXLACheckpointIO(), precision_plugin=XLAPrecision("32-true"))
         self.cores = cores
 
     def batch_to_device(self, batch: Any, device: torch.device | None = None, dataloader_idx: int = 0) -> Any:
@@ -116,16 +113,6 @@ class ManyCores(SingleDeviceXLAStrategy):
         mesh = spmd.Mesh(np.arange(self.cores), (self.cores,), ("rays",))
         spmd.mark_sharding(tensor, mesh, ("rays", *(None,) * (tensor.ndim - 1)))
         return tensor
-
-
-class XLAMixedPrecision(XLAPrecision):
-    """float32 weights, bfloat16 products. Lightning's own bf16-true would round Adam's updates away."""
-
-    @contextmanager
-    def forward_context(self) -> Iterator[None]:
-        """Multiply in bfloat16."""
-        with super().forward_context(), torch.autocast("xla", torch.bfloat16):
-            yield
 
 
 class AtomicXLACheckpointIO(AtomicCheckpointIO, XLACheckpointIO):

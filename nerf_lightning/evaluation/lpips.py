@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.products import own_precision
 from nerf_lightning.tensor_files import load_tensors
 
 LPIPS_HINT = (
@@ -53,6 +54,7 @@ class LPIPS(nn.Module):
             self.register_buffer(f"channels{level}", weight, persistent=False)
         self.requires_grad_(False)
 
+    @own_precision
     def forward(
         self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
     ) -> Float[Tensor, ""]:

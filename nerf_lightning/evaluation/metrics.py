@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from nerf_lightning.products import own_precision
+
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
 LEAST_MSE = 1e-10
@@ -39,6 +41,7 @@ def masked_out(
     return render if kept is None else torch.where(kept[..., None], render, truth)
 
 
+@own_precision
 def image_metrics(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.products import Linear, Products
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types.renderings import FieldOutput
 from nerf_lightning.types.scene import Scene
@@ -21,6 +22,16 @@ class Field(nn.Module, ABC):
 
     compiles: bool = True
     """False where kernels of our own do most of the work, which torch.compile cannot see into."""
+
+    products: Products = "float32"
+    """The precision of the products with the field's weights, and of nothing else: layers are `products.Linear`, and
+    kernels are given this. A field that does neither multiplies in float32 everywhere, which is slow and right."""
+
+    def multiply_in(self, products: Products) -> None:
+        """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""
+        for module in self.modules():
+            if isinstance(module, Linear | Field):
+                module.products = products
 
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""

@@ -79,7 +79,7 @@ class HashField(Field):
     ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density, and the encoder's features."""
         encoded = self.position_encoder(self._unit(positions))
-        return self._density(_along_rows(encoded, self.density_mlp), positions), encoded
+        return self._density(self._through(self.density_mlp, encoded), positions), encoded
 
     def forward(
         self,
@@ -108,11 +108,15 @@ class HashField(Field):
             nn.init.kaiming_uniform_(weight, a=5**0.5)
 
     def _output(self, encoded: Tensor, positions: Tensor, directions: Tensor) -> FieldOutput:
-        features = _along_rows(encoded, self.density_mlp)
+        features = self._through(self.density_mlp, encoded)
         direction = self.direction_encoder(directions).to(features.dtype)
         direction = direction.expand(*features.shape[:-1], direction.shape[-1])
-        raw_rgb = _along_rows(torch.cat([features, direction], dim=-1), self.color_mlp)
+        raw_rgb = self._through(self.color_mlp, torch.cat([features, direction], dim=-1))
         return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def _through(self, weights: nn.ParameterList, features: Tensor) -> Tensor:
+        out = mlp(features.flatten(0, -2), list(weights), self.products)
+        return out.view(*features.shape[:-1], out.shape[-1])
 
     def _unit(self, positions: Tensor) -> Tensor:
         if self.contracted:
@@ -130,11 +134,6 @@ class HashField(Field):
 
 def _weights(*sizes: int) -> nn.ParameterList:
     return nn.ParameterList(torch.empty(after, before) for before, after in pairwise(sizes))
-
-
-def _along_rows(features: Tensor, weights: nn.ParameterList) -> Tensor:
-    out = mlp(features.flatten(0, -2), list(weights))
-    return out.view(*features.shape[:-1], out.shape[-1])
 
 
 class _TruncatedExponential(torch.autograd.Function):

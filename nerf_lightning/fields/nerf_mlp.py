@@ -11,6 +11,7 @@ from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, in_unit_ball
 from nerf_lightning.geometry.contracted import Contracted
+from nerf_lightning.products import Linear
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types.renderings import FieldOutput
 from nerf_lightning.types.scene import Scene
@@ -78,10 +79,10 @@ class NerfMLP(Field):
         if skip is not None:
             sizes[skip] += inputs
         self.trunk = nn.ModuleList(_hidden(size, width, batch_norm) for size in sizes)
-        self.density_head = nn.Linear(width, 1)
-        self.feature = nn.Linear(width, width)
+        self.density_head = Linear(width, 1)
+        self.feature = Linear(width, width)
         self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2, batch_norm)
-        self.color_head = nn.Linear(width // 2, 3)
+        self.color_head = Linear(width // 2, 3)
         self.reset_parameters()
 
     @property
@@ -162,6 +163,6 @@ class _BatchNorm(nn.BatchNorm1d):
 
 
 def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:
-    linear: list[nn.Module] = [nn.Linear(inputs, outputs)]
+    linear: list[nn.Module] = [Linear(inputs, outputs)]
     norm: list[nn.Module] = [_BatchNorm(outputs, eps=EPSILON, momentum=MOMENTUM)] if batch_norm else []
     return nn.Sequential(*linear, *norm, nn.ReLU(inplace=True))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerf_lightning.geometry.lenses import project_plane, unproject
 from nerf_lightning.geometry.ndc import ndc_rays
+from nerf_lightning.products import own_precision
 from nerf_lightning.types.rays import PixelIndex, RayBundle
 from nerf_lightning.types.scene import Cameras
 
@@ -49,6 +50,7 @@ def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, 
     return replace(cameras, focal=cameras.focal * scale, center=cameras.center * scale, width=width, height=height)
 
 
+@own_precision
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
@@ -95,6 +97,7 @@ def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
     return PixelIndex(view=view, x=x.round().long(), y=y.round().long())
 
 
+@own_precision
 def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Return world points in the axes of one camera: right, up, back."""
     c2w = cameras.c2w[view]

@@ -5,10 +5,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerf_lightning.products import own_precision
+
 # An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
 CLEAR = 0.05
 
 
+@own_precision
 def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     """Return the point that is nearest to all optical axes, by least squares.
 
@@ -26,6 +29,7 @@ def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     return torch.linalg.solve(across.mean(dim=0) + weak, target)
 
 
+@own_precision
 def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     """Return the unit vector that points up in the world, as the photographer held the camera.
 
@@ -48,6 +52,7 @@ def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     return axis if sign >= 0 else -axis
 
 
+@own_precision
 def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Return the smallest rotation that takes `up` (unit) to +z.
 
@@ -94,6 +99,7 @@ def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit:
     return matrix
 
 
+@own_precision
 def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
     """Return poses given in the user's frame as the working frame sees them."""
     centers = points_from_user(c2w[:, :, 3], to_user)
@@ -101,17 +107,20 @@ def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4
     return torch.cat([rotation.mT @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
 
 
+@own_precision
 def points_from_user(points: Float[Tensor, "points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "points 3"]:
     """Return points given in the user's frame as the working frame sees them."""
     rotation = to_user[:3, :3] / unit_of(to_user)
     return (points - to_user[:3, 3]) @ rotation / unit_of(to_user)
 
 
+@own_precision
 def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "*points 3"]:
     """Return points of the working frame in the user's frame."""
     return points @ to_user[:3, :3].mT + to_user[:3, 3]
 
 
+@own_precision
 def directions_to_user(
     directions: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*points 3"]:

@@ -4,7 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerf_lightning.products import own_precision
 
+
+@own_precision
 def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
     """Tell which poses are a rotation (orthonormal, determinant +1) and a finite centre."""
     rotation = c2w[..., :3]

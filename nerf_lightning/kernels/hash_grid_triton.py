@@ -1,6 +1,6 @@
 """The hash grid for CUDA: a program takes a block of points on one level; the backward pass adds atomically.
 
-Tables may be half precision; sums and gradients are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
+Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
 from typing import TYPE_CHECKING, no_type_check

@@ -1,8 +1,7 @@
 """Small multilayer perceptrons without biases: matrix products with ReLU between them.
 
 At widths of 64 a general framework spends as much on moving activations through memory as on arithmetic. On the CPU
-each core takes tiles of rows through all layers, forward and backward, so that they stay in its cache. The products are
-bfloat16 under torch's autocast.
+each core takes tiles of rows through all layers, forward and backward, so that they stay in its cache.
 """
 
 from typing import Any
@@ -10,27 +9,31 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from nerf_lightning.kernels import mlp_tiles
 from nerf_lightning.kernels.backends import is_on
+from nerf_lightning.products import Products, linear
 
 
-def mlp(points: Float[Tensor, "points in"], weights: list[Tensor]) -> Float[Tensor, "points out"]:
-    """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in)."""
+def mlp(
+    points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
+) -> Float[Tensor, "points out"]:
+    """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32."""
     if points.device.type != "cpu" or points.dtype == torch.float64 or not is_on("mlp_tiles"):
-        return mlp_torch(points, weights)
-    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
+        return mlp_torch(points, weights, products)
+    dtype = torch.bfloat16 if products == "bfloat16" else points.dtype
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
         return _TiledMLP.apply(points, dtype, *weights)
     return mlp_tiles.forward(points, [weight.to(dtype) for weight in weights], keep=False)[0]
 
 
-def mlp_torch(points: Float[Tensor, "points in"], weights: list[Tensor]) -> Float[Tensor, "points out"]:
+def mlp_torch(
+    points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
+) -> Float[Tensor, "points out"]:
     """Return the same in plain torch: the reference, and what runs on GPUs."""
     for weight in weights[:-1]:
-        points = functional.linear(points, weight).relu_()
-    return functional.linear(points, weights[-1])
+        points = linear(points, weight, None, products).relu_()
+    return linear(points, weights[-1], None, products)
 
 
 class _TiledMLP(torch.autograd.Function):

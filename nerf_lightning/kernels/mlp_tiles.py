@@ -11,12 +11,15 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from nerf_lightning.products import own_precision
+
 TILE = 4096
 """Rows: at a width of 64 the activations of a tile take about a core's second-level cache."""
 Result = TypeVar("Result")
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 
 
+@own_precision
 def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, list[list[Tensor]]]:
     """Return the outputs in float32, and each tile's inputs of every layer where they are to be kept."""
     out = points.new_empty(points.shape[0], weights[-1].shape[0])
@@ -34,6 +37,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     return out, in_tiles(tile, points.shape[0])
 
 
+@own_precision
 def backward(
     grad: Tensor, weights: Sequence[Tensor], activations: list[list[Tensor]], wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
 from nerf_lightning.fields.base import Field
+from nerf_lightning.products import Products
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
 from nerf_lightning.samplers.base import AnySampler, Sampler
@@ -200,6 +201,11 @@ class RadianceModel(nn.Module):
     def measurements(self) -> list[Tensor]:
         """Return the buffers of all levels that hold means over rays."""
         return [measured for level in self._in_order() for measured in level.measurements()]
+
+    def multiply_in(self, products: Products) -> None:
+        """Set the precision of the products with the fields' weights; everything else is float32 always."""
+        for level in self._in_order():
+            level.field.multiply_in(products)
 
     def compile_fields(self) -> list[str]:
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""

@@ -1,8 +1,7 @@
 """Render a view in slices: between two of them its owner may do something else, or drop it."""
 
 import time
-from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import torch
@@ -47,7 +46,6 @@ class SlicedRenderer:
         scene: what a checkpoint knows of the capture.
         background: what lies behind.
         tile_points: most points at once.
-        inference: the precision to render in, entered anew for each slice.
         share: of the time that goes by, so much is spent on rendering; 1 where there is nothing else to do.
         moving_seconds: how long a picture may take while the camera moves.
     """
@@ -58,12 +56,11 @@ class SlicedRenderer:
         scene: SceneRecord,
         background: Background,
         tile_points: int,
-        inference: Callable[[], AbstractContextManager],
         share: float = 1.0,
         moving_seconds: float = 0.1,
     ):
         self.model, self.scene, self.background = model, scene, background
-        self.tile_points, self.inference = tile_points, inference
+        self.tile_points = tile_points
         self.share, self.moving_seconds = share, moving_seconds
         self.rays_per_second: float | None = None
 
@@ -84,7 +81,7 @@ class SlicedRenderer:
         while start < total:
             stop = start + self._rays_in_a_slice(total - start)
             began = time.perf_counter()
-            with self.inference():
+            with torch.no_grad():
                 parts.append(render_rays(self.model, rays[start:stop], self.background, self.tile_points))
             self._learn(stop - start, time.perf_counter() - began)
             start = stop

@@ -11,6 +11,7 @@ from nerf_lightning.geometry.frames import gaps_around
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.geometry.paths.orbit import Orbit
 from nerf_lightning.geometry.paths.spiral import Spiral
+from nerf_lightning.products import own_precision
 from nerf_lightning.types.scene import Cameras
 
 # The widest gap between photographs, seen from above, that a circle may cross.
@@ -34,6 +35,7 @@ class AutoPath(CameraPath):
         super().__post_init__()
         check_setting("longest", self.longest, self.longest >= 1, "at least 1 pixel")
 
+    @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the path that was chosen."""
         width = self.width
@@ -48,6 +50,7 @@ class AutoPath(CameraPath):
         return Orbit(self.num_frames, elevation, width=width, height=self.height, fov=self.fov).cameras(around)
 
 
+@own_precision
 def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:
     """Return the widest angle in degrees between neighbouring views, as seen from above.
 

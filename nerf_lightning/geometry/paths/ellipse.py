@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.geometry.frames import focus_point
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.products import own_precision
 from nerf_lightning.types.scene import Cameras
 
 # So finely the ellipse is measured, to go around it at one speed.
@@ -50,6 +51,7 @@ class Ellipse(CameraPath):
         check_setting("rise", self.rise, math.isfinite(self.rise), "a finite share")
         check_turns(self.turns, self.start)
 
+    @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the ellipse."""
         given = around.point("target", self.target)
@@ -78,6 +80,7 @@ class Ellipse(CameraPath):
         return torch.from_numpy(np.interp((begin + share) % 1.0, length / length[-1], angle))
 
 
+@own_precision
 def _axes(flat: Float[Tensor, "views 2"]) -> Float[Tensor, "2 2"]:
     """Return the long and the short axis as columns, the second a quarter turn anticlockwise from the first."""
     long = torch.linalg.eigh(flat.mT @ flat)[1][:, 1]

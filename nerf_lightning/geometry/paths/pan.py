@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.geometry.paths.photographs import find_views
 from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.products import own_precision
 from nerf_lightning.types.scene import Cameras
 
 
@@ -39,6 +40,7 @@ class Pan(CameraPath):
         check_setting("sweep", self.sweep, good, "a finite angle in degrees, not 0")
         check_setting("tilt", self.tilt, -180 < self.tilt < 180, "between -180 and 180 degrees")
 
+    @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras that turn."""
         pose = around.poses[find_views("view", [self.view], around.view_names, len(around.poses))[0]]

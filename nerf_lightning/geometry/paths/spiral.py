@@ -9,6 +9,7 @@ import torch
 from nerf_lightning.geometry.frames import average_pose
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame, check_setting, check_turns
 from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.products import own_precision
 from nerf_lightning.types.scene import Cameras
 
 
@@ -35,6 +36,7 @@ class Spiral(CameraPath):
         check_setting("reach", self.reach, 0 < self.reach < math.inf, "a positive share")
         check_turns(self.turns)
 
+    @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the spiral, the last of which precedes the first."""
         given = around.point("target", self.target)
