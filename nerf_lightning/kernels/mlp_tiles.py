@@ -11,10 +11,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from nerf_lightning.products import own_precision
+from nerf_lightning.products import TILE_ROWS, few_sizes, own_precision, tiles_of_rows
 
-TILE = 4096
-"""Rows: at a width of 64 the activations of a tile take about a core's second-level cache."""
 Result = TypeVar("Result")
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 
@@ -25,13 +23,13 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     out = points.new_empty(points.shape[0], weights[-1].shape[0])
 
     def tile(rows: slice) -> list[Tensor]:
-        hidden = points[rows].to(weights[0].dtype)
+        hidden = few_sizes(points[rows], weights[0].dtype)
         kept = [hidden]
         for weight in weights[:-1]:
             hidden = torch.mm(hidden, weight.t()).relu_()
             if keep:
                 kept.append(hidden)
-        out[rows].copy_(torch.mm(hidden, weights[-1].t()))
+        out[rows] = torch.mm(hidden, weights[-1].t())[: rows.stop - rows.start]
         return kept if keep else []
 
     return out, in_tiles(tile, points.shape[0])
@@ -45,8 +43,8 @@ def backward(
     grad_points = grad.new_empty(grad.shape[0], weights[0].shape[1]) if wants_points else None
 
     def tile(rows: slice) -> list[Tensor]:
-        kept = activations[rows.start // TILE]
-        flowing = grad[rows].to(weights[0].dtype)
+        kept = activations[rows.start // TILE_ROWS]
+        flowing = few_sizes(grad[rows], weights[0].dtype)
         grads: list[Tensor] = []
         for layer in reversed(range(len(weights))):
             grads.insert(0, torch.mm(flowing.t(), kept[layer]))
@@ -56,7 +54,7 @@ def backward(
             if layer:
                 relu_backward_(flowing, kept[layer], grad_input=flowing)
             elif grad_points is not None:
-                grad_points[rows].copy_(flowing)
+                grad_points[rows] = flowing[: rows.stop - rows.start]
         return grads
 
     parts = in_tiles(tile, grad.shape[0])
@@ -67,7 +65,7 @@ def backward(
 
 def in_tiles(work: Callable[[slice], Result], rows: int) -> list[Result]:
     """Do the work on each tile of rows, on as many threads as torch has, and return the results in order."""
-    slices = [slice(start, min(rows, start + TILE)) for start in range(0, rows, TILE)]
+    slices = tiles_of_rows(rows)
     threads = torch.get_num_threads()
     inference = torch.is_inference_mode_enabled()  # like the gradient mode, a thread's own
 
