@@ -62,6 +62,7 @@ def linear(
             return _LinearInTiles.apply(features, weight, bias)
         lowered = None if bias is None else bias.bfloat16()
         return functional.linear(features.bfloat16(), weight.bfloat16(), lowered)
+    features = features.to(weight.dtype)  # an earlier layer may have lowered them
     if products == "float32":
         return functional.linear(features, weight, bias)
     out = _tf32_product(features, weight.t())
@@ -89,7 +90,7 @@ class _LinearInTiles(torch.autograd.Function):
         out = points.new_empty(*features.shape[:-1], weight.shape[0])
         flat = out.flatten(0, -2)
         for rows in tiles_of_rows(points.shape[0]):
-            part = functional.linear(few_sizes(points[rows], torch.bfloat16), lowered, added)
+            part = multiply(few_sizes(points[rows], torch.bfloat16), lowered.t(), added)
             flat[rows] = part[: rows.stop - rows.start]
         ctx.save_for_backward(points, lowered)
         ctx.shape = features.shape
@@ -106,11 +107,29 @@ class _LinearInTiles(torch.autograd.Function):
         for rows in tiles_of_rows(points.shape[0]):
             part = few_sizes(grad[rows], torch.bfloat16)
             if of_points is not None:
-                of_points[rows] = (part @ weight)[: rows.stop - rows.start]
+                of_points[rows] = multiply(part, weight)[: rows.stop - rows.start]
             if of_weight is not None:
-                of_weight += part.t() @ few_sizes(points[rows], torch.bfloat16)
+                of_weight += multiply(part.t(), few_sizes(points[rows], torch.bfloat16))
         of_bias = grad.sum(dim=0, dtype=torch.float32) if ctx.needs_input_grad[2] else None
         return None if of_points is None else of_points.view(ctx.shape), of_weight, of_bias
+
+
+@functools.cache
+def cpu_multiplies_bfloat16() -> bool:
+    """Tell whether this CPU, as far as torch is allowed to use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 itself."""
+    probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    allowed = torch.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
+    return allowed and any(getattr(torch.cpu, probe, bool)() for probe in probes)
+
+
+def multiply(left: Tensor, right: Tensor, added: Tensor | None = None) -> Tensor:
+    """Return left @ right, plus a row; on CPUs that do not multiply bfloat16, of its numbers as float32.
+
+    That rounds where the others round, and is many times faster than what torch does there.
+    """
+    if left.dtype == torch.bfloat16 and not cpu_multiplies_bfloat16():
+        return multiply(left.float(), right.float(), None if added is None else added.float()).bfloat16()
+    return left @ right if added is None else torch.addmm(added, left, right)
 
 
 def tiles_of_rows(rows: int) -> list[slice]:

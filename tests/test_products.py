@@ -1,5 +1,6 @@
 """The precision of a product is what it is asked to be, forward and backward, and nothing around it changes it."""
 
+import os
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from nerf_lightning import products
 from nerf_lightning.products import ROUND_ROWS, TILE_ROWS, few_sizes, linear, own_precision
 
 # A factor that is rounded to bfloat16 (7 bits behind the leading one) is wrong by 2^-8 of itself at most; a product of
@@ -49,6 +51,25 @@ def test_bfloat16_is_the_exact_product_up_to_its_rounding(shape, bias):
         assert off(found[0], exact[0]) > 2**-12  # it was rounded
 
 
+def test_a_cpu_without_bfloat16_rounds_where_one_with_it_does(monkeypatch):
+    features, (weight, bias) = torch.randn(300, 48), layer()
+    results = []
+    for native in (products.cpu_multiplies_bfloat16(), False):
+        monkeypatch.setattr(products, "cpu_multiplies_bfloat16", lambda native=native: native)
+        results.append(gradients(lambda *x: linear(*x, "bfloat16"), features, weight, bias))
+    for native, emulated in zip(*results, strict=True):
+        assert native.dtype == emulated.dtype
+        assert off(native, emulated.double()) < 2**-10  # sums in another order, seldom rounded to another number
+
+
+def test_a_cpu_that_may_not_use_what_it_has_counts_as_one_without():
+    ask = "from nerf_lightning import products; print(products.cpu_multiplies_bfloat16())"
+    ran = subprocess.run(
+        [sys.executable, "-c", ask], env=os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}, capture_output=True, text=True
+    )
+    assert ran.stdout.strip() == "False", ran.stderr
+
+
 def test_float32_is_torchs_own_to_the_bit():
     features, (weight, bias) = torch.randn(9, 5, 48), layer()
     ours = gradients(lambda *x: linear(*x, "float32"), features, weight, bias)
@@ -64,13 +85,13 @@ def test_rows_come_in_few_sizes_and_what_is_added_is_zero():
     assert few_sizes(torch.ones(70, 2), torch.float32).shape == (70, 2)
 
 
-@pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
-def test_autocast_around_a_product_changes_no_bit_forward_or_backward(products):
+@pytest.mark.parametrize("asked", ["float32", "tf32", "bfloat16"])
+def test_autocast_around_a_product_changes_no_bit_forward_or_backward(asked):
     features, (weight, bias) = torch.randn(20, 48), layer()
-    alone = gradients(lambda *x: linear(*x, products), features, weight, bias)
+    alone = gradients(lambda *x: linear(*x, asked), features, weight, bias)
     leaves = [x.clone().requires_grad_() for x in (features, weight, bias)]
     with torch.autocast("cpu", torch.bfloat16):
-        out = linear(*leaves, products)
+        out = linear(*leaves, asked)
     torch.manual_seed(4)
     (out * torch.randn(out.shape, dtype=torch.float64).to(out.dtype)).sum().backward()
     for found, expected in zip([out.detach(), *(leaf.grad for leaf in leaves)], alone, strict=True):

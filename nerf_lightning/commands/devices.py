@@ -7,6 +7,7 @@ import torch
 
 from nerf_lightning.commands import xla
 from nerf_lightning.errors import InputError
+from nerf_lightning.products import cpu_multiplies_bfloat16
 
 log = logging.getLogger(__name__)
 
@@ -67,10 +68,7 @@ def has_native_bfloat16(device_type: str) -> bool:
     """Tell whether the device multiplies bfloat16 matrices in hardware."""
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    if device_type != "cpu":
-        return device_type == "xla"
-    probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
-    return any(getattr(torch.cpu, probe, bool)() for probe in probes)
+    return cpu_multiplies_bfloat16() if device_type == "cpu" else device_type == "xla"
 
 
 def _has_tf32(device_type: str) -> bool:

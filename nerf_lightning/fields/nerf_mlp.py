@@ -79,10 +79,10 @@ class NerfMLP(Field):
         if skip is not None:
             sizes[skip] += inputs
         self.trunk = nn.ModuleList(_hidden(size, width, batch_norm) for size in sizes)
-        self.density_head = Linear(width, 1)
+        self.density_head = nn.Linear(width, 1)
         self.feature = Linear(width, width)
         self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2, batch_norm)
-        self.color_head = Linear(width // 2, 3)
+        self.color_head = nn.Linear(width // 2, 3)
         self.reset_parameters()
 
     @property
@@ -97,7 +97,7 @@ class NerfMLP(Field):
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
-        return self._activate(self.density_head(self._trunk(positions))[..., 0], None)
+        return self._activate(self.density_head(self._trunk(positions).float())[..., 0], None)
 
     def forward(
         self,
@@ -107,12 +107,12 @@ class NerfMLP(Field):
     ) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
         hidden = self._trunk(positions)
-        raw_density = self.density_head(hidden)[..., 0]
+        raw_density = self.density_head(hidden.float())[..., 0]
         feature = self.feature(hidden)
         # Encoded once per ray, not once per sample.
         direction = self.direction_encoder(directions).to(feature.dtype)
         direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
-        raw_rgb = self.color_head(self.color_hidden(torch.cat([feature, direction], dim=-1)))
+        raw_rgb = self.color_head(self.color_hidden(torch.cat([feature, direction], dim=-1)).float())
         noise = None
         if random is not None and self.density_noise > 0:
             noise = self.density_noise * random.normal("density_noise", raw_density.shape[-1])

@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from nerf_lightning.products import TILE_ROWS, few_sizes, own_precision, tiles_of_rows
+from nerf_lightning.products import TILE_ROWS, few_sizes, multiply, own_precision, tiles_of_rows
 
 Result = TypeVar("Result")
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
@@ -26,10 +26,10 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
         hidden = few_sizes(points[rows], weights[0].dtype)
         kept = [hidden]
         for weight in weights[:-1]:
-            hidden = torch.mm(hidden, weight.t()).relu_()
+            hidden = multiply(hidden, weight.t()).relu_()
             if keep:
                 kept.append(hidden)
-        out[rows] = torch.mm(hidden, weights[-1].t())[: rows.stop - rows.start]
+        out[rows] = multiply(hidden, weights[-1].t())[: rows.stop - rows.start]
         return kept if keep else []
 
     return out, in_tiles(tile, points.shape[0])
@@ -47,10 +47,10 @@ def backward(
         flowing = few_sizes(grad[rows], weights[0].dtype)
         grads: list[Tensor] = []
         for layer in reversed(range(len(weights))):
-            grads.insert(0, torch.mm(flowing.t(), kept[layer]))
+            grads.insert(0, multiply(flowing.t(), kept[layer]))
             if layer == 0 and grad_points is None:
                 break
-            flowing = torch.mm(flowing, weights[layer])
+            flowing = multiply(flowing, weights[layer])
             if layer:
                 relu_backward_(flowing, kept[layer], grad_input=flowing)
             elif grad_points is not None:

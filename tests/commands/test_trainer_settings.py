@@ -2,10 +2,12 @@ import logging
 
 import pytest
 import torch
+from scenes import tiny_model
 
 from nerf_lightning.commands import devices, trainer
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.errors import InputError
+from nerf_lightning.products import Linear
 
 
 @pytest.fixture
@@ -69,10 +71,13 @@ def test_what_a_run_measured_is_kept_but_does_not_overrule():
     assert named.inference_tile_points == 99
 
 
-def test_inference_is_without_gradients_and_in_the_precision_of_training():
-    with TrainerSettings(accelerator="cpu", precision="32-true").inference():
-        assert not torch.is_grad_enabled()
-        assert not torch.is_autocast_enabled("cpu")
+@pytest.mark.parametrize(("precision", "products"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
+def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, products):
+    model = TrainerSettings(accelerator="cpu", precision=precision).prepare(tiny_model())
+    layers = [module for module in model.modules() if isinstance(module, Linear)]
+    assert {layer.products for layer in layers} == {products}
+    assert len(layers) == 2 * 7
+    assert {parameter.dtype for parameter in model.parameters()} == {torch.float32}
 
 
 @pytest.mark.slow
