@@ -8,11 +8,16 @@ from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixel_file import MappedPixelStore
 from nerf_lightning.data.residence import GIGABYTE, num_bytes
+from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.free_memory import free_memory
+from nerf_lightning.products import cpu_multiplies_bfloat16
 from nerf_lightning.system import RadianceFieldSystem
 
 # What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.
 GAPS = 0.25
+# A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
+# rows as a rule (products.py: few_sizes), and kept: 0.7 MB each.
+COMPILED_PER_MATRIX = 3 * 2 * 700_000
 # Smaller shortages are within what a plan can know.
 NOTICEABLE = 1.05
 
@@ -95,10 +100,22 @@ def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: Ra
             Row("gradients", trial.gradients, where, cure=tables),
             Row("optimizer's state", trial.optimizer, where, cure=tables),
             Row("gaps in the heap, about", gaps, where),
+            *([Row("compiled products, about", _compiled(system), where)] if _compiles_products(settings) else []),
         ],
         steps,
         free,
     )
+
+
+def _compiles_products(settings: TrainerSettings) -> bool:
+    return settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
+
+
+def _compiled(system: RadianceFieldSystem) -> int:
+    encoders = [module for module in system.model.modules() if isinstance(module, Encoder)]
+    tables = {id(table) for encoder in encoders for table in encoder.parameters()}
+    matrices = [weight for weight in system.model.parameters() if weight.ndim == 2 and id(weight) not in tables]
+    return COMPILED_PER_MATRIX * len(matrices)
 
 
 def announce_memory(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> None:

@@ -48,6 +48,7 @@ def most(work):
 def built():
     progress = Progress()
     system = build_system(config, settings, scene, progress, 10, {})
+    settings.prepare(system.model)
     system.initialize()
     system.tile_points = TILE
     optimizer = system.configure_optimizers()
@@ -59,7 +60,7 @@ def warm(system, batches):
     "Load libraries and kernels, which are in no plan."
     few = batches.at(0, 0)[:8]
     system.accumulate_gradients(few, lambda loss: loss.backward())
-    with settings.inference():
+    with torch.no_grad():
         system.model(few.rays, None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
     system.forget_measurements()
@@ -69,13 +70,12 @@ def warm(system, batches):
 def train():
     for _ in range(2):
         batches.progress.batch_rays = batches.progress.largest_batch
-        with settings.autocast():
-            system.training_step(batches.at(0, batches.progress.rays_seen), 0)
+        system.training_step(batches.at(0, batches.progress.rays_seen), 0)
 
 
 def evaluate():
     system.eval()
-    with settings.inference():
+    with torch.no_grad():
         picture = render_picture(system.model, scene.cameras, 0, scene.near, scene.far, "white", TILE)
         image_metrics(picture.rgb, picture.rgb)
 
@@ -97,6 +97,7 @@ print(json.dumps([measured, plan.total]))
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 @pytest.mark.parametrize(
     ("model", "tile", "overrides"),
     [
@@ -105,9 +106,10 @@ print(json.dumps([measured, plan.total]))
         ("fast_proposal", 131_072, []),
     ],
 )
-def test_the_plan_is_right_to_a_fifth(model, tile, overrides):
+def test_the_plan_is_right_to_a_fifth(model, tile, overrides, precision):
     tests = str(Path(__file__).parents[1])
-    command = [sys.executable, "-c", MEASURE, tests, model, str(tile), *overrides]
+    settings = [f"trainer.precision={precision}", *overrides]
+    command = [sys.executable, "-c", MEASURE, tests, model, str(tile), *settings]
     seen = []
     for _ in range(5):  # the gaps in the heap make one run take a fifth more than another of the same program
         run = subprocess.run(command, check=True, capture_output=True, text=True)
