@@ -3,6 +3,7 @@
 from omegaconf import DictConfig
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.loading import quick_imports
 
 
 def prepare(arguments: list[str]) -> list[str]:
@@ -17,14 +18,16 @@ def prepare(arguments: list[str]) -> list[str]:
         return arguments
     if "," in checkpoints[-1]:
         raise InputError("A sweep over checkpoints needs the scene by name: add scene=... and its settings.")
-    from nerf_lightning.commands.recorded_scene import scene_overrides
+    with quick_imports():
+        from nerf_lightning.commands.recorded_scene import scene_overrides
 
     return [*scene_overrides(checkpoints[-1]), *arguments]
 
 
 def run(config: DictConfig) -> float:
     """Measure and return the PSNR."""
-    from nerf_lightning.commands.evaluating import evaluate
-    from nerf_lightning.commands.processes import on_all_processes
+    with quick_imports():
+        from nerf_lightning.commands.evaluating import evaluate
+        from nerf_lightning.commands.processes import on_all_processes
 
     return on_all_processes("eval", config, evaluate)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.data.json_files import read_json
 from nerf_lightning.errors import InputError
 from nerf_lightning.plain_yaml import read_plain_yaml
 
@@ -70,6 +69,9 @@ def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
+    # Imported late: it brings torch, and Hydra loads this module (of sweeps) before it composes any command's config.
+    from nerf_lightning.data.json_files import read_json
+
     try:
         content = read_json(path)
     except InputError:

@@ -19,8 +19,6 @@ from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.slurm import slurm_job
 from nerf_lightning.commands.sweep_job import JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.commands.sweep_record import SweepRecord
-from nerf_lightning.commands.sweep_table import job_rows
-from nerf_lightning.commands.table_files import print_rows, write_rows
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 
@@ -99,6 +97,10 @@ def watched(run: Callable[[], None]) -> None:
 
 
 def _end() -> list[JobRecord]:
+    # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
+    from nerf_lightning.commands.sweep_table import job_rows
+    from nerf_lightning.commands.table_files import print_rows, write_rows
+
     sweep = _begun[-1]
     for number, handler in sweep.former_handlers.items():
         signal.signal(number, handler)

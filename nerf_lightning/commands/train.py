@@ -6,6 +6,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.errors import InputError
+from nerf_lightning.loading import quick_imports
 
 
 def prepare(arguments: list[str]) -> list[str]:
@@ -40,9 +41,10 @@ def _refuse_second_sweep(arguments: list[str]) -> None:
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
     # Imported late: torch and Lightning take seconds, and --help needs neither.
-    from nerf_lightning.commands.preemption import preemptible
-    from nerf_lightning.commands.processes import on_all_processes
-    from nerf_lightning.commands.training import train
+    with quick_imports():
+        from nerf_lightning.commands.preemption import preemptible
+        from nerf_lightning.commands.processes import on_all_processes
+        from nerf_lightning.commands.training import train
 
     with preemptible():
         return on_all_processes("train", config, train)

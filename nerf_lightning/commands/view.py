@@ -4,6 +4,8 @@ import logging
 
 from omegaconf import DictConfig
 
+from nerf_lightning.loading import quick_imports
+
 log = logging.getLogger(__name__)
 
 
@@ -31,6 +33,7 @@ def prepare(arguments: list[str]) -> list[str]:
 
 def run(config: DictConfig) -> None:
     """Show the page until Ctrl-C."""
-    from nerf_lightning.commands.viewing import view
+    with quick_imports():
+        from nerf_lightning.commands.viewing import view
 
     view(config)

@@ -1,0 +1,48 @@
+"""What a run loads before its first step: nothing heavy that it does not need."""
+
+import subprocess
+import sys
+
+import pytest
+from running import FAST, REPOSITORY, start
+
+# Some are there in every installation, some only with extras; none has to do with a step.
+NOT_NEEDED = (
+    *("matplotlib", "scipy.signal", "scipy.stats", "scipy.linalg", "pandas", "sklearn", "skimage", "trimesh"),
+    *("pycolmap", "viser", "optuna", "sqlalchemy", "joblib", "submitit", "selenium", "IPython", "tensorflow"),
+)
+CALLBACK = """
+import sys
+from lightning.pytorch import Callback
+
+class Listed(Callback):
+    def on_train_batch_start(self, *given):
+        print("loaded:", [name for name in {names} if name in sys.modules])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [FAST, (*FAST, "data.crop_steps=0", "model=fast_small")])
+def test_nothing_that_a_step_can_do_without_is_loaded_before_it(model, tmp_path):
+    (tmp_path / "listed.py").write_text(CALLBACK.format(names=NOT_NEEDED))
+    process = start(
+        "train", *model, "trainer.max_steps=1", "trainer.tile_points=auto", "trainer.precision=32-true",
+        "final.video=false", "final.evaluate=false", "+callbacks.listed._target_=listed.Listed",
+        f"paths.output_dir={tmp_path / 'run'}", env={"PYTHONPATH": f"{tmp_path}:{REPOSITORY}"},
+    )  # fmt: skip
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, out
+    assert "loaded: []" in out.splitlines()
+
+
+def test_a_config_is_composed_without_torch():
+    code = (
+        "import sys; sys.argv = ['nerf', 'train', 'model=fast']\n"
+        "from nerf_lightning.cli import main\n"
+        "from nerf_lightning.commands import train\n"
+        "heavy = ('torch', 'lightning', 'numba', 'rich')\n"
+        "train.run = lambda config: print(config.seed, [name for name in heavy if name in sys.modules])\n"
+        "main()"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "0 []"
