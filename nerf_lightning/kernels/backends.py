@@ -4,7 +4,6 @@ import functools
 import importlib
 import logging
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -70,7 +69,6 @@ def set_threads() -> None:
 
 
 def _configure_numba() -> None:
-    _load_without_blas()
     import numba
 
     # Straight code of four equal operations becomes one of four lanes.
@@ -78,20 +76,6 @@ def _configure_numba() -> None:
     # The layer that every platform has, and whose threads sleep while torch works.
     if "NUMBA_THREADING_LAYER" not in os.environ:
         numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
-
-
-def _load_without_blas() -> None:
-    """Load numba's arrays without scipy's BLAS, which no kernel asks for and which takes longer than all of numba."""
-    blas = "scipy.linalg.cython_blas"
-    if blas in sys.modules:
-        return
-    sys.modules[blas] = None  # type: ignore[assignment]  # Python's word for what cannot be imported
-    try:
-        importlib.import_module("numba.np.arraymath")
-    except ImportError:
-        pass  # another numba, which will load what it needs when it needs it
-    finally:
-        del sys.modules[blas]
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from running import FAST, REPOSITORY, start
 
 # Some are there in every installation, some only with extras; none has to do with a step.
 NOT_NEEDED = (
-    *("matplotlib", "scipy.signal", "scipy.stats", "scipy.linalg", "pandas", "sklearn", "skimage", "trimesh"),
+    *("pandas", "sklearn", "skimage", "trimesh"),
     *("pycolmap", "viser", "optuna", "sqlalchemy", "joblib", "submitit", "selenium", "IPython", "tensorflow"),
 )
 CALLBACK = """
