@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Let the collector of cycles rest during imports: what is imported stays, and it would walk half a million objects.
+    """Let the collector of cycles rest during imports: what is imported stays, half a million objects to walk through.
 
     Later it passes them over, too, but for the end of the process: libraries in C++ complain of what is left then.
     """

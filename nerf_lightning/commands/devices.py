@@ -1,7 +1,8 @@
 """Which device computes, and in which numbers: the choice, and the reason that is printed once."""
 
 import logging
-from typing import Literal
+import os
+from typing import Literal, cast, get_args
 
 import torch
 
@@ -48,9 +49,19 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
 def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal["32-true", "tf32", "bf16-mixed"], str]:
     """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
 
+    NERF_LIGHTNING_PRECISION in the environment says what auto means: machines of one kind can be tried as another.
+
     Raises:
-        InputError: tf32 is asked of a device that has none.
+        InputError: tf32 is asked of a device that has none, or the environment names no precision.
     """
+    meant = os.environ.get("NERF_LIGHTNING_PRECISION", "auto")
+    if asked == "auto" and meant != "auto":
+        if meant not in get_args(Precision):
+            raise InputError(
+                f"NERF_LIGHTNING_PRECISION={meant} in the environment is no precision: give one of "
+                f"{', '.join(get_args(Precision))}, or unset it."
+            )
+        return choose_precision(cast(Precision, meant), device_type)[0], "as NERF_LIGHTNING_PRECISION says"
     if asked == "auto":
         native = has_native_bfloat16(device_type)
         return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"

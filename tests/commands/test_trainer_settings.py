@@ -12,6 +12,8 @@ from nerf_lightning.products import Linear
 
 @pytest.fixture
 def native(monkeypatch):
+    monkeypatch.delenv("NERF_LIGHTNING_PRECISION", raising=False)
+
     def pretend(answer):
         monkeypatch.setattr(devices, "has_native_bfloat16", lambda device_type: answer)
 
@@ -25,6 +27,19 @@ def test_precision_follows_the_machine(native):
     native(False)
     assert TrainerSettings(accelerator="cpu").precision == "32-true"
     assert "no native bfloat16" in TrainerSettings(accelerator="cpu").describe()
+
+
+def test_the_environment_says_what_auto_means(native, monkeypatch):
+    for answer, meant in ((True, "32-true"), (False, "bf16-mixed")):
+        native(answer)
+        monkeypatch.setenv("NERF_LIGHTNING_PRECISION", meant)
+        settings = TrainerSettings(accelerator="cpu")
+        assert (settings.precision, settings.reason) == (meant, "as NERF_LIGHTNING_PRECISION says")
+        other = "32-true" if meant == "bf16-mixed" else "bf16-mixed"
+        assert TrainerSettings(accelerator="cpu", precision=other).precision == other  # what is asked for is taken
+    monkeypatch.setenv("NERF_LIGHTNING_PRECISION", "half")
+    with pytest.raises(InputError, match=r"NERF_LIGHTNING_PRECISION=half .* is no precision: give one of auto, 32-true"):
+        TrainerSettings(accelerator="cpu")
 
 
 def test_a_precision_that_is_asked_for_is_taken_with_a_warning_where_it_is_slow(native, caplog):
