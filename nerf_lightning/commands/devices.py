@@ -89,7 +89,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal
     if asked == "auto":
         native = has_native_bfloat16(device_type)
         return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"
-    if asked == "tf32" and not _has_tf32(device_type):
+    if asked == "tf32" and not has_tf32(device_type):
         raise InputError(
             "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
             "device here is none. Use trainer.precision=32-true, or auto."
@@ -116,5 +116,6 @@ def _cpu_says(probe: str) -> bool:
         return False
 
 
-def _has_tf32(device_type: str) -> bool:
+def has_tf32(device_type: str) -> bool:
+    """Tell whether the device multiplies matrices in TensorFloat-32."""
     return device_type == "cuda" and torch.cuda.get_device_capability() >= (8, 0)
