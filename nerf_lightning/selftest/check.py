@@ -114,5 +114,6 @@ def largest(differences: list[float]) -> float:
 
 def _told(error: Exception) -> str:
     text = " ".join(f"{type(error).__name__}: {error}".split())[:MOST_LETTERS]
-    frames = [each for each in traceback.extract_tb(error.__traceback__) if "nerf_lightning" in each.filename]
+    # The last line of ours: the first is that of this file.
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if "nerf_lightning" in each.filename][1:]
     return f"{text} (line {frames[-1].lineno} of {frames[-1].filename.rpartition('/')[2]})" if frames else text

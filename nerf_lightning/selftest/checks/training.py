@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import on_device
+from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.products import Products
 from nerf_lightning.schedules.exponential import ExponentialDecay
@@ -22,6 +23,8 @@ SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
 # 0.5 to 0.75 dB. What rounding does to a run must be less than that: all of 0.5 dB where products have 8 bits, half
 # where they have 11, and a tenth where only the order of sums differs.
 PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 0.5}
+LEARNT = 1e4
+"""Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
 CPU = torch.device("cpu")
 TORCH_ALONE = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba", "mlp_tiles")
 
@@ -58,7 +61,12 @@ class Training:
         setattr(self.system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
 
     def gradients(self) -> dict[str, Tensor]:
-        """Return the gradients of the first batch."""
+        """Return the gradients of the first batch, with tables as large as trained ones are."""
+        # Fresh ones are all but zero: whatever is done with them would hardly matter.
+        with torch.no_grad():
+            for encoder in self.system.modules():
+                for table in encoder.parameters() if isinstance(encoder, Encoder) else ():
+                    table.mul_(LEARNT)
         self.system.optimizers().zero_grad()  # type: ignore[union-attr]
         self.system.accumulate_gradients(self.loader.at(0, 0).to(self.system.device), lambda loss: loss.backward())
         named = self.system.model.named_parameters()
