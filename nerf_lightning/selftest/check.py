@@ -66,7 +66,7 @@ def carried_out(check: Check) -> Row:
 def relative(found: Tensor, expected: Tensor) -> float:
     """Return the largest difference of two tensors over the largest value that is expected; nan where one is.
 
-    >>> relative(torch.tensor([1.0, 2.5]), torch.tensor([1.0, 2.0]))
+    >>> relative(Tensor([1.0, 2.5]), Tensor([1.0, 2.0]))
     0.25
     """
     if found.shape != expected.shape:

@@ -1,7 +1,8 @@
 """Within a step the host never waits for the GPU: no synchronisation, no copy to the host.
 
-What is read on the host, and when, by name: `PackedLevel.update` and the grid's content every 16 steps, with the size
-of the batch that follows; `CollapseGuard` every 25, `Monitor` and `NanGuard` every 50 and 100.
+What is read on the host, and when, by name: `PackedLevel.update` every 16 steps (how many samples rays had, by which
+the tiles of the next step are cut; at its first time, which cells there are), `MaskedLevel.update` at its first time,
+`CollapseGuard` every 25 steps, `Monitor` every 50, `NanGuard` every 100.
 """
 
 import warnings
@@ -16,12 +17,13 @@ from lightning.pytorch import Callback
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
-from nerf_lightning.models.packed_level import PackedLevel
+from nerf_lightning.models.grid_level import GridLevel
+from nerf_lightning.schedules.exponential import ExponentialDecay
 from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.system import RadianceFieldSystem
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
 WARM = 2  # the optimizer's state, numbers kept on the device, compiled kernels
 
 
@@ -40,7 +42,7 @@ def never_waiting(device):
 
 def updates(run) -> set[int]:
     """The steps in which a grid is updated, and read."""
-    levels = [level for level in run.system.model.modules() if isinstance(level, PackedLevel)]
+    levels = [level for level in run.system.model.modules() if isinstance(level, GridLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 
@@ -86,7 +88,7 @@ class Watch(Callback):
             torch.cuda.set_sync_debug_mode("warn")
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        found = [str(each.message) for each in self.caught if "synchroniz" in str(each.message)]
+        found = [str(each.message) for each in self.caught if "called a synchronizing" in str(each.message)]
         self.waits[trainer.global_step] = len(found)
         self.caught.clear()
 
@@ -103,7 +105,7 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     model = chosen.model()
     model.place(scene)
     system = RadianceFieldSystem(
-        model, chosen.loss(), chosen.optimizer, lambda step, count: 1.0, progress, 48, 0, "random", 8192, 1.0, None, {}
+        model, chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0, None, {}
     )
     system.initialize()
     settings.prepare(model)

@@ -44,8 +44,6 @@ def test_every_model_follows_the_cpu(model, device):
 @pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_precision_learns_what_the_cpu_learns(method, products, device):
-    if device.type == "cpu" and products == "tf32":
-        pytest.skip("only NVIDIA GPUs multiply in tf32")
     chosen = [check for check in training.checks(a_place(device=device.type, products=(products,)))]
     rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {products}: ")]
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
