@@ -54,6 +54,13 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     assert "the torch twins of its kernels run instead" in caplog.text
 
 
+def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, caplog):
+    monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial("PTX assembly failed"))
+    assert backends.cuda_twin("hash_grid_triton", torch.device("cuda")) is None
+    assert "triton cannot be used here (RuntimeError: PTX assembly failed)" in caplog.text
+    assert backends.cuda_twin("hash_grid_triton", torch.device("cpu")) is None
+
+
 def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(anew, monkeypatch, caplog):
     found, asked = module_whose_trial(), []
 

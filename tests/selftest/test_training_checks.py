@@ -1,5 +1,8 @@
 """Small trainings: what is wrong on purpose is noticed, by the gradients or by the PSNR."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from self_tested import a_place, rows_of
@@ -70,6 +73,28 @@ def test_without_a_compiler_torch_compile_is_not_run(monkeypatch):
     monkeypatch.setattr(training.shutil, "which", lambda name: None)
     (row,) = rows_of(training.checks(a_place(compiles=True)), "compiled")
     assert (row.outcome, row.note) == ("not run", "there is no C++ compiler, which torch.compile needs on the CPU")
+
+
+COMPILED = """
+import torch
+from nerf_lightning.selftest.checks import training
+
+compile_it = torch.nn.Module.compile
+torch.nn.Module.compile = lambda field, **how: compile_it(field, backend="eager", **how)
+for products in ("float32", "tf32", "bfloat16"):
+    torch._dynamo.reset()
+    made = training.Training("coarse and fine MLP", training.CPU, products, None)
+    made.system.model.compile_fields()
+    made.gradients()
+print(dict(torch._dynamo.utils.counters["graph_break"]))
+"""
+
+
+@pytest.mark.slow
+def test_a_compiled_field_is_one_program():
+    """In a process without the checks of shapes, which torch.compile does not look into."""
+    result = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True)
+    assert result.stdout == "{}\n", result.stdout + result.stderr[-2000:]
 
 
 def test_the_perceptrons_of_a_training_are_the_kernels(monkeypatch):
