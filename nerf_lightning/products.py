@@ -119,7 +119,14 @@ def cpu_multiplies_bfloat16() -> bool:
     """Tell whether this CPU, as far as torch is allowed to use it (ATEN_CPU_CAPABILITY), multiplies bfloat16 itself."""
     probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
     allowed = torch.backends.cpu.get_cpu_capability() not in ("DEFAULT", "AVX2")
-    return allowed and any(getattr(torch.cpu, probe, bool)() for probe in probes)
+    return allowed and any(map(_cpu_says, probes))
+
+
+def _cpu_says(probe: str) -> bool:
+    try:
+        return bool(getattr(torch.cpu, probe, bool)())
+    except (RuntimeError, NotImplementedError, OSError):  # a CPU that torch does not know has no such thing
+        return False
 
 
 def multiply(left: Tensor, right: Tensor, added: Tensor | None = None) -> Tensor:

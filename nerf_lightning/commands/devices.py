@@ -5,6 +5,7 @@ import os
 from typing import Literal, cast, get_args
 
 import torch
+from torch import distributed
 
 from nerf_lightning.commands import xla
 from nerf_lightning.errors import InputError
@@ -16,6 +17,8 @@ Accelerator = Literal["auto", "cpu", "gpu", "mps", "tpu"]
 DeviceType = Literal["cpu", "cuda", "mps", "xla"]
 Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
 LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps", "xla": "tpu"}
+LEAST_GPU_MEMORY = 1_000_000_000
+"""Bytes of a GPU that must be free: tiles shrink to what there is, but libraries and tables need some room."""
 
 
 def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
@@ -46,6 +49,39 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
     return "cpu", "no GPU found"
 
 
+def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> tuple[DeviceType, str]:
+    """Try a chosen GPU, and return it with the reason for it; where it was not asked for, the CPU can take its place.
+
+    Raises:
+        InputError: the GPU cannot be used, and was asked for, or others of the run have theirs.
+    """
+    trouble = _trouble_of_gpu() if chosen[0] == "cuda" else None
+    if trouble is None:
+        return chosen
+    if accelerator == "gpu" or distributed.is_initialized():
+        raise InputError(
+            f"torch sees a GPU here, and it cannot be used: {trouble}. nvidia-smi shows who uses it and which driver "
+            "there is. Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
+        )
+    log.warning(
+        "torch sees a GPU here, and it cannot be used: %s. The CPU computes instead; trainer=gpu insists on the GPU.",
+        trouble,
+    )
+    return "cpu", "the GPU cannot be used"
+
+
+def _trouble_of_gpu() -> str | None:
+    try:
+        free, total = torch.cuda.mem_get_info()
+        if free < LEAST_GPU_MEMORY:
+            return f"{free / 1e9:.1f} GB of its {total / 1e9:.1f} GB of memory are free, and 1 GB is the least"
+        square = torch.ones(8, 8, device="cuda")
+        right = bool((square @ square == 8.0).all())
+    except RuntimeError as error:  # no memory, no kernels for this GPU, a driver that does not fit
+        return " ".join(str(error).split())[:200]
+    return None if right else "it computes 8 times 1 wrongly"
+
+
 def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal["32-true", "tf32", "bf16-mixed"], str]:
     """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
 
@@ -65,7 +101,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal
     if asked == "auto":
         native = has_native_bfloat16(device_type)
         return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"
-    if asked == "tf32" and not _has_tf32(device_type):
+    if asked == "tf32" and not has_tf32(device_type):
         raise InputError(
             "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
             "device here is none. Use trainer.precision=32-true, or auto."
@@ -82,5 +118,6 @@ def has_native_bfloat16(device_type: str) -> bool:
     return cpu_multiplies_bfloat16() if device_type == "cpu" else device_type == "xla"
 
 
-def _has_tf32(device_type: str) -> bool:
+def has_tf32(device_type: str) -> bool:
+    """Tell whether the device multiplies matrices in TensorFloat-32."""
     return device_type == "cuda" and torch.cuda.get_device_capability() >= (8, 0)

@@ -13,6 +13,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.errors import InputError
+from nerf_lightning.models.tiles import is_out_of_memory
 
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
@@ -26,6 +27,12 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         return _missing_plugin(str(error)) or explain(error, command, conf_folder)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
+    if isinstance(error, RuntimeError) and is_out_of_memory(error):
+        reason = " ".join(str(error).split()).partition(". ")[0]
+        return (
+            f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
+            "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."
+        )
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."

@@ -13,7 +13,14 @@ from torch import distributed
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.commands import xla
-from nerf_lightning.commands.devices import LIGHTNING_NAMES, Accelerator, Precision, choose_device, choose_precision
+from nerf_lightning.commands.devices import (
+    LIGHTNING_NAMES,
+    Accelerator,
+    Precision,
+    choose_device,
+    choose_precision,
+    working_device,
+)
 from nerf_lightning.commands.machine import prepare_machine
 from nerf_lightning.commands.strategy import Launcher, OneSumPerStep, cluster_environment, processes_here
 from nerf_lightning.errors import InputError
@@ -71,7 +78,7 @@ class TrainerSettings:
         if isinstance(tile_points, int) and tile_points < 1:
             raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
         self.max_steps, self.max_epochs = max_steps, max_epochs
-        self.device_type, self.device_reason = choose_device(accelerator)
+        self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
         self.precision, self.reason = choose_precision(precision, self.device_type)

@@ -4,6 +4,7 @@ import functools
 import importlib
 import logging
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -13,17 +14,59 @@ import torch
 log = logging.getLogger(__name__)
 
 
+_reasons: dict[str, str] = {}
+
+
 @functools.cache
 def twin(module: str) -> ModuleType | None:
-    """Import a module of compiled kernels; None, and one warning that names the cause, where that is impossible."""
+    """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible."""
     library = "triton" if module.endswith("_triton") else "numba"
     try:
         if library == "numba":
             _configure_numba()
-        return importlib.import_module(f"nerf_lightning.kernels.{module}")
+        found = _imported(module)
+        # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
+        found.trial()
+        return found
     except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
-        _warn_once(library, f"{type(error).__name__}: {error}")
+        _reasons[module] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        _warn_once(library, _reasons[module])
         return None
+
+
+def why_not(module: str) -> str:
+    """Return why there is no twin, once `twin` has said so."""
+    return _reasons.get(module, "unknown")
+
+
+def _imported(module: str) -> ModuleType:
+    name = f"nerf_lightning.kernels.{module}"
+    try:
+        return importlib.import_module(name)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
+            raise
+    _cache_elsewhere()
+    return importlib.import_module(name)
+
+
+@functools.cache
+def _cache_elsewhere() -> None:
+    """Let numba keep what it compiles in a folder that lasts as long as this process."""
+    import numba
+
+    folder = tempfile.TemporaryDirectory(prefix="nerf-numba-")
+    _kept.append(folder)
+    numba.config.CACHE_DIR = folder.name  # type: ignore[attr-defined]
+    log.warning(
+        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
+        "that is set), so every start compiles the kernels anew, which takes about a minute. Set NUMBA_CACHE_DIR to a "
+        "folder that can be written."
+    )
+
+
+_kept: list[tempfile.TemporaryDirectory[str]] = []
+"""Folders that go when the process does."""
 
 
 _switched_off: set[str] = set()
@@ -84,6 +127,6 @@ def _warn_once(library: str, reason: str) -> None:
         "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. "
         "Reinstall it (pip install --force-reinstall %s), or read its list of supported machines.",
         library,
-        " ".join(reason.split())[:200],
+        reason,
         library,
     )

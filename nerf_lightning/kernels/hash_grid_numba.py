@@ -57,6 +57,18 @@ def point_gradient(
     return out
 
 
+def trial() -> None:
+    """Run every kernel once on next to nothing, for the widths that conf/model uses; it raises what compilers raise."""
+    from nerf_lightning.kernels.hash_grid import hash_grid_layout
+
+    layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3)
+    for features in (2, 4):
+        table, grad = torch.zeros(layout.offsets[-1], features), torch.ones(4, 2 * features)
+        forward(table, points, layout)
+        add_table_gradient(table, points, grad, layout)
+        point_gradient(table, points, grad, layout)
+
+
 def _arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
     resolutions = np.array(layout.resolutions, np.int32)
     hashed = np.array([layout.is_hashed(level) for level in range(len(resolutions))])

@@ -3,6 +3,7 @@
 Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
+import functools
 from typing import TYPE_CHECKING, no_type_check
 
 import torch
@@ -58,6 +59,20 @@ def point_gradient(
     return leaf.grad
 
 
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    from nerf_lightning.kernels.hash_grid import hash_grid_layout
+
+    layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
+    table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)
+    forward(table, points, layout)
+    add_table_gradient(table, points, grad, layout)
+    if not bool(table.isfinite().all()):  # read, so that a fault in the kernels shows here
+        raise RuntimeError("a trial of its kernels gave numbers that are not finite")
+
+
+# Kept: made anew, these numbers would go from the host to the device in each call, and the host would wait for it.
+@functools.cache
 def _levels(layout: "HashGridLayout", device: torch.device) -> tuple[Tensor, Tensor, Tensor, int]:
     hashed = [int(layout.is_hashed(level)) for level in range(len(layout.resolutions))]
     numbers = (layout.resolutions, layout.offsets[:-1], hashed)

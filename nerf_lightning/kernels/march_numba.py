@@ -9,7 +9,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from nerf_lightning.geometry.boxes import center_and_half
-from nerf_lightning.kernels.march import BLOCK, OPAQUE, March, OccupancyCells
+from nerf_lightning.kernels.march import BLOCK, OPAQUE, March, OccupancyCells, blocks_of
 from nerf_lightning.types.rays import PackedSamples, RayBundle
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -35,6 +35,15 @@ def march(
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
     _pack(*(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
     return PackedSamples(*out, bounds, bounds[-1]), following
+
+
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
+    rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, one.long(), along)
+    cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    grid = OccupancyCells(aabb, cells, blocks_of(cells), cells.float())
+    march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
 
 
 @njit(fastmath=True)

@@ -49,6 +49,17 @@ def num_visible(density: Float[Tensor, "n"], samples: PackedSamples, opaque_belo
     return out
 
 
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    bounds, along = torch.tensor([0, 2]), torch.arange(2.0)
+    samples = PackedSamples(torch.zeros(2, dtype=torch.long), along, along + 1.0, bounds, bounds[-1])
+    density, rgb = torch.ones(2), torch.ones(2, 3)
+    foreground, opacity, depth, weights = integrate(density, rgb, samples.starts, samples.ends, bounds)
+    grads = (foreground, opacity, depth, weights)
+    integrate_gradient(density, rgb, samples.starts, samples.ends, bounds, weights, *grads)
+    num_visible(density, samples, 0.01)
+
+
 @njit(parallel=True, cache=True)
 @no_type_check
 def _integrate(density, rgb, starts, ends, bounds, foreground, opacity, depth, weights):

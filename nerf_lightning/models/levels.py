@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
 from nerf_lightning.fields.base import Field
+from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.products import Products
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.quadrature import composite
@@ -209,6 +210,9 @@ class RadianceModel(nn.Module):
 
     def compile_fields(self) -> list[str]:
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
+        for module in self.modules():
+            if isinstance(module, Contracted):
+                bool(module)  # read from its buffer in a compiled field, it would cut the program in pieces
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
     def update(self, step: int, key: int) -> None:

@@ -94,7 +94,8 @@ class PackedLevel(GridLevel):
         if random is None and not torch.is_grad_enabled():
             return self._render(rays, background)
         samples, features = self.sampler(rays, self.field.screen, random)
-        dropped = samples.found - samples.found.clamp(max=self.sampler.capacity) if samples.starts.is_cuda else 0
+        capacity = self.sampler.capacity_on(rays.near.device)
+        dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         count = torch.full_like(samples.found, rays.near.shape[0])
         self.tally += torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
         return composite_packed(self._ask(rays, samples, random, features), samples, rays, background)

@@ -143,7 +143,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             screen_fn: the field's, asked without gradients.
             random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
         """
-        capacity = self.capacity if rays.near.is_cuda else None
+        capacity = self.capacity_on(rays.near.device)
         samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
         if capacity is not None or self.opaque_below == 0:
             return samples, None
@@ -151,6 +151,10 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             density, features = screen_fn(positions_of(rays, samples))
             kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
             return samples.at(*kept), None if features is None else features[kept[0]]
+
+    def capacity_on(self, device: torch.device) -> int | None:
+        """Return the size of the arrays of samples; None where sizes may be read on the host."""
+        return self.capacity if device.type == "cuda" else None
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""

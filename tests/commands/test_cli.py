@@ -9,7 +9,7 @@ from nerf_lightning.cli import find_commands
 def test_help_lists_every_command_with_its_line(nerf):
     result = nerf("--help")
     assert result.code == 0
-    for name in ("train", "eval", "render", "bench"):
+    for name in ("train", "eval", "render", "bench", "selftest"):
         assert f"\n  {name}" in result.out
     assert nerf().out == result.out
     assert all(summary for summary in find_commands().values())
@@ -24,7 +24,7 @@ def test_help_imports_nothing_heavy():
     assert output.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "view"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "view", "selftest"])
 def test_help_of_a_command_lists_groups_and_examples(nerf, command):
     result = nerf(command, "--help")
     assert result.code == 0

@@ -59,7 +59,7 @@ def test_every_export_builds(option):
     assert isinstance(build(composed("export", f"what={option}").what), Export)
 
 
-@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view"])
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view", "selftest"])
 def test_every_command_composes(command):
     assert "trainer" in composed(command)
 

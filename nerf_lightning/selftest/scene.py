@@ -1,0 +1,57 @@
+"""The scene of the self-test: a ball whose colour is its normal, traced on the spot."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
+from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.types.scene import PixelStore, Scene
+
+RADIUS = 0.8
+NUM_VIEWS, SIZE = 10, 20
+FOCAL = 1.6 * SIZE
+TRAIN, HELD_OUT = tuple(range(8)), (8, 9)
+
+
+def ball_scene() -> Scene:
+    """Return ten small views from a circle, with alpha; eight train, two are held out."""
+    angle = 2.4 * torch.arange(NUM_VIEWS)  # the golden angle: every part of the views is spread over the circle
+    eyes = 4.0 * torch.stack([angle.cos(), angle.sin(), 0.4 + 0.0 * angle], dim=-1)
+    cameras = pinhole_cameras(look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.0, 0.0, 1.0])), FOCAL, SIZE, SIZE)
+    near, far = torch.full((NUM_VIEWS,), 2.0), torch.full((NUM_VIEWS,), 6.5)
+    pictures = []
+    for view in range(NUM_VIEWS):
+        rays = rays_through_pixels(cameras, all_pixels(cameras, view), near, far)
+        along = -(rays.origins * rays.directions).sum(-1)
+        closest = rays.origins + along[..., None] * rays.directions
+        half = (RADIUS**2 - closest.square().sum(-1)).clamp(min=0).sqrt()
+        normal = (closest - half[..., None] * rays.directions) / RADIUS
+        hit = (half > 0).float()[..., None]
+        pictures.append(torch.cat([(0.5 + 0.5 * normal).clamp(0, 1) * hit, hit], dim=-1))
+    rgba = (torch.stack(pictures) * 255).round().to(torch.uint8).reshape(-1, 4)
+    sizes = torch.full((NUM_VIEWS,), SIZE)
+    return Scene(
+        name="ball",
+        cameras=cameras,
+        pixels=PixelStore(rgba, torch.arange(NUM_VIEWS) * SIZE**2, sizes, sizes, has_transparency=True),
+        near=near,
+        far=far,
+        aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]),
+        splits={"train": TRAIN, "val": HELD_OUT, "test": HELD_OUT},
+        view_names=tuple(f"ball_{view}" for view in range(NUM_VIEWS)),
+        background="random",
+        to_user=torch.eye(4),
+        protocol={},
+        truth=None,
+    )
+
+
+def write_npz(path: Path) -> None:
+    """Write the ball in front of black, as a capture that the command line reads (scene=npz)."""
+    scene = ball_scene()
+    pictures = torch.stack([scene.pixels.view(view) for view in range(NUM_VIEWS)]).float() / 255
+    poses = torch.eye(4).repeat(NUM_VIEWS, 1, 1)
+    poses[:, :3] = scene.cameras.c2w
+    np.savez(path, images=(pictures[..., :3] * pictures[..., 3:]).numpy(), poses=poses.numpy(), focal=FOCAL)

@@ -1,0 +1,46 @@
+"""What tests on a GPU share: the device, a capture, and how they are tried where there is none.
+
+`pytest -m gpu tests/gpu` on a machine with a GPU. NERF_LIGHTNING_GPU_TESTS_ON=cpu takes the CPU for the device, so that
+the tests themselves can be tried; what only a GPU can be asked (synchronisation, copies, memory) is skipped there.
+"""
+
+import os
+
+import pytest
+import torch
+
+from nerf_lightning.commands.machine import prepare_machine
+from nerf_lightning.selftest.scene import write_npz
+
+CHOSEN = os.environ.get("NERF_LIGHTNING_GPU_TESTS_ON", "cuda")
+
+
+@pytest.fixture(autouse=True)
+def device():
+    """The device that is tested."""
+    if CHOSEN == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device, and torch sees none (NERF_LIGHTNING_GPU_TESTS_ON=cpu tries without one)")
+    prepare_machine(None)
+    return torch.device(CHOSEN)
+
+
+@pytest.fixture
+def cuda(device):
+    """The device, where it is a GPU: for what cannot be asked of a CPU."""
+    if device.type != "cuda":
+        pytest.skip("only a GPU can be asked this")
+    return device
+
+
+@pytest.fixture
+def trainer(device):
+    """The override that chooses the device."""
+    return "trainer=gpu" if device.type == "cuda" else "trainer=cpu"
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory):
+    """The ball as an npz file."""
+    path = tmp_path_factory.mktemp("capture") / "ball.npz"
+    write_npz(path)
+    return path

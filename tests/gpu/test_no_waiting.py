@@ -1,0 +1,125 @@
+"""Within a step the host never waits for the GPU: no synchronisation, no copy to the host.
+
+What is read on the host, and when, by name: `PackedLevel.update` every 16 steps (how many samples rays had, by which
+the tiles of the next step are cut; at its first time, which cells there are), `MaskedLevel.update` at its first time,
+`CollapseGuard` every 25 steps, `Monitor` every 50, `NanGuard` every 100.
+"""
+
+import warnings
+from contextlib import contextmanager
+
+import pytest
+import torch
+from configs import options
+from gpu_training import default_callbacks, step_by_step
+from lightning.pytorch import Callback
+
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.ray_batches import Progress
+from nerf_lightning.models.grid_level import GridLevel
+from nerf_lightning.schedules.exponential import ExponentialDecay
+from nerf_lightning.selftest.models import METHODS
+from nerf_lightning.selftest.scene import ball_scene
+from nerf_lightning.system import RadianceFieldSystem
+
+pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
+WARM = 2  # the optimizer's state, numbers kept on the device, compiled kernels
+
+
+@contextmanager
+def never_waiting(device):
+    """Raise where the host waits for the device; where there is no GPU, do nothing."""
+    if device.type != "cuda":
+        yield
+        return
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def updates(run) -> set[int]:
+    """The steps in which a grid is updated, and read."""
+    levels = [level for level in run.system.model.modules() if isinstance(level, GridLevel)]
+    every = min((level.sampler.update_every for level in levels), default=1 << 30)
+    return {1, *range(0, 1000, every)}
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+@pytest.mark.parametrize("model", options("model"))
+def test_no_step_waits(model, precision, device):
+    """Making the batch from resident pixels included."""
+    run = step_by_step(model, device, precision)
+    for step in range(20):
+        if step < WARM or step in updates(run):
+            run.step()
+        else:
+            with never_waiting(device):
+                run.step()
+    assert bool(run.all_losses().isfinite().all())
+
+
+@pytest.mark.parametrize("model", ["nerf_tiny", "fast_small", "fast_proposal"])
+def test_nothing_is_copied_to_the_host_within_a_step(model, cuda):
+    from torch.profiler import ProfilerActivity, profile
+
+    run = step_by_step(model, cuda)
+    for _ in range(3):
+        run.step()
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as seen:
+        for _ in range(8):
+            run.step()
+    names = [event.name for event in seen.events()]
+    assert not [name for name in names if "DtoH" in name]
+    # Only the numbers of the batch's pixels go there, by way of pinned memory.
+    assert not [name for name in names if "HtoD" in name and "Pinned" not in name]
+
+
+class Watch(Callback):
+    """Write down how often the host waited, from the end of one step to the end of the next; to stand last."""
+
+    def __init__(self, device):
+        self.device, self.caught, self.waits = device, [], {}
+
+    def on_train_start(self, trainer, pl_module):
+        if self.device.type == "cuda":
+            torch.cuda.set_sync_debug_mode("warn")
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        found = [str(each.message) for each in self.caught if "called a synchronizing" in str(each.message)]
+        self.waits[trainer.global_step] = len(found)
+        self.caught.clear()
+
+    def on_train_end(self, trainer, pl_module):
+        if self.device.type == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("resident", [True, False])
+def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, resident, device, tmp_path):
+    scene, progress, chosen = ball_scene(), Progress(), METHODS[method]
+    settings = TrainerSettings(max_steps=48, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=48)
+    model = chosen.model()
+    model.place(scene)
+    system = RadianceFieldSystem(
+        model, chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0, None, {}
+    )
+    system.initialize()
+    settings.prepare(model)
+    watch = Watch(device)
+    quiet = [each for each in default_callbacks() if type(each).__name__ in ("CollapseGuard", "NanGuard", "Monitor")]
+    trainer = settings.build(tmp_path, 48, [*quiet, watch], [])
+    budget = "auto" if resident else 0
+    with warnings.catch_warnings(record=True) as watch.caught:
+        warnings.simplefilter("always")
+        trainer.fit(system, RayDataModule(scene, progress, 0, 48, batch_rays=96, val_rays=96, device_budget=budget))
+    assert len(watch.waits) == 48
+    # A grid is updated at the beginning of the step that makes these counts one more.
+    named = {1, 2, *(step + 1 for step in range(0, 48, 8)), *range(0, 49, 16), *range(0, 49, 25), 48}
+    waited = {step: count for step, count in watch.waits.items() if count and step not in named}
+    assert not waited
+    if device.type == "cuda":
+        assert watch.waits[25], "the collapse guard reads the device there: the watch must have seen it"

@@ -1,0 +1,98 @@
+"""Training on the GPU: every model yaml follows the CPU, every precision learns, compiled fields are the same."""
+
+import pytest
+import torch
+from configs import options
+from gpu_training import step_by_step
+from self_tested import a_place
+
+from nerf_lightning.kernels.backends import without
+from nerf_lightning.selftest.check import carried_out
+from nerf_lightning.selftest.checks import training
+from nerf_lightning.selftest.models import METHODS
+
+pytestmark = [pytest.mark.gpu, pytest.mark.slow]
+STEPS, TILE_POINTS = 50, 8192
+CPU = torch.device("cpu")
+# Of the difference that another order of sums makes on the CPU: how much more a GPU's may make.
+MORE = 10.0
+LEAST = 1e-4  # relative; the order of sums of a step's some ten thousand samples, 2^-24 each, at worst: 6e-4
+
+
+def losses(model, device, tile_points=None):
+    run = step_by_step(model, device, tile_points=tile_points)
+    for _ in range(STEPS):
+        run.step()
+    assert run.system.guard.skipped == 0
+    return run.all_losses()
+
+
+@pytest.mark.parametrize("model", options("model"))
+def test_every_model_follows_the_cpu(model, device):
+    """For 50 steps, within ten times what another order of sums does to the CPU's own losses up to that step."""
+    expected = losses(model, CPU)
+    with without(*training.TORCH_ALONE):
+        otherwise = losses(model, CPU, TILE_POINTS)
+    found = losses(model, device, TILE_POINTS)
+    apart = ((otherwise - expected).abs() / expected).cummax(0).values
+    bound = MORE * apart.clamp(min=LEAST)
+    gone = (found - expected).abs() / expected
+    assert bool((gone <= bound).all()), f"apart by {gone.tolist()}, bound {bound.tolist()}"
+    assert float(expected[-10:].mean()) < float(expected[:3].mean())
+
+
+@pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_precision_learns_what_the_cpu_learns(method, products, device):
+    chosen = [check for check in training.checks(a_place(device=device.type, products=(products,)))]
+    rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {products}: ")]
+    assert [row.outcome for row in rows] == ["ok", "ok"], rows
+
+
+@pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
+def test_compiled_fields_compute_the_same(products, cuda):
+    place = a_place(device="cuda", products=(products,), chosen=products, compiles=True)
+    (row,) = [carried_out(check) for check in training.checks(place) if "compiled" in check.name]
+    assert row.outcome == "ok", row
+
+
+def test_tf32_is_really_used_and_float32_is_not_lowered(cuda):
+    from nerf_lightning.products import linear
+
+    features, weight = torch.randn(512, 512, device=cuda), torch.randn(512, 512, device=cuda)
+    exact = features.double() @ weight.double().t()
+    errors = {p: float((linear(features, weight, None, p) - exact).norm() / exact.norm()) for p in ("float32", "tf32")}
+    assert errors["float32"] < 1e-6
+    assert 1e-5 < errors["tf32"] < 2e-3
+
+
+def test_batches_of_resident_pixels_are_those_of_the_host(cuda):
+    (row,) = [carried_out(check) for check in training.checks(a_place(device="cuda")) if "pixels" in check.name]
+    assert row.outcome == "ok", row
+
+
+def test_a_step_without_memory_is_repeated_in_smaller_tiles(cuda, caplog):
+    torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(cuda).total_memory
+    run = step_by_step("nerf", cuda, tile_points=1 << 20)
+    run.step()
+    torch.cuda.empty_cache()
+    torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved() + 60_000_000) / total)
+    try:
+        for _ in range(2):
+            run.step()
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0)
+    assert "no memory for so large a tile" in caplog.text
+    assert bool(run.all_losses().isfinite().all())
+
+
+def test_memory_does_not_grow_from_step_to_step(cuda):
+    run = step_by_step("fast_small", cuda)
+    held = []
+    for number in range(60):
+        run.step()
+        run.losses.clear()
+        if number % 20 == 19:
+            held.append(torch.cuda.memory_allocated())
+    assert max(held[1:]) - held[0] < 1_000_000, held

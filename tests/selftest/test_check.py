@@ -1,0 +1,89 @@
+"""How a check is judged."""
+
+import math
+
+import pytest
+import torch
+
+from nerf_lightning.selftest.all_checks import carry_out
+from nerf_lightning.selftest.check import (
+    CannotRun,
+    Check,
+    carried_out,
+    gradient_bound,
+    largest,
+    norm_apart,
+    relative,
+    value_bound,
+)
+from nerf_lightning.selftest.table import remarks
+
+
+def a_check(difference, bound=0.1):
+    def found():
+        if isinstance(difference, Exception):
+            raise difference
+        return difference
+
+    return Check("a thing", bound, "so it is", found)
+
+
+@pytest.mark.parametrize(
+    ("difference", "outcome", "note"),
+    [
+        (0.1, "ok", "so it is"),
+        (0.11, "wrong", "so it is"),
+        (math.nan, "wrong", "so it is"),
+        (math.inf, "wrong", "so it is"),
+        (CannotRun("no triton"), "not run", "no triton"),
+        (ZeroDivisionError("by\nnothing"), "wrong", "ZeroDivisionError: by nothing"),
+        (torch.OutOfMemoryError("CUDA out of memory"), "wrong", "OutOfMemoryError: CUDA out of memory"),
+    ],
+)
+def test_a_check_is_judged_by_its_bound_and_whatever_it_raises_is_an_answer(difference, outcome, note):
+    row = carried_out(a_check(difference))
+    assert (row.outcome, row.note) == (outcome, note)
+
+
+def test_one_that_raises_does_not_keep_the_others_from_running():
+    announced = []
+    rows = carry_out([a_check(ValueError("bad")), a_check(0.0)], announced.append)
+    assert [row.outcome for row in rows] == ["wrong", "ok"]
+    assert announced == ["a thing", "a thing"]
+
+
+def test_what_is_not_right_is_told_in_words():
+    rows = [carried_out(a_check(each)) for each in (0.0, 0.5, CannotRun("no triton"), ValueError("bad"))]
+    assert remarks(rows) == [
+        "not run: a thing: no triton",
+        "WRONG: a thing: 0.5 exceeds 0.1 (so it is)",
+        "WRONG: a thing: ValueError: bad",
+    ]
+
+
+def test_a_number_that_is_not_finite_is_never_hidden_by_others():
+    bad = torch.tensor([1.0, math.nan])
+    assert math.isnan(relative(bad, torch.ones(2)))
+    assert math.isnan(norm_apart(bad, torch.ones(2)))
+    assert math.isnan(largest([0.0, math.nan, 5.0]))
+    with pytest.raises(ValueError, match="shape"):
+        relative(torch.ones(2), torch.ones(3))
+
+
+def test_bounds_grow_with_the_layers_and_with_what_products_leave_away():
+    for bound in (value_bound, gradient_bound):
+        assert bound("float32", 3) < bound("tf32", 3) < bound("bfloat16", 3) < bound("bfloat16", 6) < 0.3
+
+
+def test_rounding_the_factors_of_products_stays_within_the_bounds(generator):
+    """The formulas against perceptrons whose factors are rounded, with nothing of the kernels in between."""
+    layers = 5
+    weights = [(torch.randn(64, 64, generator=generator) / 32**0.5).double() for _ in range(layers)]
+    points = torch.randn(2000, 64, generator=generator).double()
+    results = []
+    for rounded in (lambda x: x, lambda x: x.bfloat16().double()):
+        hidden = points
+        for weight in weights:
+            hidden = rounded((rounded(hidden) @ rounded(weight).t()).relu())
+        results.append(hidden)
+    assert 1e-3 < norm_apart(results[1], results[0]) < value_bound("bfloat16", layers)

@@ -1,0 +1,119 @@
+"""What the command line left: a resume that is scrambled, a checkpoint or a frame that is changed, are wrong."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from self_tested import a_place, rows_of
+
+from nerf_lightning.selftest.checks import files
+from nerf_lightning.selftest.runs import Runs
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of all runs, made once."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = Runs(folder, ["trainer=cpu", "trainer.precision=32-true"])
+    try:
+        assert runs.whole().is_dir()
+        assert runs.resumed().is_dir()
+        assert runs.film().is_dir()
+    finally:
+        runs.close()
+    return folder
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """A copy that may be spoilt."""
+    return shutil.copytree(finished, tmp_path / "runs")
+
+
+def verdicts(folder):
+    return {row.name.partition(" ")[0]: row.outcome for row in rows_of(files.checks(a_place(folder)), "resume", "read")}
+
+
+def change(folder, run, fault):
+    path = folder / run / "checkpoints" / "last.ckpt"
+    content = torch.load(path, weights_only=True)
+    fault(content)
+    torch.save(content, path)
+
+
+def test_what_the_command_line_leaves_is_right(finished):
+    rows = rows_of(files.checks(a_place(finished)), "")
+    assert [row.outcome for row in rows] == ["ok"] * 4, rows
+
+
+def other_weight(content):
+    content["state_dict"]["model.levels.fine.field.density_mlp.0"][0, 0] += 1e-6
+
+
+def other_moment(content):
+    content["optimizer_states"][0]["state"][0]["exp_avg"].view(-1)[0] += 1e-9
+
+
+def other_grid(content):
+    content["state_dict"]["model.levels.fine.sampler.cells"].view(-1)[0] ^= 1
+
+
+def other_place(content):
+    content["nerf_lightning"]["progress"]["rays_seen"] += 1
+
+
+def no_optimizer(content):
+    content["optimizer_states"][0]["state"].popitem()
+
+
+@pytest.mark.parametrize("fault", [other_weight, other_moment, other_grid, other_place, no_optimizer])
+def test_a_resume_that_ends_elsewhere_is_wrong(fault, copied):
+    change(copied, "resumed", fault)
+    assert verdicts(copied) == {"resume": "wrong", "checkpoint": "ok"}
+
+
+def test_on_a_gpu_other_weights_are_wrong_and_rounding_is_not(copied):
+    def check():
+        (row,) = rows_of(files.checks(a_place(copied, device="cuda")), "resume")
+        return row.outcome
+
+    assert check() == "ok"
+    change(copied, "resumed", other_weight)
+    assert check() == "ok"
+
+    def another_order_of_rays(content):
+        table = content["state_dict"]["model.levels.fine.field.position_encoder.table"]
+        table += 0.05 * torch.randn(table.shape)
+
+    change(copied, "resumed", another_order_of_rays)
+    assert check() == "wrong"
+
+
+def test_a_checkpoint_that_lost_weights_is_wrong(copied):
+    change(copied, "whole", lambda content: content["state_dict"]["model.levels.fine.field.color_mlp.2"].mul_(0.5))
+    assert verdicts(copied)["checkpoint"] == "wrong"
+
+
+def test_a_film_with_other_colours_or_without_a_frame_is_wrong(copied):
+    frame = copied / "film" / "video" / "frame_0001.png"
+    picture = np.array(Image.open(frame))
+    picture[3, 4, 0] ^= 2
+    Image.fromarray(picture).save(frame)
+    (row,) = rows_of(files.checks(a_place(copied)), "film: two frames")
+    assert (row.outcome, row.difference) == ("wrong", 2.0)
+    frame.unlink()
+    (row,) = rows_of(files.checks(a_place(copied)), "film: two frames")
+    assert "1 frames were written, and 2 were asked for" in row.note
+
+
+def test_a_command_that_fails_is_quoted(tmp_path):
+    runs = Runs(tmp_path, ["trainer=cpu", "trainer.precision=quantum"])
+    try:
+        with pytest.raises(RuntimeError, match=r"nerf train ended with exit code 2: .*trainer\.precision=quantum"):
+            runs.whole()
+    finally:
+        runs.close()
