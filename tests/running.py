@@ -48,6 +48,15 @@ def start_module(module: str, *arguments: str, **options) -> subprocess.Popen | 
     return Forked("-m", module, *arguments, env=env, cwd=options.pop("cwd", REPOSITORY), **options)
 
 
+def start_code(code: str, *arguments: str, **options) -> subprocess.Popen | Forked:
+    """Run Python code in a process of its own, its standard error apart: a fork where that makes no difference."""
+    env = os.environ | options.pop("env", {})
+    options = {"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": env} | options
+    if fits_a_fork(env):
+        return Forked("-c", code, *arguments, **options)
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, arguments)], text=True, **options)
+
+
 def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
     """Start a module as a process of its own, which imports all that it needs."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
@@ -55,12 +64,9 @@ def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
         command,
         # A shell's background jobs ignore Ctrl-C and so would their children; a person's terminal does not.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        cwd=options.pop("cwd", REPOSITORY),
         env=os.environ | options.pop("env", {}),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
         text=True,
-        **options,
+        **({"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options),
     )
 
 

@@ -92,7 +92,7 @@ def test_a_reader_that_left_breaks_the_pipe():
     process.stdout.close()
     with process.stderr:
         assert "BrokenPipeError" in process.stderr.read()
-    assert process.wait(60) == 1
+    assert process.wait(60) == 120, "what Python says where it cannot flush"
 
 
 def test_random_numbers_differ_from_fork_to_fork():
@@ -107,6 +107,16 @@ def test_what_is_read_at_import_needs_a_process_of_its_own():
     assert not fits_a_fork(os.environ | {"OMP_NUM_THREADS": "13"})
     assert not fits_a_fork(os.environ | {"PYTHONHASHSEED": "13"})
     assert not fits_a_fork(os.environ | {"SLURM_JOB_ID": "4711"})
+    assert not fits_a_fork(os.environ | {"GOMP_SPINCOUNT": "13"})
+
+
+def test_a_call_of_nerf_in_this_process_changes_nothing_of_that(monkeypatch):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    assert fits_a_fork(os.environ)
+    assert told("import sys; print(sys.stdout.write_through)") == (0, "True\n")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "")
+    assert told("import sys; print(sys.stdout.write_through)") == (0, "False\n")
 
 
 def test_it_runs_the_command_line():

@@ -2,14 +2,12 @@
 
 import json
 import random
-import subprocess
-import sys
 import time
 
 import pytest
 import torch
 from killed_runs import PLACES
-from running import FAST, REPOSITORY
+from running import FAST, start_code
 
 STEPS = 60
 # A start of such a run lasts a second or two once everything is imported.
@@ -24,12 +22,13 @@ def finish_after(plans, capture, folder):
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
         "trainer.val_every_steps=20", f"paths.output_dir={folder}",
     )  # fmt: skip
-    command = [sys.executable, "tests/killed_runs.py", json.dumps([*plans, None]), *map(str, arguments)]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    script = "import runpy; runpy.run_path('tests/killed_runs.py', run_name='__main__')"
+    process = start_code(script, json.dumps([*plans, None]), *arguments)
+    codes, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     said = (folder.parent / f"{folder.name}.txt").read_text()
-    assert done.returncode == 0, done.stderr
     content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
-    return json.loads(done.stdout), said, content
+    return json.loads(codes), said, content
 
 
 def moments(count):

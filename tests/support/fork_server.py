@@ -15,6 +15,7 @@ import atexit
 import contextlib
 import gc
 import importlib
+import io
 import json
 import os
 import pkgutil
@@ -41,17 +42,25 @@ LAZY = ("torch.utils.tensorboard", "torchmetrics", "matplotlib.pyplot", "imageio
         "lightning.pytorch", "hydra.main", "jinja2", "rich.console", "rich.progress")  # fmt: skip
 # One that may not be there, and one for GPUs.
 NOT_IMPORTED = ("__main__", "_triton")
+# The one of them that a fork can make up for.
+UNBUFFERED = "PYTHONUNBUFFERED"
+# `nerf` sets it before it loads torch, also where a test has called it in this very process.
+SET_BY_NERF = {"GOMP_SPINCOUNT": "1000"}
 LARGEST_REQUEST = 1 << 20
-
-
-def fits_a_fork(env: Mapping[str, str]) -> bool:
-    """Whether a process with this environment may be a fork: in what is read at import it equals the server's."""
-    names = {name for name in {*env, *ENVIRONMENT} if name.startswith(READ_AT_IMPORT)}
-    return sys.platform == "linux" and all(env.get(name) == ENVIRONMENT.get(name) for name in names)
 
 
 # Tests change the environment for a while; the server has it as it was when the tests were collected.
 ENVIRONMENT = dict(os.environ)
+
+
+def fits_a_fork(env: Mapping[str, str]) -> bool:
+    """Whether a process with this environment may be a fork: in what is read at import it equals the server's."""
+    return sys.platform == "linux" and _read_at_import(env) == _read_at_import(ENVIRONMENT)
+
+
+def _read_at_import(env: Mapping[str, str]) -> dict[str, str]:
+    found = {name: value for name, value in env.items() if name.startswith(READ_AT_IMPORT) and name != UNBUFFERED}
+    return SET_BY_NERF | found
 
 
 class Forked:
@@ -60,7 +69,7 @@ class Forked:
     Arguments:
         what: `-m` or `-c`, the module or the code, and its arguments.
         env: the whole environment; this process's if None.
-        stdin, stdout, stderr: DEVNULL, PIPE (as text) or a file; for stderr also STDOUT.
+        stdin, stdout, stderr: None for this process's own, DEVNULL, PIPE (as text) or a file; for stderr also STDOUT.
     """
 
     def __init__(
@@ -69,9 +78,9 @@ class Forked:
         cwd: str | Path | None = None,
         env: Mapping[str, str] | None = None,
         start_new_session: bool = False,
-        stdin: int | IO = DEVNULL,
-        stdout: int | IO = PIPE,
-        stderr: int | IO = STDOUT,
+        stdin: int | IO | None = DEVNULL,
+        stdout: int | IO | None = PIPE,
+        stderr: int | IO | None = STDOUT,
     ) -> None:
         self.args, self.returncode = [sys.executable, *map(str, what)], None
         request = {
@@ -83,9 +92,11 @@ class Forked:
         news, told = os.pipe()
         with contextlib.ExitStack() as theirs:
             theirs.callback(os.close, told)
-            self.stdin, input_ = _stream(stdin, "w", theirs)
-            self.stdout, output = _stream(stdout, "r", theirs)
-            self.stderr, errors = (None, output) if stderr == STDOUT else _stream(stderr, "r", theirs)
+            self.stdin, input_ = _stream(0 if stdin is None else stdin, "w", theirs)
+            self.stdout, output = _stream(1 if stdout is None else stdout, "r", theirs)
+            self.stderr, errors = (None, output)
+            if stderr != STDOUT:
+                self.stderr, errors = _stream(2 if stderr is None else stderr, "r", theirs)
             socket.send_fds(_channel(), [json.dumps(request).encode()], [told, input_, output, errors])
         self._news = open(news, "rb", buffering=0)  # noqa: SIM115 - closed with the news of the end
         self._readers: list[tuple[threading.Thread, list[str]]] = []
@@ -188,7 +199,7 @@ def _channel() -> socket.socket:
         with theirs:
             command = [sys.executable, __file__, str(theirs.fileno())]
             server = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], cwd=REPOSITORY, env=ENVIRONMENT, stdin=DEVNULL
+                command, pass_fds=[theirs.fileno()], cwd=REPOSITORY, env=ENVIRONMENT | {UNBUFFERED: ""}, stdin=DEVNULL
             )
         _running = server, ours
     return _running[1]
@@ -283,6 +294,9 @@ def become(request: dict[str, Any]) -> None:
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    if os.environ.get(UNBUFFERED):
+        raw = open(1, "wb", buffering=0, closefd=False)  # noqa: SIM115 - as long as the process
+        sys.stdout = sys.__stdout__ = io.TextIOWrapper(raw, write_through=True)
     sys.path[0] = os.getcwd()
     # Python's own generator is seeded anew by os.fork.
     sys.modules["numpy"].random.seed()
@@ -315,8 +329,7 @@ def end(code: int) -> NoReturn:
 def main() -> None:
     """Serve, and in each fork become what was asked for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # As `nerf` does before it loads torch.
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    os.environ.update(SET_BY_NERF | os.environ)
     # Not this file's folder, but where our package is.
     sys.path[0] = str(REPOSITORY)
     import_everything()
