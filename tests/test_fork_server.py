@@ -106,7 +106,7 @@ def test_what_is_read_at_import_needs_a_process_of_its_own():
     assert fits_a_fork(os.environ | {"PATH": "/elsewhere"})
     assert not fits_a_fork(os.environ | {"OMP_NUM_THREADS": "13"})
     assert not fits_a_fork(os.environ | {"PYTHONHASHSEED": "13"})
-    assert not fits_a_fork(os.environ | {"SLURM_JOB_ID": "4711"})
+    assert not fits_a_fork(os.environ | {"SLURM_CPUS_PER_TASK": "1"})
     assert not fits_a_fork(os.environ | {"GOMP_SPINCOUNT": "13"})
 
 

@@ -1,6 +1,7 @@
 """A capture that a command can read, a finished run on it, and ways to call `nerf`."""
 
 import csv
+import os
 import sys
 from dataclasses import dataclass
 
@@ -45,12 +46,15 @@ def nerf(monkeypatch, capfd):
     def call(*arguments: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
         capfd.readouterr()
-        code = 0
+        code, environment = 0, dict(os.environ)
         try:
             cli.main()
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
         finally:
+            # What a command says to the processes that it starts is not said to those of later tests.
+            for name in os.environ.keys() - environment.keys():
+                del os.environ[name]
             monkeypatch.undo()
         return Result(code, *capfd.readouterr())
 

@@ -9,9 +9,9 @@ import torch
 from killed_runs import PLACES
 from running import FAST, start_code
 
-STEPS = 60
-# A start of such a run lasts a second or two once everything is imported.
-LONGEST = 1.6
+STEPS = 36
+# A start of such a run lasts a second or so once everything is imported.
+LONGEST = 1.2
 
 
 def finish_after(plans, capture, folder):
@@ -20,7 +20,7 @@ def finish_after(plans, capture, folder):
         "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
         "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto", "logger=none",
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
-        "trainer.val_every_steps=20", f"paths.output_dir={folder}",
+        "trainer.val_every_steps=12", f"paths.output_dir={folder}",
     )  # fmt: skip
     script = "import runpy; runpy.run_path('tests/killed_runs.py', run_name='__main__')"
     process = start_code(script, json.dumps([*plans, None]), *arguments)

@@ -46,7 +46,7 @@ def test_two_processes_build_one_scene_once(tmp_path):
 @pytest.mark.slow
 def test_two_runs_never_write_into_one_folder(capture, tmp_path):
     arguments = (
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=400", "final.evaluate=false",
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=150", "final.evaluate=false",
         "final.video=false", "resume=auto", "logger=none", f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     runs = [start(*arguments) for _ in range(2)]

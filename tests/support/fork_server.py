@@ -35,8 +35,8 @@ from typing import IO, Any, NoReturn
 
 REPOSITORY = Path(__file__).parents[2]
 # What begins so is read while torch, numba, Python itself or our own modules are loaded.
-READ_AT_IMPORT = ("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "NUMBA_", "PYTHON", "LD_", "TORCH", "PJRT_", "XLA_",
-                  "CUDA_", "TRITON_", "SLURM_", "SUBMITIT_")  # fmt: skip
+READ_AT_IMPORT = ("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "NUMBA_", "PYTHON", "LD_", "TORCH_", "PJRT_", "XLA_",
+                  "CUDA_", "TRITON_", "SLURM_CPUS_")  # fmt: skip
 # What commands import only once they need it.
 LAZY = ("torch.utils.tensorboard", "torchmetrics", "matplotlib.pyplot", "imageio.v3", "imageio_ffmpeg", "PIL.Image",
         "lightning.pytorch", "hydra.main", "jinja2", "rich.console", "rich.progress")  # fmt: skip
