@@ -47,7 +47,7 @@ def address_in(process):
 
 @pytest.mark.slow
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
-    steps = "trainer.max_steps=80"
+    steps = "trainer.max_steps=200"
     alone = run(capture, tmp_path / "alone", steps)
     watched = run(
         capture,

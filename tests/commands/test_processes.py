@@ -109,6 +109,7 @@ def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
     quick = ("trainer.max_steps=3", "final.evaluate=false")
     sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")

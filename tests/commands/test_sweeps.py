@@ -44,7 +44,13 @@ def wait_for_step(folder, step, process):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "launcher", ["basic", "parallel", pytest.param("joblib", marks=pytest.mark.exhaustive), "slurm_here"]
+    "launcher",
+    [
+        "basic",
+        "parallel",
+        pytest.param("joblib", marks=pytest.mark.exhaustive),
+        pytest.param("slurm_here", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, monkeypatch, launcher):
     if launcher == "parallel":  # whose jobs share the cores, however many the tests leave to each other

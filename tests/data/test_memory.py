@@ -5,7 +5,7 @@ from captures import pose, write_transforms
 from PIL import Image
 from running import start_code
 
-SIDE = 512
+SIDE = 384
 VIEWS = 256
 # How far the constant part may differ between two readings: the pictures that threads hold at the same moment.
 NOISE = 2 * 2**20

@@ -337,8 +337,8 @@ def main() -> None:
     gc.collect()
     gc.freeze()
     request = serve(socket.socket(fileno=int(sys.argv[1])))
-    if request is not None:
-        end(run(request))
+    # What was frozen cannot be taken apart in order, and some libraries would complain of that.
+    os._exit(0) if request is None else end(run(request))
 
 
 if __name__ == "__main__":
