@@ -126,7 +126,7 @@ def test_a_job_that_fails_costs_only_itself(capture, tmp_path, launcher):
 
 @pytest.mark.slow
 def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
-    longer = ("seed=0,1", "trainer.max_steps=150")
+    longer = ("seed=0,1", "trainer.max_steps=80")
     process = start(*arguments(capture, tmp_path, *longer))
     wait_for_step(tmp_path / "1_seed=1", 10, process)
     process.kill()
@@ -142,7 +142,7 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     assert "going on from step" in output
     assert json.loads((tmp_path / "0_seed=0" / "run.json").read_text()) == before
     assert {row["state"] for row in table(tmp_path)} == {"finished before", "finished"}
-    assert {row["steps"] for row in table(tmp_path)} == {"150"}
+    assert {row["steps"] for row in table(tmp_path)} == {"80"}
 
 
 @pytest.mark.slow
