@@ -76,7 +76,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, nev
 def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
     """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""
     folder = tmp_path / "run"
-    codes, said, content = finish_after([{"full": 3}, {"full": 12}], capture, folder)
+    codes, said, content = finish_after([{"full": 3}, {"full": 6}], capture, folder)
     assert codes == [2, 2, 0], said
     assert said.count("nerf: The checkpoint") == 2, said
     assert "No space left on device" in said
