@@ -7,7 +7,11 @@ XLA_VENV := .venv-xla
 ARGS ?=
 # How long make soak lasts.
 SECONDS ?= 1800
+# How many tests run at a time.
+WORKERS ?= 2
 
+# One thread each; a worker without work takes over half of what another has left.
+PYTEST := $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 PINNED := -c constraints/torch.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
@@ -41,14 +45,14 @@ $(VENV)/.ready: pyproject.toml constraints/torch.txt
 train: setup ## Train the embedded scene, measure it and film it; ARGS="key=value ..." for Hydra overrides
 	@$(VENV)/bin/nerf train experiment=quickstart $(ARGS)
 
-test: setup ## Run every test, but for those that take many minutes
-	@$(VENV)/bin/python -m pytest
+test: setup ## Run the tests, but for the exhaustive ones: under five minutes on two cores
+	@$(PYTEST)
 
 test-all: setup ## Run every test, the exhaustive ones included
-	@$(VENV)/bin/python -m pytest -m ""
+	@$(PYTEST) -m ""
 
 test-fast: setup ## Run the tests that take less than a few seconds each
-	@$(VENV)/bin/python -m pytest -m "not slow"
+	@$(PYTEST) -m "not slow and not exhaustive"
 
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
 	@$(MAKE) --no-print-directory xla \

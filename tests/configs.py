@@ -1,5 +1,7 @@
 """Composing the yaml files of conf/ in tests."""
 
+import copy
+from functools import cache
 from pathlib import Path
 
 from hydra import compose
@@ -17,6 +19,11 @@ def options(group: str) -> list[str]:
 
 def composed(command: str, *overrides: str) -> DictConfig:
     """Return the config of a command."""
+    return copy.deepcopy(_composed(command, overrides))
+
+
+@cache
+def _composed(command: str, overrides: tuple[str, ...]) -> DictConfig:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(command, overrides=list(overrides))

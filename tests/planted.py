@@ -1,8 +1,6 @@
 """Payloads in files: each would leave a mark if anything in it ran, or fill the memory if it were believed."""
 
 import pickle
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +10,7 @@ import torch
 import yaml
 from configs import composed
 from omegaconf import OmegaConf
-from running import REPOSITORY
+from running import start_code
 from scenes import ball_scene
 
 from nerf_lightning.checkpoints import make_record
@@ -87,8 +85,8 @@ def peak_of(code: str, *arguments: object) -> tuple[int, list[str]]:
     before, after = code.split("# begin\n")
     measure = "peak = lambda: 1024 * int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])\n"
     whole = f"import sys\n{measure}{before}start = peak()\n{after}print('grown', peak() - start)\n"
-    command = [sys.executable, "-c", whole, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 0, done.stderr
-    *lines, grown = done.stdout.splitlines()
+    process = start_code(whole, *arguments)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    *lines, grown = output.splitlines()
     return int(grown.split()[1]), lines

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from support.fork_server import Forked, fits_a_fork
+
 REPOSITORY = Path(__file__).parents[1]
 
 # Small enough for a test: seconds in all.
@@ -33,24 +35,38 @@ FAST_PATH = (
 )  # fmt: skip
 
 
-def start(*arguments: str, **options) -> subprocess.Popen:
+def start(*arguments: str, **options) -> subprocess.Popen | Forked:
     """Start the command line as a process of its own."""
     return start_module("nerf_lightning", *arguments, **options)
 
 
-def start_module(module: str, *arguments: str, **options) -> subprocess.Popen:
-    """Start a module as a process of its own."""
+def start_module(module: str, *arguments: str, **options) -> subprocess.Popen | Forked:
+    """Start a module as a process of its own: a fork where that makes no difference to it."""
+    env = os.environ | options.pop("env", {})
+    if not fits_a_fork(env):
+        return start_cold(module, *arguments, env=env, **options)
+    return Forked("-m", module, *arguments, env=env, cwd=options.pop("cwd", REPOSITORY), **options)
+
+
+def start_code(code: str, *arguments: str, **options) -> subprocess.Popen | Forked:
+    """Run Python code in a process of its own, its standard error apart: a fork where that makes no difference."""
+    env = os.environ | options.pop("env", {})
+    options = {"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": env} | options
+    if fits_a_fork(env):
+        return Forked("-c", code, *arguments, **options)
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, arguments)], text=True, **options)
+
+
+def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
+    """Start a module as a process of its own, which imports all that it needs."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
     return subprocess.Popen(
         command,
         # A shell's background jobs ignore Ctrl-C and so would their children; a person's terminal does not.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        cwd=options.pop("cwd", REPOSITORY),
         env=os.environ | options.pop("env", {}),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
         text=True,
-        **options,
+        **({"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options),
     )
 
 

@@ -1,12 +1,10 @@
 """A checkpoint file is whole at every moment, the one before stays, and what goes wrong is said."""
 
 import os
-import subprocess
-import sys
 
 import pytest
 import torch
-from running import REPOSITORY
+from running import start_code
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers, write_checkpoint
 from nerf_lightning.errors import InputError
@@ -69,10 +67,11 @@ def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
         "except InputError as error:\n"
         "    print(error); sys.exit(2)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 2, done.stderr
-    assert "could not be saved" in done.stdout
-    assert f"The former checkpoint {path} is unharmed" in done.stdout
+    process = start_code(code)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 2, errors
+    assert "could not be saved" in output
+    assert f"The former checkpoint {path} is unharmed" in output
     assert steps(path.parent) == {"last.ckpt": 1}
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 from running import FAST, start
+from support.ports import unused_port
 from viser_client import ViserClient
 
 from nerf_lightning.callbacks.live_view import LiveView
@@ -46,14 +47,14 @@ def address_in(process):
 
 @pytest.mark.slow
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
-    steps = "trainer.max_steps=150"
+    steps = "trainer.max_steps=200"
     alone = run(capture, tmp_path / "alone", steps)
     watched = run(
         capture,
         tmp_path / "watched",
         steps,
         "viewer=on",
-        "viewer.live_view.port=18280",
+        f"viewer.live_view.port={unused_port()}",
         "viewer.live_view.max_height=48",
     )
     port = address_in(watched)

@@ -2,31 +2,26 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from running import FAST, REPOSITORY
+from running import FAST, start
 
 from nerf_lightning.closed_pipe import READER_LEFT, ends_quietly
-
-COMMAND = [sys.executable, "-m", "nerf_lightning"]
 
 
 def unread(*arguments, buffered=True, merged=False):
     """Run a command whose reader left before the first word; return its exit code and what stderr says."""
     ours, theirs = os.pipe()
     os.close(ours)
-    done = subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        stdout=theirs,
-        stderr=theirs if merged else subprocess.PIPE,
-        cwd=REPOSITORY,
-        env=os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"},
-        text=True,
-    )
+    process = begin(*arguments, stdout=theirs, stderr=theirs if merged else subprocess.PIPE, buffered=buffered)
     os.close(theirs)
-    return done.returncode, done.stderr
+    _, told = process.communicate(timeout=300)
+    return process.returncode, told
+
+
+def begin(*arguments, buffered=True, **streams):
+    return start(*arguments, env={"PYTHONUNBUFFERED": "" if buffered else "1"}, **streams)
 
 
 @pytest.mark.parametrize("buffered", [True, False])
@@ -64,14 +59,12 @@ def test_bad_input_is_told_though_nobody_reads_stdout():
 @pytest.mark.parametrize("buffered", [True, False])
 @pytest.mark.parametrize("arguments", [["--version"], ["train", "--help"]])
 def test_a_full_disk_is_told_once(arguments, buffered):
-    environment = os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"}
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [*COMMAND, *arguments], stdout=full, stderr=subprocess.PIPE, cwd=REPOSITORY, env=environment, text=True
-        )
-    assert done.returncode == 2
-    assert done.stderr.startswith("nerf: No space left on device.")
-    assert len(done.stderr.splitlines()) == 1
+        process = begin(*arguments, stdout=full, stderr=subprocess.PIPE, buffered=buffered)
+        _, told = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert told.startswith("nerf: No space left on device.")
+    assert len(told.splitlines()) == 1
 
 
 def test_another_pipe_that_breaks_is_an_error():

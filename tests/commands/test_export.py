@@ -47,7 +47,12 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     said(nerf("export", f"ckpt={last}", "what=sculpture", where), "sculpture", "mesh")
     said(nerf("export", f"ckpt={last}", "what.format=stl", where), "what.format=stl does not fit", "ply, obj, glb")
     said(nerf("export", f"ckpt={last}", "what.resolution=30000", where), "what.resolution=30000", "GB", "would fit")
-    said(nerf("export", f"ckpt={last}", "what.threshold=1e9", where), "There is no surface", "go from", "1e+09")
+    said(
+        nerf("export", f"ckpt={last}", "what.threshold=1e9", "what.resolution=32", where),
+        "There is no surface",
+        "go from",
+        "1e+09",
+    )
     assert not list(tmp_path.iterdir())
 
 

@@ -8,12 +8,12 @@ import torch
 from running import FAST, FAST_PATH, start
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
-STEPS = 120
+STEPS = 70
 
 
 def arguments(capture, folder, *extra):
     return (
-        "train", "scene=npz", f"scene.path={capture}", *QUIET, f"trainer.max_steps={STEPS}", "trainer.num_threads=2",
+        "train", "scene=npz", f"scene.path={capture}", *QUIET, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
         "final.evaluate=false", "final.video=false", "resume=auto", "callbacks.checkpoints.every_steps=5",
         "callbacks.validation_pictures.every_steps=1000", f"paths.output_dir={folder}", *extra,
     )  # fmt: skip
@@ -42,19 +42,21 @@ def flat(value, path=""):
 
 
 @pytest.mark.slow
-def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path):
+@pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
+def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads):
     """Weights, moments, occupancy grid, rays per step: all of it."""
-    code, output = finished(start(*arguments(capture, tmp_path / "whole")))
+    shared = f"trainer.num_threads={threads}"
+    code, output = finished(start(*arguments(capture, tmp_path / "whole", shared)))
     assert code == 0, output
     folder = tmp_path / "stopped"
-    for how, after in ((signal.SIGKILL, 20), (signal.SIGTERM, 60)):
-        process = start(*arguments(capture, folder))
+    for how, after in ((signal.SIGKILL, 10), (signal.SIGTERM, 25)):
+        process = start(*arguments(capture, folder, shared))
         while process.poll() is None and saved(folder)["global_step"] < after:
             time.sleep(0.02)
         process.send_signal(how)
         code, output = finished(process)
         assert code in (-how, 128 + how), output
-    code, output = finished(start(*arguments(capture, folder)))
+    code, output = finished(start(*arguments(capture, folder, shared)))
     assert code == 0, output
     assert "going on from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")

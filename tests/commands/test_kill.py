@@ -2,18 +2,16 @@
 
 import json
 import random
-import subprocess
-import sys
 import time
 
 import pytest
 import torch
 from killed_runs import PLACES
-from running import FAST, REPOSITORY
+from running import FAST, start_code
 
-STEPS = 60
-# A start of such a run lasts a second or two once everything is imported.
-LONGEST = 1.6
+STEPS = 36
+# A start of such a run lasts a second or so once everything is imported.
+LONGEST = 1.2
 
 
 def finish_after(plans, capture, folder):
@@ -22,14 +20,15 @@ def finish_after(plans, capture, folder):
         "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
         "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto", "logger=none",
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
-        "trainer.val_every_steps=20", f"paths.output_dir={folder}",
+        "trainer.val_every_steps=12", f"paths.output_dir={folder}",
     )  # fmt: skip
-    command = [sys.executable, "tests/killed_runs.py", json.dumps([*plans, None]), *map(str, arguments)]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    script = "import runpy; runpy.run_path('tests/killed_runs.py', run_name='__main__')"
+    process = start_code(script, json.dumps([*plans, None]), *arguments)
+    codes, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     said = (folder.parent / f"{folder.name}.txt").read_text()
-    assert done.returncode == 0, done.stderr
     content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
-    return json.loads(done.stdout), said, content
+    return json.loads(codes), said, content
 
 
 def moments(count):
@@ -77,7 +76,7 @@ def test_a_run_that_is_killed_at_any_moment_ends_the_same(capture, tmp_path, nev
 def test_a_run_whose_disk_was_full_says_so_and_ends_the_same(capture, tmp_path, never_killed):
     """The failure of the writer beside it reaches the training; in a middle save, and in one of the last."""
     folder = tmp_path / "run"
-    codes, said, content = finish_after([{"full": 3}, {"full": 12}], capture, folder)
+    codes, said, content = finish_after([{"full": 3}, {"full": 6}], capture, folder)
     assert codes == [2, 2, 0], said
     assert said.count("nerf: The checkpoint") == 2, said
     assert "No space left on device" in said

@@ -166,6 +166,7 @@ def test_real_photographs_are_all_registered(poses, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.data
 def test_found_cameras_agree_with_those_that_came_with_a_capture(poses, tmp_path):
     capture, folder = real_capture("fox"), tmp_path / "small"

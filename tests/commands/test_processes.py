@@ -2,12 +2,12 @@
 
 import json
 import signal
-import socket
 import time
 
 import pytest
 import torch
-from running import FAST, FAST_PATH, start, start_module
+from running import FAST, FAST_PATH, start, start_cold
+from support.ports import unused_port
 
 from nerf_lightning.commands import processes
 from nerf_lightning.commands.processes import num_processes
@@ -72,11 +72,9 @@ def test_two_processes_follow_one(capture, tmp_path, alone):
 
 @pytest.mark.slow
 def test_two_machines_under_torchrun_follow_one_process(capture, tmp_path, alone):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = unused_port()
     machines = [
-        start_module(
+        start_cold(
             "torch.distributed.run", "--nnodes", 2, "--nproc-per-node", 1, "--node-rank", number,
             "--master-addr", "127.0.0.1", "--master-port", port, "-m", "nerf_lightning",
             *arguments(capture, "trainer=torchrun", "trainer.accelerator=cpu", f"paths.output_dir={tmp_path}"),
@@ -116,6 +114,7 @@ def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_jobs_of_a_sweep_may_have_several_processes(capture, tmp_path):
     quick = ("trainer.max_steps=3", "final.evaluate=false")
     sweep = arguments(capture, *TWO, *quick, "seed=0,1", f"paths.output_dir={tmp_path}")

@@ -9,12 +9,13 @@ import torch
 from running import FAST, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-STEPS = 300
+STEPS = 150
 
 
-def arguments(capture, folder, steps=STEPS):
+def arguments(capture, folder, steps=STEPS, threads=1):
     return (
-        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}", "trainer.num_threads=2",
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}",
+        f"trainer.num_threads={threads}",
         "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto",
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=7",
         "trainer.val_every_steps=14", f"paths.output_dir={folder}",
@@ -38,19 +39,28 @@ def steps_saved(folder):
     return torch.load(last, weights_only=True)["global_step"] if last.exists() else 0
 
 
-@pytest.fixture(scope="module")
-def never_stopped(capture, tmp_path_factory):
+def never_stopped_on(threads, capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("never_stopped") / "run"
-    process = start(*arguments(capture, folder))
+    process = start(*arguments(capture, folder, threads=threads))
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     return state(folder)
 
 
-def run_and_stop(capture, folder, how, after_step):
+@pytest.fixture(scope="module")
+def never_stopped(capture, tmp_path_factory):
+    return never_stopped_on(1, capture, tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def never_stopped_on_two_threads(capture, tmp_path_factory):
+    return never_stopped_on(2, capture, tmp_path_factory)
+
+
+def run_and_stop(capture, folder, how, after_step, threads=1):
     """Start or resume; stop as soon as `after_step` is saved; return what was said and the exit code."""
     after_step = max(after_step, steps_saved(folder) + 7)
-    process = start(*arguments(capture, folder))
+    process = start(*arguments(capture, folder, threads=threads))
     while process.poll() is None and steps_saved(folder) < after_step:
         time.sleep(0.02)
     if process.poll() is None:
@@ -59,18 +69,18 @@ def run_and_stop(capture, folder, how, after_step):
     return process.returncode, output
 
 
-@pytest.mark.slow
-def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture, tmp_path, never_stopped):
-    folder = tmp_path / "run"
+def assert_the_same_end(capture, folder, never_stopped, threads):
     order = random.Random(time.time_ns())
     points = sorted(order.sample(range(7, STEPS - 60), 3))
     for point, how in zip(points, [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], strict=True):
-        code, output = run_and_stop(capture, folder, how, point)
+        code, output = run_and_stop(capture, folder, how, point, threads)
         assert code in (-how, 128 + how), (points, output)
-        if how != signal.SIGKILL:
+        if how == signal.SIGKILL:
+            killed_at = steps_saved(folder)
+        else:
             assert "go on with: nerf train" in output
             assert f"resume={folder}" in output
-    process = start(*arguments(capture, folder))
+    process = start(*arguments(capture, folder, threads=threads))
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     assert "going on from step" in output
@@ -79,7 +89,19 @@ def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture,
     assert steps == list(range(5, STEPS + 1, 5)), "TensorBoard shows each step once"
     validated = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("val/psnr")]
     assert len(set(validated)) == len(validated)
-    assert {14 * number for number in range(1, STEPS // 14)} <= set(validated)
+    # Killed between a save and the validation of the same step, it has lost that one.
+    assert {14 * number for number in range(1, STEPS // 14)} - {killed_at} <= set(validated)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture, tmp_path, never_stopped):
+    assert_the_same_end(capture, tmp_path / "run", never_stopped, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+def test_a_run_on_two_threads_ends_the_same(capture, tmp_path, never_stopped_on_two_threads):
+    assert_the_same_end(capture, tmp_path / "run", never_stopped_on_two_threads, 2)
 
 
 @pytest.mark.slow

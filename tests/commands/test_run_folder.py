@@ -140,7 +140,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
 def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
     result = nerf(
         "train", "-m", "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1", "data.batch_rays=32,48",
-        "trainer.max_steps=3", "final.video=false", f"paths.root_dir={tmp_path}",
+        "trainer.max_steps=2", "final.video=false", "evaluation.max_views=1", f"paths.root_dir={tmp_path}",
     )  # fmt: skip
     assert result.code == 0, result.err
     runs = sorted((tmp_path / "sweeps").glob("*/*/metrics.json"))

@@ -1,10 +1,8 @@
 """What a sweep is asked for, before Hydra reads it."""
 
-import subprocess
-import sys
-
 import pytest
 from configs import composed
+from running import start_code
 
 from nerf_lightning.commands.sweep_record import JOB_NUMBER, SweepRecord
 from nerf_lightning.errors import InputError
@@ -77,11 +75,12 @@ def test_a_requeued_slurm_job_finds_its_own_sweep(tmp_path, monkeypatch):
 def test_a_plugin_that_is_not_installed_is_named_with_its_extra(tmp_path, group, plugin, extra):
     arguments = ["nerf", "train", "-m", f"hydra/{group}", "seed=0,1", f"paths.output_dir={tmp_path}/out"]
     code = f"import sys; sys.modules['hydra_plugins'] = None; sys.argv = {arguments}; import nerf_lightning.__main__"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 2, done.stderr
+    process = start_code(code)
+    _, told = process.communicate(timeout=300)
+    assert process.returncode == 2, told
     kind = group.partition("=")[0]
     expected = f"nerf: This {kind} needs {plugin}, which is not installed: pip install 'nerf-lightning[{extra}]'.\n"
-    assert done.stderr == expected
+    assert told == expected
     assert not (tmp_path / "out").exists()
 
 

@@ -172,7 +172,10 @@ def test_an_epoch_is_every_training_ray_once(nerf, capture, tmp_path):
     assert steps == 3 + -(-8 * 256 // 100)  # after the crop
 
 
-@pytest.mark.parametrize("experiment", ["lego_article", "lego_article_100", "quickstart"])
+# The article's larger Lego is the smaller one, with other sizes.
+@pytest.mark.parametrize(
+    "experiment", [pytest.param("lego_article", marks=pytest.mark.exhaustive), "lego_article_100", "quickstart"]
+)
 def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     scene = ["scene=npz"] if experiment == "quickstart" else []
     article = [] if experiment == "quickstart" else ["trainer.max_epochs=null", "scene.download=null"]

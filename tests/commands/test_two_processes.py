@@ -1,10 +1,9 @@
 """Two processes at once: one run folder is held by one, one cache is built by one."""
 
 import subprocess
-import sys
 
 import pytest
-from running import FAST, start
+from running import FAST, start, start_code
 
 BUILD_BRICKS = """
 import sys
@@ -30,8 +29,7 @@ print(count, int(scene.pixels.rgba.long().sum()))
 
 
 def test_two_processes_build_one_scene_once(tmp_path):
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    builders = [subprocess.Popen([sys.executable, "-c", BUILD_BRICKS, str(tmp_path)], **pipes) for _ in range(2)]
+    builders = [start_code(BUILD_BRICKS, tmp_path, stdin=subprocess.PIPE, stderr=None) for _ in range(2)]
     assert [builder.stdout.readline() for builder in builders] == ["ready\n"] * 2
     for builder in builders:
         builder.stdin.close()
@@ -48,7 +46,7 @@ def test_two_processes_build_one_scene_once(tmp_path):
 @pytest.mark.slow
 def test_two_runs_never_write_into_one_folder(capture, tmp_path):
     arguments = (
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=400", "final.evaluate=false",
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=150", "final.evaluate=false",
         "final.video=false", "resume=auto", "logger=none", f"paths.output_dir={tmp_path}/run",
     )  # fmt: skip
     runs = [start(*arguments) for _ in range(2)]

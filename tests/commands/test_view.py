@@ -11,6 +11,7 @@ import pytest
 from browser import drag, opened, wait_until
 from planted import write_checkpoint
 from running import said, start
+from support.ports import unused_port
 from viser_client import ViserClient
 
 from nerf_lightning.commands import view, viewing
@@ -45,7 +46,7 @@ def serve(*arguments):
 def page(finished_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
     checkpoint = finished_run / "checkpoints" / "last.ckpt"
-    served = serve(f"ckpt={checkpoint}", "port=18080", "max_height=96", f"paths.output_dir={folder}")
+    served = serve(f"ckpt={checkpoint}", f"port={unused_port()}", "max_height=96", f"paths.output_dir={folder}")
     yield served
     served.process.kill()
     served.process.communicate()
@@ -90,7 +91,7 @@ def test_clients_that_leave_or_never_read_harm_nobody(page, client):
 @pytest.mark.slow
 def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
     checkpoint = finished_run / "checkpoints" / "last.ckpt"
-    served = serve(f"ckpt={checkpoint}", "port=18180", f"paths.output_dir={tmp_path}", "photographs=false")
+    served = serve(f"ckpt={checkpoint}", f"port={unused_port()}", f"paths.output_dir={tmp_path}", "photographs=false")
     client = ViserClient(served.port)
     client.look_from(0)
     client.wait_for(len)

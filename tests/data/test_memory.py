@@ -1,11 +1,11 @@
-import subprocess
 import sys
 
 import pytest
 from captures import pose, write_transforms
 from PIL import Image
+from running import start_code
 
-SIDE = 512
+SIDE = 384
 VIEWS = 256
 # How far the constant part may differ between two readings: the pictures that threads hold at the same moment.
 NOISE = 2 * 2**20
@@ -37,8 +37,9 @@ def test_reading_takes_the_store_and_no_more(tmp_path):
         (tmp_path / f"r_{view}.png").hardlink_to(tmp_path / "r_0.png")
     frames = [{"file_path": f"r_{view}", "transform_matrix": pose(view)} for view in range(VIEWS)]
     write_transforms(tmp_path, "train", frames)
-    command = [sys.executable, "-c", MEASURE, str(tmp_path)]
-    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    process = start_code(MEASURE, tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     growth = [[int(number) for number in line.split()] for line in output.splitlines()]
     assert len(growth) == 2
     for num_bytes, pixels in growth:

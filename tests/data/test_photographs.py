@@ -3,7 +3,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import torch
 from captures import picture
 from PIL import Image
+from running import start_code
 
 from nerf_lightning.data import photographs as module
 from nerf_lightning.data.images import area_downscale, crop_to_multiple, read_rgba
@@ -219,9 +219,8 @@ print(count, int(store.rgba.long().sum()))
 
 def test_processes_that_read_at_once_share_one_file(tmp_path, cache):
     Image.fromarray(picture(0, 400, 400)).save(tmp_path / "big.png")
-    command = [sys.executable, "-c", SHARE, str(cache), *[str(tmp_path / "big.png")] * 8]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    readers = [subprocess.Popen(command, **pipes) for _ in range(2)]
+    pictures = [tmp_path / "big.png"] * 8
+    readers = [start_code(SHARE, cache, *pictures, stdin=subprocess.PIPE, stderr=None) for _ in range(2)]
     assert [reader.stdout.readline() for reader in readers] == ["ready\n"] * 2
     for reader in readers:
         reader.stdin.close()

@@ -20,6 +20,7 @@ def test_points_of_the_exact_surface_are_on_it_and_reach_all_of_it():
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_mesh_of_a_short_run_is_close_to_the_exact_surface(tmp_path):
     scene = ("scene.resolution=64", "scene.num_train=60", "scene.num_val=2", "scene.num_test=2")
     run = ("experiment=quickstart", *scene, f"scene.cache_dir={tmp_path}/cache", "trainer.max_steps=150")

@@ -1,0 +1,126 @@
+"""Forks of the test server are processes like others."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from support.fork_server import PIPE, Forked, fits_a_fork
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere tests start processes of their own")
+
+
+def told(code, *arguments, **options):
+    process = Forked("-c", code, *arguments, **options)
+    output, _ = process.communicate(timeout=60)
+    return process.returncode, output
+
+
+def test_it_has_imported_everything_and_computed_nothing():
+    code = """
+import sys, threading
+print(len(threading.enumerate()), open("/proc/self/status").read().split("Threads:")[1].split()[0])
+print({"nerf_lightning.commands.training", "numba", "lightning.pytorch", "hydra.main"} <= sys.modules.keys())
+print({"pytest", "_pytest", "conftest"} & sys.modules.keys())
+import logging
+print(logging.getLogger().handlers, logging.getLogger("nerf_lightning").handlers)
+"""
+    assert told(code) == (0, "1 1\nTrue\nset()\n[] []\n")
+
+
+def test_warnings_are_filtered_as_in_a_process_of_its_own():
+    code = "import nerf_lightning.commands.training, warnings; print(*warnings.filters[-5:], sep='\\n')"
+    alone = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told(code) == (0, alone.stdout)
+
+
+def test_it_has_its_own_folder_environment_and_arguments(tmp_path, monkeypatch):
+    monkeypatch.setenv("THIS_IS_HERE", "now")
+    code = "import os, sys; print(os.getcwd(), os.environ.get('THIS_IS_HERE'), os.environ.get('HOME'), sys.argv)"
+    assert told(code, 1, "two", cwd=tmp_path) == (0, f"{tmp_path} now {os.environ.get('HOME')} ['-c', '1', 'two']\n")
+    assert told(code, cwd=tmp_path, env={}) == (0, f"{tmp_path} None None ['-c']\n")
+
+
+@pytest.mark.parametrize(
+    ("code", "expected", "words"),
+    [
+        ("import sys; sys.exit(3)", 3, ""),
+        ("import sys; sys.exit('no')", 1, "no\n"),
+        ("1 / 0", 1, "ZeroDivisionError"),
+        ("raise KeyboardInterrupt", -signal.SIGINT, "KeyboardInterrupt"),
+        ("import os; os.kill(os.getpid(), 9)", -signal.SIGKILL, ""),
+        ("import atexit; atexit.register(print, 'at the end')", 0, "at the end\n"),
+        ("import threading; threading.Timer(0.2, print, ['late']).start()", 0, "late\n"),
+    ],
+)
+def test_it_ends_as_any_process(code, expected, words):
+    number, output = told(code)
+    assert (number, words in output) == (expected, True), output
+
+
+def test_signals_reach_it():
+    for number, code in ((signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, -signal.SIGTERM)):
+        process = Forked("-c", "import time; print('ready', flush=True); time.sleep(60)")
+        assert process.stdout.readline() == "ready\n"
+        assert process.poll() is None
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.01)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.communicate(timeout=0.01)
+        process.send_signal(number)
+        process.communicate(timeout=60)
+        assert process.returncode == code
+        process.kill()
+
+
+def test_it_may_have_a_session_of_its_own():
+    code = "import os; print(os.getsid(0) == os.getpid() == os.getpgid(0))"
+    assert told(code, start_new_session=True) == (0, "True\n")
+    assert told(code) == (0, "False\n")
+
+
+def test_each_stream_can_be_a_pipe():
+    code = "import sys; print(sys.stdin.read()); print('wrong', file=sys.stderr)"
+    process = Forked("-c", code, stdin=PIPE, stderr=PIPE)
+    process.stdin.write("hello")
+    assert process.communicate(timeout=60) == ("hello\n", "wrong\n")
+
+
+def test_a_reader_that_left_breaks_the_pipe():
+    process = Forked("-c", "import time; time.sleep(0.3); print('x', flush=True)", stderr=PIPE)
+    process.stdout.close()
+    with process.stderr:
+        assert "BrokenPipeError" in process.stderr.read()
+    assert process.wait(60) == 120, "what Python says where it cannot flush"
+
+
+def test_random_numbers_differ_from_fork_to_fork():
+    code = "import random, numpy, torch; print(random.random(), numpy.random.rand(), torch.rand(()).item())"
+    one, other = told(code)[1].split(), told(code)[1].split()
+    assert all(mine != theirs for mine, theirs in zip(one, other, strict=True))
+
+
+def test_what_is_read_at_import_needs_a_process_of_its_own():
+    assert fits_a_fork(os.environ)
+    assert fits_a_fork(os.environ | {"PATH": "/elsewhere"})
+    assert not fits_a_fork(os.environ | {"OMP_NUM_THREADS": "13"})
+    assert not fits_a_fork(os.environ | {"PYTHONHASHSEED": "13"})
+    assert not fits_a_fork(os.environ | {"SLURM_CPUS_PER_TASK": "1"})
+    assert not fits_a_fork(os.environ | {"GOMP_SPINCOUNT": "13"})
+
+
+def test_a_call_of_nerf_in_this_process_changes_nothing_of_that(monkeypatch):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    assert fits_a_fork(os.environ)
+    assert told("import sys; print(sys.stdout.write_through)") == (0, "True\n")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "")
+    assert told("import sys; print(sys.stdout.write_through)") == (0, "False\n")
+
+
+def test_it_runs_the_command_line():
+    process = Forked("-m", "nerf_lightning", "trian")
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert output.startswith("nerf: There is no command 'trian'.")
