@@ -26,7 +26,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-fast test-xla xla check format lint types layers bench soak clean
+.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -58,6 +58,18 @@ test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where to
 	@$(MAKE) --no-print-directory xla \
 		|| { echo "make: test-xla is skipped: torch_xla 2.9 cannot be installed here (Linux x86-64, Python 3.11 to 3.13)"; exit 0; }; \
 	PJRT_DEVICE=CPU $(XLA_VENV)/bin/python -m pytest -m xla tests/xla tests/commands/test_command_on_xla.py
+
+test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
+	@$(VENV)/bin/python -m pytest -m gpu tests/gpu
+
+# Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none.
+OTHER := $(if $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
+OTHER_TESTS := tests/test_products.py tests/test_own_precision.py tests/test_system.py tests/kernels tests/fields tests/models \
+	tests/rendering tests/samplers tests/commands/test_trainer_settings.py tests/commands/test_memory_plan.py \
+	tests/commands/test_train_eval_render.py tests/commands/test_processes.py tests/commands/test_fast_path.py
+test-other: setup ## Run a part of the tests as on the other kind of CPU (bfloat16 on or off), with one thread
+	@echo "as another machine: $(OTHER) OMP_NUM_THREADS=1"
+	@$(OTHER) OMP_NUM_THREADS=1 $(PYTEST) $(OTHER_TESTS)
 
 xla: $(XLA_VENV)/.ready ## Make an environment for TPUs, .venv-xla: torch 2.9 with torch_xla, 7 GB
 # torch_xla's newest release is older than the torch that the package asks for, so the floors are left out here.

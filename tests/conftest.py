@@ -7,6 +7,8 @@ from pathlib import Path
 # Workers side by side have one thread each, and so has what they start; torch reads it while it is loaded.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+# As cli.py: threads that wait busily would take the time of others.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 sys.path.insert(0, str(Path(__file__).parent))
 
