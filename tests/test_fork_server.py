@@ -92,7 +92,7 @@ def test_a_reader_that_left_breaks_the_pipe():
     process.stdout.close()
     with process.stderr:
         assert "BrokenPipeError" in process.stderr.read()
-    assert process.wait(60) == 120, "what Python says where it cannot flush"
+    assert process.wait(60) in (1, 120), "120 is what Python says where it still holds what it could not write"
 
 
 def test_random_numbers_differ_from_fork_to_fork():

@@ -13,7 +13,6 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.errors import InputError
-from nerf_lightning.models.tiles import is_out_of_memory
 
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
@@ -27,7 +26,7 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         return _missing_plugin(str(error)) or explain(error, command, conf_folder)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
-    if isinstance(error, RuntimeError) and is_out_of_memory(error):
+    if isinstance(error, RuntimeError) and _is_out_of_memory(error):
         reason = " ".join(str(error).split()).partition(". ")[0]
         return (
             f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
@@ -37,6 +36,13 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
     return None
+
+
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    # Imported late: it brings torch, which a config is composed without.
+    from nerf_lightning.models.tiles import is_out_of_memory
+
+    return is_out_of_memory(error)
 
 
 def _missing_plugin(message: str) -> str | None:

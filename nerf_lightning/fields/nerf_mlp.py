@@ -11,7 +11,7 @@ from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.boxes import contract, in_unit_ball
 from nerf_lightning.geometry.contracted import Contracted
-from nerf_lightning.products import Linear
+from nerf_lightning.products import Linear, linear
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types.renderings import FieldOutput
 from nerf_lightning.types.scene import Scene
@@ -97,7 +97,7 @@ class NerfMLP(Field):
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
-        return self._activate(self.density_head(self._trunk(positions).float())[..., 0], None)
+        return self._activate(_exactly(self.density_head, self._trunk(positions))[..., 0], None)
 
     def forward(
         self,
@@ -107,12 +107,12 @@ class NerfMLP(Field):
     ) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
         hidden = self._trunk(positions)
-        raw_density = self.density_head(hidden.float())[..., 0]
+        raw_density = _exactly(self.density_head, hidden)[..., 0]
         feature = self.feature(hidden)
         # Encoded once per ray, not once per sample.
         direction = self.direction_encoder(directions).to(feature.dtype)
         direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
-        raw_rgb = self.color_head(self.color_hidden(torch.cat([feature, direction], dim=-1)).float())
+        raw_rgb = _exactly(self.color_head, self.color_hidden(torch.cat([feature, direction], dim=-1)))
         noise = None
         if random is not None and self.density_noise > 0:
             noise = self.density_noise * random.normal("density_noise", raw_density.shape[-1])
@@ -160,6 +160,11 @@ class _BatchNorm(nn.BatchNorm1d):
 
     def forward(self, features: Float[Tensor, "*points width"]) -> Float[Tensor, "*points width"]:
         return super().forward(features.flatten(0, -2)).view_as(features)
+
+
+def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
+    # With so few outputs float32 costs nothing, and a density or a colour keeps the digits that it has.
+    return linear(features, head.weight, head.bias, "float32")
 
 
 def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:

@@ -1,6 +1,5 @@
 """The panel: what is saved where it can be, and what is not there is said."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -58,7 +57,7 @@ class Panel:
     def __init__(self, folder, **changed):
         scene = ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
-        self.studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096, nullcontext))
+        self.studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
         self.client, self.gui = MagicMock(client_id=1), Gui()
         self.client.gui = self.gui
         c2w, camera = record.cameras.c2w[0], self.client.camera

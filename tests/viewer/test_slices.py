@@ -1,6 +1,5 @@
 """Views in slices are the same views; crops and photographs' cameras are kept."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -24,7 +23,7 @@ def scene():
 
 @pytest.fixture
 def renderer(scene):
-    return SlicedRenderer(tiny_model().eval(), scene_record(scene), "white", 4096, nullcontext)
+    return SlicedRenderer(tiny_model().eval(), scene_record(scene), "white", 4096)
 
 
 @pytest.fixture
@@ -32,7 +31,7 @@ def behind_grid(scene):
     """A model that asks its field only in occupied cells: those in which the photographs' alpha leaves something."""
     model = fast_model(PackedLevel).eval()
     model.place(scene)
-    return SlicedRenderer(model, scene_record(scene), "white", 4096, nullcontext)
+    return SlicedRenderer(model, scene_record(scene), "white", 4096)
 
 
 def finished(generator):

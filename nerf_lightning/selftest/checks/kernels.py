@@ -15,10 +15,10 @@ from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
 from nerf_lightning.kernels.march_torch import march_torch
 from nerf_lightning.kernels.mlp import mlp, mlp_torch
-from nerf_lightning.products import TILE_ROWS as TILE
 from nerf_lightning.kernels.packed import integrate, num_visible
 from nerf_lightning.kernels.packed_torch import integrate_torch, transmittance_torch
 from nerf_lightning.kernels.search import search
+from nerf_lightning.products import TILE_ROWS as TILE
 from nerf_lightning.products import Products
 from nerf_lightning.selftest.check import (
     UNIT,
