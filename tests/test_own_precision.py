@@ -279,8 +279,8 @@ def multiplies(node: ast.AST) -> bool:
         return isinstance(node.op, ast.MatMult)
     if not isinstance(node, ast.Call):
         return False
-    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-    return called in PRODUCTS
+    # Torch's are attributes (torch.mm, functional.linear); a plain name is one of products.py.
+    return isinstance(node.func, ast.Attribute) and node.func.attr in PRODUCTS
 
 
 def test_who_multiplies_matrices_says_in_which_precision():

@@ -133,7 +133,7 @@ def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_a
     assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 150
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path):
     folder = tmp_path / "sweep"
     process = begin(

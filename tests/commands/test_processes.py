@@ -70,7 +70,7 @@ def test_two_processes_follow_one(capture, tmp_path, alone):
     assert json.loads((tmp_path / "run.json").read_text())["finished_at_step"] == STEPS
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_machines_under_torchrun_follow_one_process(capture, tmp_path, alone):
     port = unused_port()
     machines = [
@@ -86,7 +86,7 @@ def test_two_machines_under_torchrun_follow_one_process(capture, tmp_path, alone
     assert_close(tmp_path, alone)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path, alone):
     process = start(*arguments(capture, *TWO, f"paths.output_dir={tmp_path}"))
     while process.poll() is None and saved(tmp_path)["global_step"] < 25:

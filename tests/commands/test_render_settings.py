@@ -242,7 +242,7 @@ def test_a_killed_render_goes_on_to_a_video(nerf, last, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_processes_share_the_frames(nerf, last, tmp_path):
     arguments = ["render", f"ckpt={last}", *SMALL, "path.num_frames=5", "format=frames"]
     assert nerf(*arguments, "trainer=cpu", f"paths.output_dir={tmp_path}/one").code == 0

@@ -59,7 +59,7 @@ def test_other_devices_are_refused_in_one_paragraph(nerf, monkeypatch):
     assert "nerf selftest knows CPUs and NVIDIA GPUs" in result.err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_whole_of_it(nerf, tmp_path):
     result = nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out")
     assert result.code == 0, result.out

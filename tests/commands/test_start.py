@@ -21,7 +21,7 @@ class Listed(Callback):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("model", [FAST, (*FAST, "data.crop_steps=0", "model=fast_small")])
 def test_nothing_that_a_step_can_do_without_is_loaded_before_it(model, tmp_path):
     (tmp_path / "listed.py").write_text(CALLBACK.format(names=NOT_NEEDED))

@@ -145,7 +145,7 @@ def test_a_sweep_killed_in_its_second_job_goes_on(capture, tmp_path):
     assert {row["steps"] for row in table(tmp_path)} == {"80"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ctrl_c_lets_parallel_jobs_save_and_starts_no_other(capture, tmp_path):
     longer = ("hydra/launcher=parallel", "seed=0,1,2", "trainer.max_steps=100000")
     process = start(*arguments(capture, tmp_path, *longer), start_new_session=True)

@@ -172,9 +172,12 @@ def test_an_epoch_is_every_training_ray_once(nerf, capture, tmp_path):
     assert steps == 3 + -(-8 * 256 // 100)  # after the crop
 
 
-# The article's larger Lego is the smaller one, with other sizes.
+# Every experiment is composed and built elsewhere; these take the longest to end.
+ARTICLES = ("lego_article", "lego_article_100")
+
+
 @pytest.mark.parametrize(
-    "experiment", [pytest.param("lego_article", marks=pytest.mark.exhaustive), "lego_article_100", "quickstart"]
+    "experiment", [*(pytest.param(name, marks=pytest.mark.exhaustive) for name in ARTICLES), "quickstart"]
 )
 def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     scene = ["scene=npz"] if experiment == "quickstart" else []
@@ -189,7 +192,7 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
-@pytest.mark.parametrize("experiment", ["fern", "fern_article"])
+@pytest.mark.parametrize("experiment", ["fern", pytest.param("fern_article", marks=pytest.mark.exhaustive)])
 def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
     result = nerf(
         "train", f"experiment={experiment}", f"scene.root={real_capture('fern')}", "trainer.max_epochs=null",

@@ -98,7 +98,7 @@ def require_sparse_files(folder: Path) -> None:
         pytest.skip("this file system has no sparse files")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.skipif(sys.platform != "linux", reason="anonymous memory is read from /proc")
 def test_ten_thousand_photographs_train_in_two_gigabytes(tmp_path):
     require_sparse_files(tmp_path)

@@ -21,7 +21,7 @@ def test_gradients_of_every_kind_of_model_are_right(method):
     assert rows[1].difference > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("method", [name for name in METHODS if "capacity" not in name])
 def test_whole_trainings_learn_and_end_alike(method):
     rows = rows_of(training.checks(a_place()), f"{method}, float32: PSNR", f"{method}, bfloat16: PSNR")
