@@ -17,6 +17,7 @@ def told(code, *arguments, **options):
     return process.returncode, output
 
 
+@pytest.mark.exhaustive
 def test_it_has_imported_everything_and_computed_nothing():
     code = """
 import sys, threading

@@ -68,6 +68,7 @@ def train(folder, name, accelerator, precision="32-true", steps=30, loss=None, d
     )
     settings.prepare_machine()
     system = static_system(name, scene, progress, steps, loss=loss)
+    settings.prepare(system.model)
     if accelerator == "tpu":
         from torch_xla.debug import metrics
 

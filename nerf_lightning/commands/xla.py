@@ -74,8 +74,10 @@ def use_cores(wanted: int | Literal["auto"]) -> int:
     Raises:
         InputError: the machine has another number.
     """
-    from torch_xla import runtime
+    from torch_xla import backends, runtime
 
+    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (products.py).
+    backends.set_mat_mul_precision("highest")
     if wanted == 1:
         runtime.global_runtime_device_count()  # autograd must see the device before its first backward
         return 1

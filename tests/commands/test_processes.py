@@ -100,7 +100,7 @@ def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path,
     assert_close(tmp_path, alone)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_fast_model_adapts_its_batches_alike_in_two_processes(capture, tmp_path):
     for name, extra in (("one", ()), ("two", TWO)):
         code, output = finished(start(*arguments(capture, *FAST_PATH, *extra, f"paths.output_dir={tmp_path / name}")))

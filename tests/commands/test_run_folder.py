@@ -136,7 +136,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/file/run"), 100, None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
     result = nerf(
         "train", "-m", "scene=npz", f"scene.path={capture}", *FAST, "seed=0,1", "data.batch_rays=32,48",

@@ -16,7 +16,7 @@ from nerf_lightning.randomness import batch_random
 from nerf_lightning.rendering.blending import photograph
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
-STEPS, SIDE, TILE_POINTS = 60, 16, 8192
+STEPS, SIDE, TILE_POINTS = 40, 16, 8192
 RAYS = {"nerf": 10, "nerf_occupancy": 16}
 MOST_RAYS = 64
 

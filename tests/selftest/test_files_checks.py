@@ -13,6 +13,9 @@ from nerf_lightning.selftest.runs import Runs
 
 pytestmark = pytest.mark.slow
 
+# Four runs of the command line; `nerf selftest` itself is run by .ci/run.
+pytestmark = pytest.mark.exhaustive
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):

@@ -90,7 +90,7 @@ print(dict(torch._dynamo.utils.counters["graph_break"]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_compiled_field_is_one_program():
     """In a process without the checks of shapes, which torch.compile does not look into."""
     result = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True)
