@@ -192,7 +192,8 @@ def test_a_few_steps_of_every_experiment(nerf, capture, tmp_path, experiment):
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
-@pytest.mark.parametrize("experiment", ["fern", pytest.param("fern_article", marks=pytest.mark.exhaustive)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("experiment", ["fern", "fern_article"])
 def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
     result = nerf(
         "train", f"experiment={experiment}", f"scene.root={real_capture('fern')}", "trainer.max_epochs=null",

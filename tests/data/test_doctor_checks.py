@@ -190,7 +190,11 @@ def test_a_hole_in_a_ring_of_views_is_noted():
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("reader", "name", "looks"),
-    [(LlffReader, "fern", set()), (TransformsReader, "fox", set()), (ColmapReader, "cup_colmap", {"upright"})],
+    [
+        (LlffReader, "fern", set()),
+        pytest.param(TransformsReader, "fox", set(), marks=pytest.mark.exhaustive),
+        pytest.param(ColmapReader, "cup_colmap", {"upright"}, marks=pytest.mark.exhaustive),
+    ],
 )
 def test_good_captures_raise_no_alarm(reader, name, looks):
     _, checks = examine(reader(root=str(real_capture(name))).read())

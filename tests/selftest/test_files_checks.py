@@ -11,8 +11,6 @@ from self_tested import a_place, rows_of
 from nerf_lightning.selftest.checks import files
 from nerf_lightning.selftest.runs import Runs
 
-pytestmark = pytest.mark.slow
-
 # Four runs of the command line; `nerf selftest` itself is run by .ci/run.
 pytestmark = pytest.mark.exhaustive
 
