@@ -10,6 +10,8 @@ SECONDS ?= 1800
 # How many tests run at a time.
 WORKERS ?= 2
 
+# Bytecode is kept, also where the environment says otherwise: else every process of the tests would compile it anew.
+export PYTHONDONTWRITEBYTECODE :=
 # One thread each; a worker without work takes over half of what another has left.
 PYTEST := $(VENV)/bin/python -m pytest -n $(WORKERS) --dist worksteal
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
