@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import Progress, batch_size
-from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.encoders.base import tables_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.ray_errors import RayErrors
 from nerf_lightning.losses.base import Loss
@@ -108,11 +108,11 @@ class RadianceFieldSystem(LightningModule):
 
     def configure_optimizers(self) -> Optimizer:
         """Complete the optimizer; the parameters of encoders are tables, which do not decay."""
-        encoders = [module for module in self.model.modules() if isinstance(module, Encoder)]
-        tables = {id(table): table for encoder in encoders for table in encoder.parameters()}
-        groups: list[dict[str, Any]] = [{"params": [p for p in self.model.parameters() if id(p) not in tables]}]
+        tables = tables_of(self.model)
+        known = set(map(id, tables))
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.model.parameters() if id(p) not in known]}]
         if tables:
-            groups.append({"params": list(tables.values()), "weight_decay": 0.0})
+            groups.append({"params": tables, "weight_decay": 0.0})
         return self.build_optimizer(groups)
 
     def training_step(self, batch: Batch, batch_index: int) -> None:

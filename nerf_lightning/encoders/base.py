@@ -41,3 +41,9 @@ def require_direction_encoder(encoder: Encoder) -> None:
     """
     if encoder.needs_unit_cube:
         raise ValueError(f"{type(encoder).__name__} cannot encode directions: directions do not lie in the unit cube")
+
+
+def tables_of(model: nn.Module) -> list[nn.Parameter]:
+    """Return the parameters of the encoders within a model, each once: tables, where the others are matrices."""
+    encoders = [module for module in model.modules() if isinstance(module, Encoder)]
+    return list({id(table): table for encoder in encoders for table in encoder.parameters()}.values())

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import on_device
-from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.encoders.base import tables_of
 from nerf_lightning.kernels.backends import without
 from nerf_lightning.products import Products
 from nerf_lightning.schedules.exponential import ExponentialDecay
@@ -64,9 +64,8 @@ class Training:
         """Return the gradients of the first batch, with tables as large as trained ones are."""
         # Fresh ones are all but zero: whatever is done with them would hardly matter.
         with torch.no_grad():
-            for encoder in self.system.modules():
-                for table in encoder.parameters() if isinstance(encoder, Encoder) else ():
-                    table.mul_(LEARNT)
+            for table in tables_of(self.system):
+                table.mul_(LEARNT)
         self.system.optimizers().zero_grad()  # type: ignore[union-attr]
         self.system.accumulate_gradients(self.loader.at(0, 0).to(self.system.device), lambda loss: loss.backward())
         named = self.system.model.named_parameters()
