@@ -1,12 +1,12 @@
 """`nerf bench`: the compiled kernels against the same mathematics in torch, eager and compiled."""
 
-import shutil
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.commands.timing import seconds_of
+from nerf_lightning.kernels.backends import can_compile
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 from nerf_lightning.kernels.mlp import mlp, mlp_torch
@@ -30,11 +30,6 @@ def kernel_ratios(device: torch.device, rounds: int) -> dict[str, list[float]]:
                     theirs / mine for theirs, mine in zip(seconds[kind][1:], ours, strict=True)
                 ]
     return result
-
-
-def can_compile(device: torch.device) -> bool:
-    """Tell whether torch.compile has what it needs: a C++ compiler on the CPU."""
-    return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
 
 
 def points_along_rays(device: torch.device) -> Tensor:

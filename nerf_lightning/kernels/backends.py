@@ -4,6 +4,7 @@ import functools
 import importlib
 import logging
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -102,6 +103,11 @@ def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
 def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
     """Return a triton module for tensors on a CUDA device; else None."""
     return twin(module) if device.type == "cuda" else None
+
+
+def can_compile(device: torch.device) -> bool:
+    """Tell whether torch.compile has what it needs: a C++ compiler on the CPU."""
+    return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
 
 
 def set_threads() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from self_tested import a_place, rows_of
 
-from nerf_lightning.kernels import hash_grid_numba, mlp_tiles
+from nerf_lightning.kernels import backends, hash_grid_numba, mlp_tiles
 from nerf_lightning.products import Linear
 from nerf_lightning.selftest.checks import training
 from nerf_lightning.selftest.models import METHODS
@@ -70,13 +70,14 @@ def test_what_only_a_gpu_does_is_not_run_here_and_says_so():
 
 
 def test_without_a_compiler_torch_compile_is_not_run(monkeypatch):
-    monkeypatch.setattr(training.shutil, "which", lambda name: None)
+    monkeypatch.setattr(backends.shutil, "which", lambda name: None)
     (row,) = rows_of(training.checks(a_place(compiles=True)), "compiled")
     assert (row.outcome, row.note) == ("not run", "there is no C++ compiler, which torch.compile needs on the CPU")
 
 
 COMPILED = """
 import torch
+from nerf_lightning.kernels import backends
 from nerf_lightning.selftest.checks import training
 
 compile_it = torch.nn.Module.compile

@@ -1,6 +1,5 @@
 """A small training of each kind of model, in every precision of the device, against the same on the CPU in float32."""
 
-import shutil
 from functools import cache
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import on_device
 from nerf_lightning.encoders.base import tables_of
-from nerf_lightning.kernels.backends import without
+from nerf_lightning.kernels.backends import can_compile, without
 from nerf_lightning.products import Products
 from nerf_lightning.schedules.exponential import ExponentialDecay
 from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart, relative
@@ -137,7 +136,7 @@ def _compiled(place: Place) -> Check:
     def difference() -> float:
         if not place.compiles:
             raise CannotRun("torch.compile is tried on GPUs, and on the CPU with trainer.compile=true")
-        if not place.is_cuda and not any(map(shutil.which, ("g++", "clang++", "cl"))):
+        if not can_compile(place.device):
             raise CannotRun("there is no C++ compiler, which torch.compile needs on the CPU")
         training = Training(method, place.device, place.chosen, None)
         if not training.system.model.compile_fields():
