@@ -1,5 +1,8 @@
 """The one error that is meant for a person: bad input, said in one paragraph with its cure."""
 
+ANOTHER = "The checkpoint is damaged, or made by somebody else: use another one."
+"""The cure of a state that no run can have left."""
+
 
 class InputError(Exception):
     """Report something that the user can mend.

@@ -1,6 +1,7 @@
 """The one LightningModule: it wires model, loss, optimizer and schedule together, and holds no mathematics."""
 
 import logging
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
@@ -11,6 +12,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning import ranks
+from nerf_lightning.checkpoints.format import LOOPS
+from nerf_lightning.checkpoints.resume_state import require_callbacks, require_loops, require_resumable
 from nerf_lightning.data.ray_batches import Progress, batch_size
 from nerf_lightning.encoders.base import tables_of
 from nerf_lightning.errors import InputError
@@ -233,14 +236,35 @@ class RadianceFieldSystem(LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place, tile and thread count decide the last bits of every sum."""
+        """Take up the state again: place, tile and thread count decide the last bits of every sum.
+
+        Raises:
+            InputError: the checkpoint is not one of this run; nothing was taken from it.
+        """
+        self._require_own(checkpoint)
         state = checkpoint["nerf_lightning"]
-        for name, value in state["progress"].items():
-            setattr(self.progress, name, value)
+        self.progress.take_up(Progress(**state["progress"]))
         self.guard.restore(state["bad_steps"], self.device)
         self.tile_points = state["tile_points"]
-        if state.get("world_size", 1) == ranks.world_size():
-            torch.set_num_threads(state["num_threads"])
+        if state["world_size"] == ranks.world_size():
+            _use_threads(state["num_threads"])
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Take the weights, and look at what they are, before anything is computed with them.
+
+        Raises:
+            InputError: a part of the model holds what it cannot.
+        """
+        result = super().load_state_dict(*args, **kwargs)
+        self.model.require_sound_state()
+        return result
+
+    def _require_own(self, checkpoint: dict[str, Any]) -> None:
+        trainer = self.trainer
+        require_resumable(checkpoint, self.model, self.build_optimizer, self.progress, self.configure_optimizers())
+        require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
+        ours = {key: getattr(trainer, key).state_dict() for key in LOOPS}
+        require_loops(checkpoint["loops"], ours, checkpoint["global_step"])
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)
@@ -252,3 +276,17 @@ class RadianceFieldSystem(LightningModule):
         for group in optimizer.param_groups:
             group["lr"] = self.schedule(self.progress.step, self.num_steps) * group.setdefault("base_lr", group["lr"])
         optimizer.step()
+
+
+def _use_threads(number: int) -> None:
+    cores = os.cpu_count() or 1
+    if number <= cores:
+        torch.set_num_threads(number)
+    else:
+        log.warning(
+            "The run has used %d threads and this machine has %d cores: it goes on with %d, and may differ in the last "
+            "bits.",
+            number,
+            cores,
+            torch.get_num_threads(),
+        )

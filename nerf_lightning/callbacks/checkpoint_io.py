@@ -11,6 +11,7 @@ from lightning_utilities.core.apply_func import apply_to_collection
 from torch import Tensor
 
 from nerf_lightning.callbacks.checkpoint_file import write_checkpoint
+from nerf_lightning.checkpoints import read_content
 
 # Copies in memory: one being written, one that waits for it (`last` and `best` fall due at the same step).
 MOST_COPIES = 2
@@ -44,6 +45,14 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         # The optimizer changes its tensors in place, and callbacks their lists: nothing may be shared.
         copy = apply_to_collection(checkpoint, Tensor, _on_the_host)
         self.writes.append(self.writer.submit(write_checkpoint, copy, Path(path)))
+
+    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
+        """Return a checkpoint that training can go on from, on the host: the file may come from anybody.
+
+        Raises:
+            InputError: it cannot be read, or is not as `checkpoints.format` says.
+        """
+        return read_content(Path(path), resumable=True)
 
     def raise_failure(self) -> None:
         """Return at once.

@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.checkpoints import BEST, LAST
 from nerf_lightning.errors import require_positive
+from nerf_lightning.files.schema import Maybe, Number, Record
 
 
 class Checkpoints(Callback):
@@ -23,6 +24,9 @@ class Checkpoints(Callback):
         every_steps: steps between two writes of `last.ckpt`.
         monitor: the logged value whose maximum is the best.
     """
+
+    STATE = Record({"best": Maybe(Number())})
+    needs_state = True
 
     def __init__(self, every_steps: int = 500, monitor: str = "val/psnr"):
         require_positive(every_steps=every_steps)

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.errors import require_positive
+from nerf_lightning.files.schema import Record, Whole
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +30,9 @@ class CollapseGuard(Callback):
         ratio: smallest share of the targets' spread that counts as alive.
         max_restarts: how often it restarts at most.
     """
+
+    STATE = Record({"failed": Whole()})
+    needs_state = True
 
     def __init__(
         self,

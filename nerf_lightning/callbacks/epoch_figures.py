@@ -10,6 +10,7 @@ from nerf_lightning.callbacks.validation_view import render_validation_view
 from nerf_lightning.errors import require_positive
 from nerf_lightning.export.figures import epoch_figure, loss_curve
 from nerf_lightning.export.pictures import save_png
+from nerf_lightning.files.schema import Many, Number, Record, Whole
 
 
 class EpochFigures(Callback):
@@ -20,6 +21,8 @@ class EpochFigures(Callback):
         every_steps: steps between two points of the loss curve.
         view: which view of the validation split is shown.
     """
+
+    STATE = Record({"steps": Many(Whole(), 1 << 20), "losses": Many(Number(), 1 << 20)})
 
     def __init__(self, every_epochs: int = 1, every_steps: int = 25, view: int = 0):
         require_positive(every_epochs=every_epochs, every_steps=every_steps)

@@ -90,10 +90,10 @@ class NanGuard(Callback):
             system.restart()
         else:
             content = trainer.strategy.load_checkpoint(good, weights_only=True)
+            system.on_load_checkpoint(content)
             trainer.strategy.load_model_state_dict(content)
             trainer.strategy.load_optimizer_state_dict(content)
-            system.on_load_checkpoint(content)
-            lowered = content["nerf_lightning"]["progress"].get("rollbacks", 0)
+            lowered = content["nerf_lightning"]["progress"]["rollbacks"]
         system.progress.attempt, system.progress.rollbacks = attempt + 1, rollbacks + 1
         system.guard.restore([skipped, 0], system.device)
         for group in system.optimizers().param_groups:

@@ -8,6 +8,7 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning import ranks
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.schema import Number, Record
 
 
 class TimeBudget(Callback):
@@ -20,6 +21,9 @@ class TimeBudget(Callback):
         seconds: training time in all, validation included.
         every_steps: steps between two estimates of the run's length.
     """
+
+    STATE = Record({"used": Number(low=0.0)})
+    needs_state = True
 
     def __init__(self, seconds: float, every_steps: int = 10):
         if seconds <= 0:

@@ -1,6 +1,7 @@
 """Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
 
 import importlib
+import math
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.checkpoints import Checkpoint
 from nerf_lightning.commands import xla
 from nerf_lightning.commands.schema import require_fitting_values
@@ -58,6 +60,7 @@ def build_system(
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
+    _require_few_samples(model, "The model")
     model.place(scene)
     return RadianceFieldSystem(
         model=model,
@@ -95,7 +98,12 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     _require_fitting(shapes, checkpoint)
     model = _built(config, checkpoint)
     load_weights(model, checkpoint)
+    _require_few_samples(model, f"The model of {checkpoint.path}")
     return model.eval()
+
+
+def _require_few_samples(model: RadianceModel, where: str) -> None:
+    require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 
 def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
@@ -127,8 +135,16 @@ def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
     Raises:
         InputError: the model has another shape than the checkpoint's.
     """
+    known = model.state_dict()
+    other = [name for name, tensor in checkpoint.weights.items() if name in known and tensor.dtype != known[name].dtype]
+    if other:
+        raise InputError(
+            f"{checkpoint.path} is damaged: its {other[0]} holds {checkpoint.weights[other[0]].dtype}, and the model "
+            f"{known[other[0]].dtype}. Use another checkpoint."
+        )
     try:
         model.load_state_dict(checkpoint.weights)
+        model.require_sound_state()
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:400]
         raise InputError(

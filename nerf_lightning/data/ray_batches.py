@@ -5,7 +5,7 @@ is stored but how many rays have been seen, so a resumed run goes on exactly whe
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Int
@@ -48,6 +48,11 @@ class Progress:
         self.step += 1
         self.rays_seen += num_rays
 
+    def take_up(self, other: "Progress") -> None:
+        """Go on from the place of another run."""
+        for place in fields(self):
+            setattr(self, place.name, getattr(other, place.name))
+
     def restart(self) -> None:
         """Begin a new attempt."""
         self.attempt, self.step, self.rays_seen = self.attempt + 1, 0, 0
@@ -56,13 +61,22 @@ class Progress:
 BATCH_SIZES = 8
 
 
+def batch_sizes(largest: int) -> list[int]:
+    """Return the sizes that batches may have, the largest first: it, its half, its quarter, ...
+
+    >>> batch_sizes(4096)
+    [4096, 2048, 1024, 512, 256, 128, 64, 32]
+    """
+    return [max(1, largest >> number) for number in range(BATCH_SIZES)]
+
+
 def batch_size(largest: int, wanted: float) -> int:
-    """Return the largest of a few fixed sizes (`largest`, its half, its quarter, ...) that is at most `wanted`.
+    """Return the largest of `batch_sizes` that is at most `wanted`.
 
     >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0)
     (1024, 4096, 32)
     """
-    sizes = [max(1, largest >> number) for number in range(BATCH_SIZES)]
+    sizes = batch_sizes(largest)
     return next((size for size in sizes if size <= wanted), sizes[-1])
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
-from nerf_lightning.geometry.boxes import center_and_half, contract, in_unit_ball, to_unit_cube
+from nerf_lightning.geometry.boxes import center_and_half, contract, in_unit_ball, require_box, to_unit_cube
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
@@ -69,6 +69,14 @@ class HashField(Field):
         self.contracted.place(scene)
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: a box without inside.
+        """
+        require_box(self.aabb)
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""

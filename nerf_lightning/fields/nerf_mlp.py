@@ -1,6 +1,6 @@
 """The MLP of the original NeRF (Fig. 7, arXiv 2003.08934)."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from nerf_lightning.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.fields.base import Field
-from nerf_lightning.geometry.boxes import contract, in_unit_ball
+from nerf_lightning.geometry.boxes import contract, in_unit_ball, require_box
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.products import Linear, linear
 from nerf_lightning.randomness import RayRandom
@@ -95,6 +95,14 @@ class NerfMLP(Field):
         self.contracted.place(scene)
         self.aabb.copy_(scene.aabb)
 
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: a box without inside.
+        """
+        require_box(self.aabb)
+
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
         return self._activate(_exactly(self.density_head, self._trunk(positions))[..., 0], None)
@@ -130,11 +138,6 @@ class NerfMLP(Field):
                 if self.xavier:
                     nn.init.xavier_uniform_(module.weight)
                     nn.init.zeros_(module.bias)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # Checkpoints from before the box was known to this field never ask for it.
-        state_dict.setdefault(f"{prefix}aabb", self.aabb)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted:

@@ -4,7 +4,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.types.rays import RayBundle
+
+
+def require_box(aabb: Float[Tensor, "2 3"]) -> None:
+    """Refuse a box from a file that has no inside.
+
+    Raises:
+        InputError: a lower corner that is not below the upper one.
+    """
+    if not bool((aabb[0] < aabb[1]).all()):
+        raise InputError(
+            f"The box in the model's state reaches from {aabb[0].tolist()} to {aabb[1].tolist()}. {ANOTHER}"
+        )
 
 
 def to_unit_cube(positions: Float[Tensor, "*points 3"], aabb: Float[Tensor, "2 3"]) -> Float[Tensor, "*points 3"]:

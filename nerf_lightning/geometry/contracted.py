@@ -39,8 +39,6 @@ class Contracted(nn.Module):
             self._known = bool(self.switch)
         return self._known
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # Checkpoints from before there was a switch are of bounded scenes.
-        state_dict.setdefault(f"{prefix}switch", torch.tensor(bool(self.fixed)))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
         self.forget()

@@ -195,6 +195,17 @@ class RadianceModel(nn.Module):
         for level in self._in_order():
             level.place(scene)
 
+    def require_sound_state(self) -> None:
+        """Look at what was loaded into the parts of the model, where they know what it can be.
+
+        Raises:
+            InputError: a part holds what it never can.
+        """
+        for part in self.modules():
+            look = getattr(part, "require_sound_state", None)
+            if part is not self and look is not None:
+                look()
+
     def counts(self) -> list[Tensor]:
         """Return the buffers of all levels in which a training step counts."""
         return [count for level in self._in_order() for count in level.counts()]

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.fields.base import Field
 from nerf_lightning.kernels.march import march
 from nerf_lightning.models.grid_level import GridLevel
@@ -78,6 +79,15 @@ class PackedLevel(GridLevel):
             "train/occupied": float(self.sampler.cells.float().mean()),
             "train/dropped_samples": float(self.tally[2]),
         }
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: counts that are none.
+        """
+        if bool((self.tally < 0).any()) or not -1.0 <= float(self.measured) <= MOST_SAMPLES:
+            raise InputError(f"The samples per ray in the model's state are no counts. {ANOTHER}")
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)

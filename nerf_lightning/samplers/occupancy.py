@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.carving import possible_cells
@@ -188,6 +189,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         if self._lattice is None:
             near, far = self.range.tolist()
             edges, step = [near], self.step_size
+            self._require_few((far - near) / step if not self.cone_angle else 0)
             while edges[-1] <= far:
                 edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
             edges.append(2 * edges[-1] - edges[-2])
@@ -209,9 +211,19 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         if near <= nearest and farthest <= far:
             return self.lattice
         step = self.step_size
+        self._require_few((farthest - nearest) / step)
         first = max(math.floor((nearest - near) / step), math.ceil(-near / step))
         number = torch.arange(first, math.ceil((farthest - near) / step) + 3, dtype=torch.float64)
         return (near + step * number).float().to(rays.near.device)
+
+    def _require_few(self, intervals: float) -> None:
+        """Refuse a march that would not end: near, far and the box may come out of a file."""
+        if not intervals <= allowed().intervals:
+            raise InputError(
+                f"A ray from near to far would be cut into {intervals:.3g} intervals of {self.step_size:.3g} scene "
+                f"units, and more than {allowed().intervals:,} are not taken. Give a smaller sampler.num_steps, or a "
+                "larger box; or add budgets.intervals=N."
+            )
 
     @torch.no_grad()
     def update(self, density_fn: DensityFn, step: int, key: int) -> None:
@@ -249,8 +261,8 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         self.allocate(resolution, cascades or 1)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        # The grid must be as large as the one that is read; without a switch that one is of a bounded scene.
-        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", torch.tensor(False)))
+        # The grid must be as large as the one that is read. A missing switch is complained of below.
+        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", self.contracted.switch))
         self.contracted.forget()
         self._fit_to_space()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerf_lightning.geometry.boxes import center_and_half
+from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.geometry.boxes import center_and_half, require_box
 from nerf_lightning.kernels.march import BLOCK, blocks_of
 
 # The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
@@ -49,6 +50,18 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: a box without inside, or cells that are neither empty nor occupied.
+        """
+        require_box(self.aabb)
+        near, far = self.range.tolist()
+        sound = 0.0 <= near < far and float(self.cells.max()) <= 1 and bool((self.density >= 0).all())
+        if not sound or not torch.equal(self.blocks, blocks_of(self.cells)):
+            raise InputError(f"The occupancy grid in the model's state cannot be one. {ANOTHER}")
 
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""

@@ -18,15 +18,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning import __version__
+from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
+from nerf_lightning.checkpoints.possible import require_possible_scene
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.schema import Unfit, shown
 from nerf_lightning.geometry.reach import near_and_far
-from nerf_lightning.record_checks import require_sound_scene
 from nerf_lightning.tensor_files import load_tensors
 from nerf_lightning.types.scene import Background, Cameras, Scene, Space
 
-FORMAT = 1
-KEY = "nerf_lightning"
-PRECISIONS = ("32-true", "tf32", "bf16-mixed")
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
 
@@ -93,6 +92,32 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         InputError: the file is missing, damaged, not a checkpoint of this program, or of another format.
     """
     path = Path(path)
+    content = read_content(path, resumable=False)
+    record, prefix = content[KEY], "model."
+    scene = record["scene"]
+    return Checkpoint(
+        path=path,
+        config=record["config"],
+        choices=record["choices"],
+        scene=SceneRecord(**scene | {"cameras": Cameras(**scene["cameras"])}),
+        weights={key[len(prefix) :]: value for key, value in content["state_dict"].items()},
+        step=content["global_step"],
+        precision=record["precision"],
+        tile_points=record["tile_points"],
+        good=record.get("bad_steps", [0, 0])[1] == 0,
+    )
+
+
+def read_content(path: Path, resumable: bool) -> dict[str, Any]:
+    """Return a checkpoint as it lies in its file, of which everything is as `format.checkpoint` says.
+
+    Args:
+        path: the file.
+        resumable: whether it must have what training goes on from.
+
+    Raises:
+        InputError: as `read_checkpoint`.
+    """
     content = _load(path)
     record = content.get(KEY)
     if not isinstance(record, dict) or "state_dict" not in content:
@@ -102,31 +127,16 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         )
     if record.get("format") != FORMAT:
         raise InputError(
-            f"{path} has checkpoint format {_short(record.get('format'))} (written by nerf_lightning "
-            f"{_short(record.get('version'))}), "
+            f"{path} has checkpoint format {shown(record.get('format'))} (written by nerf_lightning "
+            f"{shown(record.get('version'))}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )
     try:
-        scene = dict(record["scene"])
-        scene["cameras"] = _with_lens(scene["cameras"])
-        require_sound_scene(scene)
-        scene["cameras"] = Cameras(**scene["cameras"])
-        _require_sound_run(record, content["global_step"])
-        prefix = "model."
-        state = content["state_dict"]
-        return Checkpoint(
-            path=path,
-            config=record["config"],
-            choices=record["choices"],
-            scene=SceneRecord(**scene),
-            weights={key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)},
-            step=content["global_step"],
-            precision=record["precision"],
-            tile_points=record["tile_points"],
-            good=record.get("bad_steps", [0, 0])[1] == 0,
-        )
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is damaged: its record lacks or garbles {error}. {_instead_of(path)}") from error
+        require_checkpoint(content, resumable)
+        require_possible_scene(record["scene"], str(path))
+    except Unfit as problem:
+        raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
+    return content
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
@@ -157,29 +167,6 @@ def last_good_checkpoint(folder: Path) -> Path | None:
             if read_checkpoint(path).good:
                 return path
     return None
-
-
-def _with_lens(cameras: dict[str, Any]) -> dict[str, Any]:
-    # The first checkpoints knew pinholes only, and name no lens.
-    lens = {"lens": cameras["focal"].new_zeros(*cameras["focal"].shape[:-1], 6), "lens_model": "pinhole"}
-    return lens | cameras
-
-
-def _require_sound_run(record: dict[str, Any], step: object) -> None:
-    config, choices, tile = record["config"], record["choices"], record["tile_points"]
-    if type(step) is not int or not (tile is None or (type(tile) is int and tile > 0)):
-        raise ValueError("global_step or tile_points")
-    if record["precision"] not in PRECISIONS:
-        raise ValueError(f"precision {_short(record['precision'])}")
-    if not isinstance(config, str) or not isinstance(choices, dict):
-        raise ValueError("config or choices")
-    if not all(isinstance(word, str) for pair in choices.items() for word in pair):
-        raise ValueError("choices")
-
-
-def _short(value: object) -> str:
-    # What nests itself a thousandfold is not written out.
-    return str(value)[:40] if isinstance(value, (str, int, float)) else type(value).__name__
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -1,0 +1,100 @@
+"""What a file may cost before a person has agreed: the one table of sizes that are taken from a file unasked.
+
+Files come from anybody. Each limit is far above what sound files need, and low enough that nothing fills the memory or
+runs for hours. A person who knows better raises it on the command line (`budgets.views=500000`); no file can.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+
+from nerf_lightning.errors import InputError
+
+
+@dataclass(frozen=True)
+class Budgets:
+    """How much of each kind, at most."""
+
+    views: int = 200_000
+    """Photographs of a capture."""
+    view_pixels: int = 1 << 28
+    """Pixels of one camera's picture."""
+    megapixels: int = 178
+    """Size of a picture file that is decoded, in millions of pixels."""
+    name_characters: int = 1024
+    """Of the name of a photograph or of a scene."""
+    samples_per_ray: int = 1 << 12
+    """Points that a model asks its field about along one ray, at once."""
+    intervals: int = 1 << 17
+    """Steps of a march through an occupancy grid, from near to far."""
+    json_bytes: int = 1 << 26
+    """Of a json file."""
+    json_depth: int = 32
+    """Brackets within brackets in a json file."""
+    yaml_characters: int = 1 << 20
+    """Of a yaml text."""
+    yaml_depth: int = 50
+    """Brackets within brackets in a yaml text."""
+    object_bytes: int = 1 << 24
+    """Of that part of a PyTorch file that is not numbers."""
+    event_bytes: int = 1 << 29
+    """Of a run's TensorBoard files."""
+    film_frames: int = 100_000
+    """Of a camera path that is given by times."""
+    folders: int = 1_000_000
+    """That are searched for runs."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if type(value) is not int or value < 1:
+                raise InputError(f"budgets.{name}={value}: give a whole number above 0.")
+
+
+class _Now:
+    budgets = Budgets()
+
+
+def allowed() -> Budgets:
+    """Return the budgets that hold in this process."""
+    return _Now.budgets
+
+
+def allow(budgets: Budgets) -> None:
+    """Let these budgets hold from now on."""
+    _Now.budgets = budgets
+
+
+def allow_as_typed(arguments: Iterable[str]) -> None:
+    """Let the defaults hold, but for what the command line says: files are read before Hydra has composed a config.
+
+    Raises:
+        InputError: a value that is no whole number above 0.
+    """
+    known, typed = {field.name for field in fields(Budgets)}, dict[str, int]()
+    for argument in arguments:
+        key, _, value = argument.lstrip("+").partition("=")
+        name = key.removeprefix("budgets.")
+        if key != name and name in known:  # what is mistyped is named by Hydra
+            if not value.isdecimal():
+                raise InputError(f"{key}={value}: give a whole number above 0.")
+            typed[name] = int(value)
+    allow(Budgets(**typed))
+
+
+def require_within(name: str, found: int, where: str, what: str) -> None:
+    """Refuse what costs more than a person has agreed to.
+
+    Args:
+        name: of the budget.
+        found: how much there is, or is announced.
+        where: the file, for the message.
+        what: is counted, for the message.
+
+    Raises:
+        InputError: it is more than the budget, which the message names.
+    """
+    most = getattr(allowed(), name)
+    if found > most:
+        raise InputError(
+            f"{where} has {found:,} {what}, and more than {most:,} are not taken from a file unasked. If you trust it, "
+            f"add budgets.{name}={found}; else use another file."
+        )

@@ -1,0 +1,132 @@
+"""What a checkpoint is, key by key: whoever writes one and whoever reads one hold it against this page."""
+
+from typing import get_args
+
+import torch
+
+from nerf_lightning.budgets import allowed
+from nerf_lightning.files.schema import (
+    Choice,
+    Description,
+    Many,
+    Maybe,
+    Named,
+    Numbers,
+    Plain,
+    Record,
+    Text,
+    Whole,
+)
+from nerf_lightning.types.scene import Background, LensModel, Space
+
+FORMAT = 2
+KEY = "nerf_lightning"
+PRECISIONS = ("32-true", "tf32", "bf16-mixed")
+FARTHEST = 1e9
+"""Scene units: coordinates beyond have lost every digit that a picture could show."""
+WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
+"""Types of what a model holds. Numbers of other types would be cast without a word."""
+MOST_THREADS = 4096
+LOOPS = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
+"""Lightning's; each is held against the trainer's own (`resume_state`)."""
+VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"
+
+
+def cameras() -> Record:
+    """Return what the cameras of a scene are."""
+    pixels = allowed().view_pixels
+    return Record(
+        {
+            "c2w": Numbers(("views", 3, 4), low=-FARTHEST, high=FARTHEST),
+            "focal": Numbers(("views", 2), low=1e-3, high=FARTHEST),
+            "center": Numbers(("views", 2), low=-FARTHEST, high=FARTHEST),
+            "lens": Numbers(("views", 6), low=-FARTHEST, high=FARTHEST),
+            "lens_model": Choice(get_args(LensModel)),
+            "width": Numbers(("views",), (torch.int64,), low=1, high=pixels),
+            "height": Numbers(("views",), (torch.int64,), low=1, high=pixels),
+            "ndc": Maybe(Numbers(("views", 2), low=1e-6, high=FARTHEST)),
+        }
+    )
+
+
+def scene() -> Record:
+    """Return what the scene in a checkpoint is; `require_possible_scene` asks what no single key can answer."""
+    name = Text(allowed().name_characters)
+    views = allowed().views
+    numbers = Many(Whole(0, views), views, tuple)
+    return Record(
+        {
+            "view_names": Many(name, views, tuple, least=1, size="views"),
+            "name": name,
+            "cameras": cameras(),
+            "near": Numbers(("views",), low=0.0, high=FARTHEST),
+            "far": Numbers(("views",), low=0.0, high=FARTHEST),
+            "aabb": Numbers((2, 3), low=-FARTHEST, high=FARTHEST),
+            "splits": Record({}, {"train": numbers, "val": numbers, "test": numbers}),
+            "background": Choice(get_args(Background)),
+            "to_user": Numbers((4, 4)),
+            "space": Choice(get_args(Space)),
+        }
+    )
+
+
+def progress() -> Record:
+    """Return what a run's place is, one key for each field of `Progress`."""
+    rays = Whole(1, 1 << 31)
+    counts = {key: Whole() for key in ("attempt", "step", "rays_seen", "rollbacks")}
+    return Record(counts | {"batch_rays": rays, "largest_batch": rays})
+
+
+def record(resumable: bool) -> Record:
+    """Return what lies under this program's own key."""
+    use: dict[str, Description] = {
+        "format": Choice((FORMAT,)),
+        "version": Text(40, VERSION),
+        "config": Text(allowed().yaml_characters),
+        "choices": Named(Text(200), Text(200), 200),
+        "scene": scene(),
+        "precision": Choice(PRECISIONS),
+        "tile_points": Maybe(Whole(1, 1 << 31)),
+    }
+    run: dict[str, Description] = {
+        "progress": progress(),
+        "bad_steps": Many(Whole(), 2, least=2),
+        "num_threads": Whole(1, MOST_THREADS),
+        "world_size": Whole(1, 1 << 16),
+    }
+    return Record(use | run) if resumable else Record(use, run)
+
+
+def checkpoint(resumable: bool) -> Record:
+    """Return what a checkpoint is.
+
+    Args:
+        resumable: whether it must have what training goes on from, beside what rendering needs.
+    """
+    name = Text(500)
+    use: dict[str, Description] = {
+        "state_dict": Named(Text(500, r"model\..+"), Numbers(dtypes=WEIGHTS), 100_000),
+        "global_step": Whole(),
+        KEY: record(resumable),
+    }
+    entry = Plain(depth=2, most=100)  # what exactly, the optimizer itself says (`optimizer_state`)
+    run: dict[str, Description] = {
+        "epoch": Whole(0, 1),
+        "pytorch-lightning_version": Text(40, VERSION),
+        "loops": Record({key: Plain(most=1000) for key in LOOPS}),
+        "callbacks": Named(name, Plain(), 100),
+        "optimizer_states": Many(
+            Record({"state": Plain(depth=3), "param_groups": Many(entry, 100, least=1)}), 1, least=1
+        ),
+        "lr_schedulers": Many(Plain(), 0),
+    }
+    return Record(use | run) if resumable else Record(use, run)
+
+
+def require_checkpoint(content: object, resumable: bool) -> None:
+    """Hold a checkpoint against its description.
+
+    Raises:
+        Unfit: the first key that is missing, unknown, or not what it must be.
+    """
+    checkpoint(resumable).require(content, "", {})

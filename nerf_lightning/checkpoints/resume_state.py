@@ -1,0 +1,125 @@
+"""What training goes on from, held against the run that takes it up: its model, optimizer, callbacks and loops."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from torch import Tensor, nn
+
+from nerf_lightning.checkpoints.format import KEY
+from nerf_lightning.checkpoints.optimizer_state import Build, require_fitting_optimizer
+from nerf_lightning.data.ray_batches import Progress, batch_sizes
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.schema import Description, Plain, Unfit, like
+
+CURE = (
+    "The checkpoint is damaged, or made by somebody else: go on from another one (resume=RUN_FOLDER takes the newest "
+    "that is whole), or begin a new run from its weights alone (init_from=FILE)."
+)
+
+
+def require_resumable(
+    content: Mapping[str, Any], model: nn.Module, build_optimizer: Build, progress: Progress, optimizer: Any
+) -> None:
+    """Refuse a checkpoint that is sound in itself, and not of this run.
+
+    Args:
+        content: as `read_content` returned it.
+        model: the run's.
+        build_optimizer: the run's.
+        progress: the run's, as the loader has set it up.
+        optimizer: newly made, of the run's parameters.
+
+    Raises:
+        InputError: with the place in the checkpoint.
+    """
+    try:
+        prefix = "model."
+        require_fitting_weights(
+            {key[len(prefix) :]: value for key, value in content["state_dict"].items()}, model.state_dict()
+        )
+        require_fitting_optimizer(
+            content["optimizer_states"][0], optimizer, build_optimizer, most_steps=content["global_step"]
+        )
+        _require_progress(content[KEY], progress, content["global_step"])
+    except Unfit as problem:
+        raise InputError(f"Training cannot go on: {problem}. {CURE}") from problem
+
+
+def require_fitting_weights(weights: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> None:
+    """Refuse weights of another model.
+
+    Raises:
+        Unfit: other names, shapes or types.
+    """
+    for name in [*(known.keys() - weights.keys()), *(weights.keys() - known.keys())][:1]:
+        raise Unfit(f"state_dict.model.{name}", "is missing" if name in known else "belongs to no part of this model")
+    for name, tensor in weights.items():
+        if tensor.shape != known[name].shape or tensor.dtype != known[name].dtype:
+            raise Unfit(
+                f"state_dict.model.{name}",
+                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the model {known[name].dtype} in "
+                f"{tuple(known[name].shape)}",
+            )
+
+
+def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:
+    """Refuse the state of callbacks that is not what they keep.
+
+    A callback that describes its state (`STATE`) takes nothing else. Where it says so (`needs_state`), it is part of
+    what the run computes, and has to be there.
+
+    Raises:
+        InputError: with the callback.
+    """
+    try:
+        for callback in callbacks:
+            key, description = callback.state_key, getattr(callback, "STATE", Plain())
+            assert isinstance(description, Description)
+            if key in states:
+                description.require(states[key], f"callbacks.{key}", {})
+            elif getattr(callback, "needs_state", False):
+                raise Unfit(f"callbacks.{key}", "is missing")
+    except Unfit as problem:
+        raise InputError(f"Training cannot go on: {problem}. {CURE}") from problem
+
+
+def require_loops(loops: Mapping[str, Any], ours: Mapping[str, Any], step: int) -> None:
+    """Refuse the state of Lightning's loops that is of another kind than theirs, or of another step.
+
+    Args:
+        loops: from the checkpoint.
+        ours: what the trainer's loops keep.
+        step: the checkpoint's.
+
+    Raises:
+        InputError: with the key.
+    """
+    try:
+        like(ours).require(loops, "loops", {})
+        fit = loops["fit_loop"]
+        steps = fit["epoch_loop.manual_optimization.optim_step_progress"]["total"]
+        batches = fit["epoch_loop.batch_progress"]
+        if set(steps.values()) != {step}:
+            raise Unfit("loops.fit_loop", f"has taken {steps['completed']} steps, and the checkpoint {step}")
+        # A save within a step finds it begun, and not yet counted as done.
+        counts = [*batches["total"].values(), *batches["current"].values()]
+        if not all(step - 1 <= count <= step + 1 for count in counts):
+            raise Unfit("loops.fit_loop", f"has counted other batches than the {step} steps of the checkpoint")
+        if any(count > 1 for part in fit["epoch_progress"].values() for count in part.values()):
+            raise Unfit("loops.fit_loop.epoch_progress", "counts more than the one epoch that a run has")
+    except Unfit as problem:
+        raise InputError(f"Training cannot go on: {problem}. {CURE}") from problem
+
+
+def _require_progress(record: Mapping[str, Any], ours: Progress, step: int) -> None:
+    found = Progress(**record["progress"])
+    if found.largest_batch != ours.largest_batch or found.batch_rays not in batch_sizes(ours.largest_batch):
+        raise Unfit("progress", f"has {found.batch_rays} rays of {found.largest_batch} in a step, not those of the run")
+    if not (found.rollbacks <= found.attempt <= step + 1 and found.step <= step):
+        raise Unfit("progress", f"has come to what {step} steps cannot ({asdict(found)})")
+    if not found.rays_seen <= found.step * found.largest_batch:
+        raise Unfit("progress.rays_seen", f"is more than {found.step} steps can see")
+    skipped, in_row = record["bad_steps"]
+    if not in_row <= skipped <= step:
+        raise Unfit("bad_steps", f"counts more than {step} steps")
