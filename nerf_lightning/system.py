@@ -264,7 +264,8 @@ class RadianceFieldSystem(LightningModule):
         require_resumable(checkpoint, self.model, self.build_optimizer, self.progress, self.configure_optimizers())
         require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
         ours = {key: getattr(trainer, key).state_dict() for key in LOOPS}
-        require_loops(checkpoint["loops"], ours, checkpoint["global_step"])
+        skipped = checkpoint["nerf_lightning"]["bad_steps"][0]
+        require_loops(checkpoint["loops"], ours, checkpoint["global_step"], skipped)
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
         return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)

@@ -111,7 +111,7 @@ def checkpoint(resumable: bool) -> Record:
     }
     entry = Plain(depth=2, most=100)  # what exactly, the optimizer itself says (`optimizer_state`)
     run: dict[str, Description] = {
-        "epoch": Whole(0, 1),
+        "epoch": Whole(),
         "pytorch-lightning_version": Text(40, VERSION),
         "loops": Record({key: Plain(most=1000) for key in LOOPS}),
         "callbacks": Named(name, Plain(), 100),

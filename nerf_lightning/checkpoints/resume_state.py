@@ -84,13 +84,14 @@ def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:
         raise InputError(f"Training cannot go on: {problem}. {CURE}") from problem
 
 
-def require_loops(loops: Mapping[str, Any], ours: Mapping[str, Any], step: int) -> None:
+def require_loops(loops: Mapping[str, Any], ours: Mapping[str, Any], step: int, skipped: int) -> None:
     """Refuse the state of Lightning's loops that is of another kind than theirs, or of another step.
 
     Args:
         loops: from the checkpoint.
         ours: what the trainer's loops keep.
         step: the checkpoint's.
+        skipped: batches whose step was left out.
 
     Raises:
         InputError: with the key.
@@ -103,23 +104,27 @@ def require_loops(loops: Mapping[str, Any], ours: Mapping[str, Any], step: int) 
         if set(steps.values()) != {step}:
             raise Unfit("loops.fit_loop", f"has taken {steps['completed']} steps, and the checkpoint {step}")
         # A save within a step finds it begun, and not yet counted as done.
-        counts = [*batches["total"].values(), *batches["current"].values()]
-        if not all(step - 1 <= count <= step + 1 for count in counts):
+        most = step + skipped + 1
+        counts = [*batches["total"].values(), fit["epoch_loop.state_dict"]["_batches_that_stepped"]]
+        if not all(step - 1 <= count <= most for count in counts):
             raise Unfit("loops.fit_loop", f"has counted other batches than the {step} steps of the checkpoint")
-        if any(count > 1 for part in fit["epoch_progress"].values() for count in part.values()):
-            raise Unfit("loops.fit_loop.epoch_progress", "counts more than the one epoch that a run has")
+        # To Lightning an epoch ends where a run does: one that was gone on with has had several.
+        small = [*batches["current"].values(), *(n for part in fit["epoch_progress"].values() for n in part.values())]
+        if max(small) > most:
+            raise Unfit("loops.fit_loop", f"counts more than {step} steps can have had")
     except Unfit as problem:
         raise InputError(f"Training cannot go on: {problem}. {CURE}") from problem
 
 
 def _require_progress(record: Mapping[str, Any], ours: Progress, step: int) -> None:
     found = Progress(**record["progress"])
+    skipped, in_row = record["bad_steps"]
+    step += skipped  # those count as no steps of the optimizer
     if found.largest_batch != ours.largest_batch or found.batch_rays not in batch_sizes(ours.largest_batch):
         raise Unfit("progress", f"has {found.batch_rays} rays of {found.largest_batch} in a step, not those of the run")
     if not (found.rollbacks <= found.attempt <= step + 1 and found.step <= step):
         raise Unfit("progress", f"has come to what {step} steps cannot ({asdict(found)})")
     if not found.rays_seen <= found.step * found.largest_batch:
         raise Unfit("progress.rays_seen", f"is more than {found.step} steps can see")
-    skipped, in_row = record["bad_steps"]
-    if not in_row <= skipped <= step:
-        raise Unfit("bad_steps", f"counts more than {step} steps")
+    if not in_row <= skipped:
+        raise Unfit("bad_steps", "counts more in a row than in all")

@@ -68,8 +68,8 @@ class Whole(Description):
 class Number(Description):
     """A finite number."""
 
-    low: float = -math.inf
-    high: float = math.inf
+    low: int | float = -math.inf
+    high: int | float = math.inf
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""
@@ -191,8 +191,8 @@ class Numbers(Description):
 
     shape: tuple[int | str, ...] | None = None
     dtypes: tuple[torch.dtype, ...] = (torch.float32,)
-    low: float = -math.inf
-    high: float = math.inf
+    low: int | float = -math.inf
+    high: int | float = math.inf
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""

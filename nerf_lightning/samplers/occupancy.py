@@ -189,7 +189,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         if self._lattice is None:
             near, far = self.range.tolist()
             edges, step = [near], self.step_size
-            self._require_few((far - near) / step if not self.cone_angle else 0)
+            self._require_few((far - near) / step if not self.cone_angle else 0.0)
             while edges[-1] <= far:
                 edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
             edges.append(2 * edges[-1] - edges[-2])

@@ -150,6 +150,7 @@ BAD_YAML = {
 def test_a_config_that_is_no_config(nerf, tmp_path, command, text):
     file = write_checkpoint(tmp_path / "a.ckpt", lambda content: content["nerf_lightning"].update(config=text))
     words = "it holds references" if "&a" in text else "The config in" if "model" in text else "damaged"
+    words = "nerf_lightning.config has" if len(text) > 1_000_000 else words
     said(nerf(command, f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", words)
     assert not (tmp_path / "out").exists()
 
@@ -172,20 +173,20 @@ def state(**changed):
         (camera(c2w=torch.zeros(3, 4)), "c2w"),
         (camera(width=torch.full((6,), 1 << 40)), "width"),
         (camera(height=torch.full((6,), 1 << 27), width=torch.full((6,), 1 << 27)), "pixels"),
-        (camera(focal=torch.full((6, 2), float("nan"))), "focal, which holds NaN"),
+        (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
         (camera(lens="pinhole"), "lens"),
         (recorded(near=1.0), "near"),
         (recorded(aabb=torch.zeros(3)), "aabb"),
         (recorded(background="\x1b[2Jwhite"), "background"),
         (recorded(space="hyper"), "space"),
-        (recorded(view_names=tuple("abc")), "c2w"),
+        (recorded(view_names=tuple("abc")), "view_names has 3 entries"),
         (recorded(splits={"train": (0, 99)}), "splits"),
         (recorded(splits=[1]), "splits"),
         (state(precision="transformer-engine"), "precision"),
         (state(tile_points=-1), "tile_points"),
         (state(choices=["scene"]), "choices"),
         (state(config=3), "config"),
-        (state(format=[[["1"]]]), "format list"),
+        (state(format=[[["1"]]]), "format a list"),
     ],
 )
 def test_a_garbled_record_is_named(nerf, tmp_path, change, words):

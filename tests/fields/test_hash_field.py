@@ -84,12 +84,9 @@ def test_the_scene_says_whether_there_is_something_outside_of_its_box(space, eve
     assert bool((stubborn.density(torch.tensor([[1.2, 0.0, 0.0]])) == 0).all())
 
 
-def test_the_space_travels_in_the_state_dict_and_old_ones_load():
+def test_the_space_travels_in_the_state_dict():
     field, other = a_field(), a_field()
     field.place(replace(ball_scene(), space="contracted"))
     other.load_state_dict(field.state_dict())
     points = 5 * torch.rand(20, 3)
     assert torch.equal(other.density(points), field.density(points))
-    old = {name: value for name, value in field.state_dict().items() if name != "contracted.switch"}
-    other.load_state_dict(old)
-    assert bool((other.density(torch.tensor([[9.0, 0.0, 0.0]])) == 0).all())

@@ -100,14 +100,3 @@ def test_elsewhere_positions_enter_as_they_are(space):
     before = field.density(points)
     field.place(replace(ball_scene(), space=space, aabb=torch.tensor([[-9.0] * 3, [3.0] * 3])))
     assert torch.equal(field.density(points), before)
-
-
-def test_a_state_dict_from_before_there_were_spaces_loads():
-    field, other = tiny_field(), tiny_field()
-    state = field.state_dict()
-    old = {name: value for name, value in state.items() if name not in ("aabb", "contracted.switch")}
-    assert len(old) == len(state) - 2
-    other.place(replace(ball_scene(), space="contracted"))
-    other.load_state_dict(old)
-    points = 5 * torch.rand(20, 3)
-    assert torch.equal(other.density(points), field.density(points))

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import pytest
-import torch
 from scenes import ball_scene
 
 from nerf_lightning.geometry.contracted import Contracted
@@ -39,14 +38,3 @@ def test_it_travels_in_the_state_dict(state):
     assert not bool(other)
     other.load_state_dict(one.state_dict())
     assert bool(other) is state
-
-
-@pytest.mark.parametrize("fixed", [None, True, False])
-def test_a_state_dict_from_before_there_was_a_switch_loads(fixed):
-    switch = Contracted(fixed)
-    if fixed is None:
-        switch.place(replace(ball_scene(), space="contracted"))
-    parent = torch.nn.Module()
-    parent.child = switch
-    parent.load_state_dict({}, strict=True)
-    assert bool(switch) is bool(fixed)

@@ -204,16 +204,6 @@ def test_the_grid_takes_the_size_of_the_state_that_is_read(saved, placed):
     learn(other, ball_density())
 
 
-def test_a_state_from_before_there_were_spaces_is_of_one_box():
-    state = learn(a_sampler(), ball_density()).state_dict()
-    old = {name: value for name, value in state.items() if name != "contracted.switch"}
-    assert len(old) == len(state) - 1
-    sampler = a_sampler(contracted_ball())
-    sampler.load_state_dict(old)
-    assert not sampler.contracted
-    assert torch.equal(sampler.cells, state["cells"])
-
-
 def test_cascades_cover_what_lies_far_out():
     sampler = a_sampler(contracted_ball())
     rays = some_rays(40)

@@ -127,9 +127,3 @@ def test_importance_samples_remember_that_space_has_no_end():
     samples = sampler(rays, [], None)
     seen = composite(FieldOutput(torch.rand(4, 16), torch.rand(4, 16, 3)), samples, rays, torch.ones(3))
     assert ImportanceSampler(8)(rays, [seen], None).endless
-
-
-def test_a_stratified_sampler_of_an_old_checkpoint_loads():
-    sampler = StratifiedSampler(4)
-    sampler.load_state_dict({})
-    assert not sampler.contracted
