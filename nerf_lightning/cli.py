@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.closed_pipe import ends_quietly
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.sweep_arguments import is_sweep, sweep_arguments
@@ -88,6 +89,8 @@ def _run(command: str, arguments: list[str]) -> None:
     module = importlib.import_module(f"nerf_lightning.commands.{command}")
 
     def task(config: "DictConfig") -> Any:
+        # A job of a sweep may be in another process than the command line was read in.
+        allow(Budgets(**config.budgets))
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             from nerf_lightning.commands.sweep_job import run_job
 
@@ -100,6 +103,7 @@ def _run(command: str, arguments: list[str]) -> None:
         from nerf_lightning.commands.hydra_options import options_first
 
         arguments = options_first(arguments)
+        allow_as_typed(arguments)
         prepare = getattr(module, "prepare", list)
         sys.argv = [f"nerf {command}", *options_first(prepare(sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)

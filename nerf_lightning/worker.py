@@ -8,6 +8,7 @@ import json
 import sys
 from pathlib import Path
 
+from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.cli import explained
 
 
@@ -30,6 +31,7 @@ def _run(command: str, folder: Path) -> None:
 
     setup_globals()
     config = OmegaConf.load(folder / "config.yaml")
+    allow(Budgets(**config.budgets))
     hydra = OmegaConf.merge(OmegaConf.structured(HydraConf), OmegaConf.load(folder / "hydra.yaml"))
     HydraConfig.instance().set_config(OmegaConf.create({"hydra": hydra}))
     configure_log(hydra.job_logging)

@@ -19,7 +19,7 @@ from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
 from nerf_lightning.plain_yaml import read_plain_yaml
 
-OF_ONE_START = ("resume", "paths", "init_from", "sweep", "viewer")
+OF_ONE_START = ("resume", "paths", "init_from", "sweep", "viewer", "budgets")
 """What belongs to one start of a run, not to the run: the viewer opens a server, for whoever sits there then."""
 OF_THE_USER = ("hydra", "logger", "scene.download", "scene.cache_dir", "scene.allow_outside", "scene.max_gigabytes")
 """Where to write, what to fetch, and what to trust."""

@@ -16,11 +16,11 @@ from nerf_lightning.commands.suggestions import flatten
 NOT_IDENTITY = (
     *("paths.", "resume", "sweep.", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
     *("logger.", "evaluation.", "final.", "path.", "callbacks.", "viewer.", "scene.cache_dir", "scene.verify"),
-    *("scene.allow_outside", "scene.max_gigabytes"),
+    *("scene.allow_outside", "scene.max_gigabytes", "budgets."),
 )
 IDENTITY = ("callbacks.collapse_guard.",)
 # What may differ between two starts of which the second has nothing left to do.
-OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "viewer", "scene.cache_dir")
+OF_ONE_START = ("paths.", "resume", "sweep.", "logger.", "viewer", "scene.cache_dir", "budgets.")
 # What viewer=off leaves of its group: a run that is watched is the same run.
 UNWATCHED: dict[str, Any] = {"viewer": {}}
 

@@ -13,6 +13,7 @@ from nerf_lightning.data.json_files import keys_of, read_json
 from nerf_lightning.errors import InputError
 
 FORMAT = "The Blender format"
+LEAST_ANGLE = 1e-6
 KEYS, FRAME_KEYS = ("camera_angle_x", "frames"), ("file_path", "transform_matrix")
 
 
@@ -36,7 +37,7 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
     """
     content = read_json(path)
     fov, entries = keys_of(content, KEYS, str(path), FORMAT)
-    if not isinstance(fov, int | float) or not 0.0 < fov < math.pi:
+    if not isinstance(fov, int | float) or not LEAST_ANGLE <= fov < math.pi:
         raise InputError(
             f"{path}: camera_angle_x is {fov!r}, but it must be an angle between 0 and pi radians "
             "(the horizontal angle of view)."

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.data.checks import listed
+from nerf_lightning.budgets import require_within
+from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL, listed
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import is_rigid
@@ -96,6 +97,7 @@ def check_capture(capture: Capture) -> None:
         InputError: with the view's name: no views, two of one name, poses that are no rotation, focal lengths that are
             not positive, principal points outside the picture, and numbers that are not finite.
     """
+    require_within("views", len(capture.views), str(capture.source), "views")
     if not capture.views:
         raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
     names = [view.name for view in capture.views]
@@ -112,10 +114,16 @@ def _check_view(view: View, where: str) -> None:
         raise InputError(
             f"{where} has a pose or intrinsics with NaN or infinity. Remove it, or estimate the poses anew."
         )
-    if min(view.focal) <= 0 or min(view.size) < 1:
+    if max(view.focal) > FARTHEST or float(view.c2w[:, 3].abs().max()) > FARTHEST:
+        raise InputError(
+            f"{where} has a focal length or a centre beyond {FARTHEST:g}, where no digit is left that a picture could "
+            "show. Export the cameras again, in units of about the scene's size."
+        )
+    if not min(view.focal) >= LEAST_FOCAL or min(view.size) < 1:
         raise InputError(
             f"{where} has the focal length {view.focal[0]:g}, {view.focal[1]:g} for {view.size[0]:g} x "
-            f"{view.size[1]:g} pixels; all must be above 0. Export the intrinsics again."
+            f"{view.size[1]:g} pixels; all must be above 0, and a focal length at least {LEAST_FOCAL:g}. Export the "
+            "intrinsics again."
         )
     if not (0 < view.center[0] < view.size[0] and 0 < view.center[1] < view.size[1]):
         raise InputError(

@@ -14,6 +14,9 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.poses import is_rigid
 from nerf_lightning.types.scene import Background
 
+LEAST_FOCAL, FARTHEST = 1e-3, 1e9
+"""What a camera can have: a focal length in pixels, and coordinates in the capture's own units."""
+
 
 def listed(items: Iterable[object], cap: int = 10) -> str:
     """Return the items separated by commas, at most `cap` of them.
@@ -86,6 +89,11 @@ def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
         raise InputError(f"{where} must be a 4 x 4 matrix, but it is {shape}. Export the camera poses again.")
     if not torch.isfinite(pose).all():
         raise InputError(f"{where} holds NaN or infinite numbers. Remove that frame or export the poses again.")
+    if float(pose[:3, 3].abs().max()) > FARTHEST:
+        raise InputError(
+            f"{where} lies beyond {FARTHEST:g}, where no digit is left that a picture could show. Export the cameras "
+            "again, in units of about the scene's size."
+        )
     last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
     if not is_rigid(pose[:3]) or (pose[3] - last).abs().max() > 1e-3:
         raise InputError(

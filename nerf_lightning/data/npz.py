@@ -13,6 +13,8 @@ from torch import Tensor
 
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.checks import (
+    FARTHEST,
+    LEAST_FOCAL,
     check_bounds,
     check_divisible,
     check_step,
@@ -182,8 +184,10 @@ def _checked_images(images: Shaped[np.ndarray, "..."], path: Path) -> Shaped[np.
 def _checked_focal(focal: Shaped[np.ndarray, "..."], path: Path) -> float:
     """Return the focal length in pixels."""
     value = float(focal.reshape(-1)[0]) if focal.size == 1 and focal.dtype.kind in "fiu" else 0.0
-    if not 0.0 < value < float("inf"):
-        raise InputError(f"{path}: focal must be one number above 0, in pixels. {LAYOUT}")
+    if not LEAST_FOCAL <= value <= FARTHEST:
+        raise InputError(
+            f"{path}: focal must be one number above 0, from {LEAST_FOCAL:g} to {FARTHEST:g} pixels. {LAYOUT}"
+        )
     return value
 
 

@@ -45,6 +45,16 @@ def a_pose_of_a_thousand_digits(root):
     edit_frame(root, 0, transform_matrix=[[10**400] * 4] * 4)
 
 
+@case("transforms", r"has the focal length 1e-300, .*; all must be above 0, and a focal length at least 0.001")
+def a_focal_length_of_nothing(root):
+    edit_json(root, lambda content: content | {"fl_x": 1e-300, "fl_y": 1e-300})
+
+
+@case("transforms", r"transform_matrix lies beyond 1e\+09, where no digit is left")
+def a_camera_at_the_end_of_the_world(root):
+    edit_frame(root, 0, transform_matrix=[[1, 0, 0, 9e30], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
 @case("transforms", r"poses.csv is not valid json: .*line 1", file="poses.csv")
 def a_csv_of_reality_capture(root):
     (root / "poses.csv").write_text("#name,x,y,alt,heading,pitch,roll\np_0.png,0,0,1,2,3,4\n")

@@ -100,7 +100,7 @@ ONE_NAN[2, 0, 0, 0] = np.nan
             r"images\[0\] has values outside 0..1 or NaN. Divide 0..255",
         ),
         ({"images": ONE_NAN}, r"images\[2\] has values outside 0..1 or NaN"),
-        ({"focal": np.array([1.0, 2.0])}, r"focal must be one number above 0, in pixels"),
+        ({"focal": np.array([1.0, 2.0])}, r"focal must be one number above 0, from 0.001 to"),
         ({"focal": np.array(-1.0)}, r"focal must be one number above 0"),
         ({"focal": np.array("far")}, r"focal must be one number above 0"),
         ({"focal": np.array({"a": 1})}, r"is not a numpy .npz archive, or is damaged: Object arrays"),

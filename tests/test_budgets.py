@@ -1,0 +1,45 @@
+"""What a file may cost: one table, raised by the command line alone."""
+
+from dataclasses import asdict
+
+import pytest
+from configs import composed, loaded
+from omegaconf import OmegaConf
+
+from nerf_lightning.budgets import Budgets, allow, allow_as_typed, allowed, require_within
+from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def _defaults_afterwards():
+    yield
+    allow(Budgets())
+
+
+def test_the_yaml_has_the_table_that_the_code_has():
+    assert OmegaConf.to_container(loaded("budgets", "default")) == asdict(Budgets())
+
+
+@pytest.mark.parametrize("command", sorted(file.stem for file in conf_folder().glob("*.yaml")))
+def test_every_command_has_it(command):
+    assert composed(command).budgets == asdict(Budgets())
+
+
+def test_a_limit_is_raised_by_what_is_typed_and_by_nothing_else():
+    allow_as_typed(["scene=npz", "budgets.views=7", "xbudgets.json_depth=3", "budgets.nothing=4"])
+    assert allowed() == Budgets(views=7)
+    allow_as_typed([])
+    assert allowed() == Budgets()
+
+
+@pytest.mark.parametrize("value", ["0", "-3", "many", "1.5", ""])
+def test_a_limit_is_a_whole_number(value):
+    with pytest.raises(InputError, match=r"budgets\.views=.*give a whole number above 0"):
+        allow_as_typed([f"budgets.views={value}"])
+
+
+def test_what_is_too_much_is_said_with_the_setting_that_takes_it():
+    require_within("views", 200_000, "FILE", "views")
+    with pytest.raises(InputError, match=r"FILE has 200,001 views, .* add budgets\.views=200001"):
+        require_within("views", 200_001, "FILE", "views")
