@@ -51,4 +51,7 @@ def widened(
     reach = int(torch.ceil(torch.tensor(largest) + 0.5)) if largest > 0 else 0
     if reach == 0 or 2 * reach + 1 > min(matter.shape):
         return None
-    return functional.max_pool2d(matter.float()[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0] > 0
+    # A square is a row of columns: (2 r + 1) comparisons a pixel for each of the two, in place of (2 r + 1)^2.
+    size, pixels = 2 * reach + 1, matter.float()[None, None]
+    columns = functional.max_pool2d(pixels, (size, 1), stride=1, padding=(reach, 0))
+    return functional.max_pool2d(columns, (1, size), stride=1, padding=(0, reach))[0, 0] > 0

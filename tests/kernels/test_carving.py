@@ -102,6 +102,21 @@ def test_the_compiled_twin_carves_what_the_reference_carves(a_view, half_diagona
     assert torch.equal(fast, slow)
 
 
+def test_matter_is_widened_to_squares_that_hold_the_largest_disc():
+    matter = torch.zeros(20, 30, dtype=torch.bool)
+    matter[3, 12] = matter[19, 0] = True
+    found = carving_torch.widened(matter, torch.tensor([0.0, 0.4, 2.3]))  # 2.3 and half a pixel: 3
+    expected = torch.zeros_like(matter)
+    expected[0:7, 9:16] = expected[16:20, 0:4] = True
+    assert found is not None
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("radius", [[], [0.0], [9.8]])
+def test_without_a_disc_that_fits_nothing_is_widened(radius):
+    assert carving_torch.widened(torch.ones(20, 30, dtype=torch.bool), torch.tensor(radius)) is None
+
+
 def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
     scene = ball_scene(num_views=24, size=40)
     fast = possible_cells(scene, *cells(scene))
