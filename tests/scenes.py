@@ -15,6 +15,11 @@ from nerf_lightning.types.rays import RayBundle
 from nerf_lightning.types.scene import PixelStore, Scene
 
 BALL_RADIUS = 0.8
+LENSES = [
+    ("radial_tangential", (-0.5, 0.4, 0.0, 0.0, 0.004, -0.003)),
+    ("radial_tangential", (0.4, 0.1, 0.0, 0.0, 0.0, 0.0)),
+    ("fisheye", (0.1, -0.02, 0.0, 0.0, 0.0, 0.0)),
+]
 
 
 def ball_scene(

@@ -14,7 +14,7 @@ from nerf_lightning.commands.scoring import Scoring
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, Progress, RayBatches, gather
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
-from nerf_lightning.geometry.carving import possible_cells
+from nerf_lightning.kernels.carving import possible_cells
 from nerf_lightning.losses.mse import MeanSquaredError
 
 

@@ -22,20 +22,26 @@ def footprint(
         centers: of the spheres, world axes, scene units.
         half_diagonal: the spheres' radius in scene units.
     """
-    local = camera_coordinates(cameras, view, centers)
     if cameras.lens_model == "pinhole":
-        return _through_pinhole(cameras, view, local, half_diagonal)
+        return _through_pinhole(cameras, view, centers, half_diagonal)
+    local = camera_coordinates(cameras, view, centers)
     return _through_lens(cameras, view, local * local.new_tensor([1.0, -1.0, -1.0]), half_diagonal)
 
 
-def _through_pinhole(cameras: Cameras, view: int, local: Tensor, half_diagonal: float) -> tuple[Tensor, Tensor, Tensor]:
-    depth = -local[..., 2]
+def _through_pinhole(
+    cameras: Cameras, view: int, centers: Tensor, half_diagonal: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    # Sums are written out, in the order of the compiled twin (kernels/carving_numba.py), which has the same bits.
+    c2w = cameras.c2w[view]
+    x, y, z = (centers - c2w[:, 3]).unbind(dim=-1)
+    right, up, back = (x * axis[0] + y * axis[1] + z * axis[2] for axis in c2w[:, :3].unbind(dim=-1))
+    depth = -back
     in_front = depth > 2.0 * half_diagonal
     safe = torch.where(in_front, depth, 1.0)
-    x = cameras.focal[view, 0] * local[..., 0] / safe + cameras.center[view, 0]
-    y = -cameras.focal[view, 1] * local[..., 1] / safe + cameras.center[view, 1]
+    x = cameras.focal[view, 0] * right / safe + cameras.center[view, 0]
+    y = -cameras.focal[view, 1] * up / safe + cameras.center[view, 1]
     # A sphere off the axis appears longer: by no more than its ray's length over its depth, squared.
-    stretch = (local.square().sum(dim=-1) / safe.square()).clamp(max=9.0)
+    stretch = ((right.square() + up.square() + depth.square()) / safe.square()).clamp(max=9.0)
     radius = cameras.focal[view].max() * half_diagonal / (safe - half_diagonal).clamp(min=half_diagonal) * stretch
     return x, y, torch.where(in_front, radius, 0.0)
 

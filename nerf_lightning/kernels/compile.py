@@ -2,7 +2,7 @@
 
 from nerf_lightning.kernels.backends import twin
 
-CPU_TWINS = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba")
+CPU_TWINS = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba", "carving_numba")
 
 
 def compile_kernels() -> None:

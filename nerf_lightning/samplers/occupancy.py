@@ -12,8 +12,8 @@ from torch import Tensor
 from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
-from nerf_lightning.geometry.carving import possible_cells
 from nerf_lightning.geometry.contracted import Contracted
+from nerf_lightning.kernels.carving import possible_cells
 from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march
 from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible

@@ -85,11 +85,16 @@ class OccupancyGrid(nn.Module):
         side = self.resolution
         cascade, rest = number // side**3, number % side**3
         cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
-        center, half = center_and_half(self.aabb)
-        return center + (2.0 * (cell + within) / side - 1.0) * half * (2.0**cascade)[:, None]
+        return self._from_cells(cell + within, (2.0**cascade)[:, None])
 
     def cell_centers(self, cascade: int) -> tuple[Float[Tensor, "cells 3"], float]:
         """Return the centres of the cells of one box, and half the diagonal of a cell."""
-        number = torch.arange(self.resolution**3, device=self.aabb.device) + cascade * self.resolution**3
+        along = torch.arange(self.resolution, device=self.aabb.device)[:, None] + 0.5
+        axes = self._from_cells(along, 2.0**cascade).unbind(dim=-1)
         half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) * 2**cascade / self.resolution
-        return self.positions(number, torch.full((1, 3), 0.5, device=number.device)), half_diagonal
+        return torch.stack(torch.meshgrid(*axes, indexing="ij")).view(3, -1).t(), half_diagonal
+
+    def _from_cells(self, at: Tensor, scale: Tensor | float) -> Tensor:
+        """Return places that are given in cells from the lower corner of a box, `scale` times as large as the first."""
+        center, half = center_and_half(self.aabb)
+        return center + (2.0 * at / self.resolution - 1.0) * half * scale

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -225,3 +226,14 @@ def test_a_learnt_shell_beyond_the_first_box_is_kept_and_the_rest_given_up():
     reach = 3**0.5 * half / side
     assert bool(((center.norm(dim=-1) - 5.0).abs() <= 1.0 + reach).all())
     assert {4, 5} <= set(cascade.tolist())
+
+
+def test_the_centre_of_a_cell_is_the_middle_of_its_positions():
+    """Bit for bit: carving asks about the centres, training about points in the same cells."""
+    sampler = OccupancySampler(resolution=12, num_cascades=3)
+    sampler.aabb.copy_(torch.tensor([[-1.1, -0.7, -0.3], [0.9, 1.7, 1.1]]))
+    for cascade in range(3):
+        number = torch.arange(12**3) + cascade * 12**3
+        centers, half_diagonal = sampler.cell_centers(cascade)
+        assert torch.equal(centers, sampler.positions(number, torch.full((1, 3), 0.5)))
+        assert half_diagonal == pytest.approx(2**cascade * math.hypot(2.0, 2.4, 1.4) / 24)

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.kernels import backends
 from nerf_lightning.kernels.adam import adam_step, adam_step_torch
+from nerf_lightning.kernels.carving import possible_cells
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
@@ -31,6 +32,7 @@ from nerf_lightning.selftest.check import (
     value_bound,
 )
 from nerf_lightning.selftest.place import Place
+from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.types.rays import PackedSamples, RayBundle
 
 POINTS, RAYS = 2048, 400
@@ -97,6 +99,7 @@ def checks(place: Place) -> list[Check]:
             "about 12 roundings an entry",
             lambda: _adam(device),
         ),
+        Check("carving: cells with another answer", 0.0, "the same operations in the same order", _carving),
         Check("search in sorted numbers", 0.0, "whole numbers", lambda: _search(device)),
         *[check for products in place.products for check in _perceptrons(place, products)],
         *([] if "tf32" in place.products else [_absent("perceptron, tf32", "only NVIDIA GPUs multiply in tf32")]),
@@ -108,7 +111,7 @@ def _twins(place: Place) -> list[Check]:
     if place.is_cuda:
         return [_loads("hash_grid_triton", "triton")]
     if place.device.type == "cpu":
-        names = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba")
+        names = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba", "carving_numba")
         found = [_loads(name, "numba") for name in names]
         return [*found, _absent("hash_grid (triton)", "it is for GPUs, and the device here is the CPU")]
     return []
@@ -238,6 +241,14 @@ def _adam(device: torch.device) -> float:
     adam_step(ours[0], ours[1], ours[2], ours[3], *settings)
     adam_step_torch(exact[0], exact[1], exact[2], exact[3], *settings)
     return largest([relative(found, expected) for found, expected in zip(ours, exact, strict=True)])
+
+
+def _carving() -> float:
+    centers = 1.5 * torch.randn(20_000, 3, generator=_generator())
+    scene = ball_scene()
+    with backends.without("carving_numba"):
+        expected = possible_cells(scene, centers, 0.05)
+    return float((possible_cells(scene, centers, 0.05) != expected).sum())
 
 
 def _search(device: torch.device) -> float:
