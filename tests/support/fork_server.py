@@ -332,10 +332,12 @@ def main() -> None:
     os.environ.update(SET_BY_NERF | os.environ)
     # Not this file's folder, but where our package is.
     sys.path[0] = str(REPOSITORY)
+    gc.disable()
     import_everything()
     # What is there is there to stay: no fork need look through it, and so copy it.
     gc.collect()
     gc.freeze()
+    gc.enable()
     request = serve(socket.socket(fileno=int(sys.argv[1])))
     # What was frozen cannot be taken apart in order, and some libraries would complain of that.
     os._exit(0) if request is None else end(run(request))
