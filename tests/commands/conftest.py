@@ -12,6 +12,7 @@ from hydra._internal.hydra import Hydra
 from running import FAST, start_cold
 from scenes import ball_scene
 from support.made_once import made_once
+from support.one_composition import mode_as_typed
 
 from nerf_lightning import cli
 
@@ -40,21 +41,13 @@ def save_ball(folder):
     np.savez(folder / "ball.npz", images=images, poses=poses.numpy(), focal=1.6 * 16)
 
 
-compose_for_mode = Hydra.get_mode
-
-
-def _mode(hydra, config_name, overrides):
-    """Compose the config once, as our conf/ sets no hydra.mode; Hydra would first compose it to look for that."""
-    return compose_for_mode(hydra, config_name, overrides) if "hydra.mode" in str(overrides) else None
-
-
 @pytest.fixture
 def nerf(monkeypatch, capfd):
     """Call the command line in this process."""
 
     def call(*arguments: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
-        monkeypatch.setattr(Hydra, "get_mode", _mode)
+        monkeypatch.setattr(Hydra, "get_mode", mode_as_typed)
         capfd.readouterr()
         code, environment = 0, dict(os.environ)
         try:
