@@ -51,6 +51,13 @@ class Refinement:
         """Render the finest picture once more: the model has changed, or somebody wants to keep it."""
         self.is_stale = True
 
+    def give_up(self) -> None:
+        """Drop what could not be rendered, and wait for another wish."""
+        failed = self.wish if self._job is None else self._job.look
+        if self.wish is failed:
+            self.wish = self.shown = None
+        self._job = None
+
     @property
     def is_moving(self) -> bool:
         """Whether nothing at all has been shown of the present wish."""
