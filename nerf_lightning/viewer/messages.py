@@ -39,7 +39,7 @@ def admitted(raw: object) -> bytes | None:
         if given is None or gate is None:
             return None
         return msgspec.msgpack.encode({"type": kind} | gate(given))
-    except (_Unfit, KeyError, msgspec.DecodeError, RecursionError):
+    except (_Unfit, KeyError, ValueError, TypeError, msgspec.MsgspecError, RecursionError):
         return None
 
 

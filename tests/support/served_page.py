@@ -4,7 +4,7 @@ import http.client
 import socket
 import threading
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -66,10 +66,9 @@ class ServedPage:
 
 
 @contextmanager
-def served(folder: Path, **options):
-    """Serve a page until the end of the block."""
-    scene = ball_scene(num_views=4, size=16)
-    record = scene_record(scene)
+def served(folder: Path, record: dict | None = None, **options):
+    """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture."""
+    record = replace(scene_record(ball_scene(num_views=4, size=16)), **(record or {}))
     studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
     page = Page(studio, Photographs(record, None, "white"), folder, "127.0.0.1", unused_port(), HEIGHT, **options)
     over = threading.Event()

@@ -37,19 +37,20 @@ NOT_NUMBERS = [math.nan, math.inf, -math.inf, "x", None, [], {}, True]
 
 
 @pytest.mark.parametrize("key", ["fov", "image_width", "image_height"])
-@pytest.mark.parametrize("value", [0, -1, 1e-300, 1e9, 4e8, 2**63, *NOT_NUMBERS])
-def test_a_camera_with_an_impossible_number_harms_nothing(page, client, key, value):
-    client.look_from(0, **{key: value})
+def test_a_camera_with_an_impossible_number_harms_nothing(page, client, key):
+    for value in [0, -1, 1e-300, 1e9, 4e8, 2**63, *NOT_NUMBERS]:
+        client.look_from(0, **{key: value})
     client.look_from(30)
     client.wait_for_height(HEIGHT)
     assert all(max(each.shape) <= limits.MOST_SIDE for each in client.pictures)
 
 
 @pytest.mark.parametrize("key", ["position", "wxyz", "look_at", "up_direction"])
-@pytest.mark.parametrize("bad", [[0.0] * 4, [0.0] * 3, [math.nan] * 3, [1e300] * 3, [9e30] * 4, [1.0], [], "abc", None])
-def test_a_camera_in_an_impossible_place_harms_nothing(page, client, key, bad):
-    client.look_from(0, **{key: bad})
-    client.set("Add keyframe", True)
+def test_a_camera_in_an_impossible_place_harms_nothing(page, client, key):
+    client.look_from(0)
+    for bad in [[0.0] * 4, [0.0] * 3, [math.nan] * 3, [1e300] * 3, [9e30] * 4, [1.0], [], "abc", None]:
+        client.look_from(0, **{key: bad})
+        client.set("Add keyframe", True)
     client.look_from(30)
     client.wait_for_height(HEIGHT)
 
@@ -89,11 +90,11 @@ GARBAGE = [
 ]
 
 
-@pytest.mark.parametrize("message", GARBAGE)
-def test_garbage_in_a_frame_is_dropped(page, client, message):
+def test_garbage_in_a_frame_is_dropped(page, client):
     client.look_from(0)
     client.wait_for(len)
-    client.socket.send(message)
+    for message in GARBAGE:
+        client.socket.send(message)
     client.look_from(90)
     before = len(client.pictures)
     client.wait_for_height(HEIGHT, after=before)
@@ -135,12 +136,11 @@ UPDATES = [
 ]
 
 
-@pytest.mark.parametrize("updates", UPDATES)
 @pytest.mark.parametrize("label", ["Show", "Field of view", "View", "x", "Seconds between", "Add keyframe"])
-def test_impossible_values_on_the_panel_are_dropped(page, client, label, updates):
+def test_impossible_values_on_the_panel_are_dropped(page, client, label):
     client.look_from(0)
-    client.wait_until(lambda: label in client._uuids)
-    client.send({"type": "GuiUpdateMessage", "uuid": client._uuids[label], "updates": updates})
+    for updates in UPDATES:
+        client.update(label, updates)
     client.set("Look through it", True)
     client.look_from(90)
     client.wait_for_height(HEIGHT)
@@ -228,6 +228,7 @@ def test_only_so_many_look_on(page):
     page.still_serves()
 
 
+@pytest.mark.filterwarnings("ignore:Queued a")
 def test_who_never_reads_is_let_go(page, monkeypatch):
     monkeypatch.setattr(limits, "SEND_SECONDS", 0.3)
     wait(lambda: not page.page.server.get_clients())
