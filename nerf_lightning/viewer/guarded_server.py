@@ -22,7 +22,7 @@ from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
 from nerf_lightning.viewer.complaints import Complaints
 from nerf_lightning.viewer.connections import GuardedConnection
-from nerf_lightning.viewer.page_headers import FIXED, headers_for, new_nonce, with_nonce
+from nerf_lightning.viewer.page_headers import FIXED, UNMARKED, headers_for, marked
 
 FULL = "So many look on already that the viewer takes no more connections: close a page of it.\n"
 
@@ -64,7 +64,7 @@ class Guard:
         if not self.is_in_place:
             raise InputError(
                 "This version of viser serves its page in a way that cannot be guarded against strangers. Install one "
-                "that can: pip install 'viser>=1.1,<1.2'."
+                "that can: pip install 'viser==1.1.1'."
             )
 
     def _serve(self, handler: Handler, host: str, port: int, **options: Any) -> serve:
@@ -106,13 +106,23 @@ class Guard:
         if response is None:
             full = len(connection.server.connections) >= limits.MOST_CONNECTIONS
             return _with(connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL), FIXED) if full else None
-        nonce = new_nonce()
-        if response.headers.get("Content-Type", "").startswith("text/html"):
-            response.body = with_nonce(response.body or b"", nonce)
-            response = _with(response, {"Content-Length": str(len(response.body))})
+        scripts = self._mark(response) if response.headers.get("Content-Type", "").startswith("text/html") else "'none'"
         if self.admission.brings_token(request.path):
             response = _with(response, {"Set-Cookie": self.admission.cookie(port)})
-        return _with(response, headers_for(hosts[0], nonce))
+        return _with(response, headers_for(hosts[0], scripts))
+
+    def _mark(self, response: Response) -> str:
+        """Mark the page's scripts; return which scripts its policy lets run."""
+        page = marked(response.body or b"")
+        if page is None:
+            self.complaints.say(
+                "the page of this version of viser is not known here: it is shown, but nothing would keep a stranger's "
+                "script from being run if one got in. viser 1.1.1 has a page that is known"
+            )
+            return UNMARKED
+        response.body, scripts = page
+        _with(response, {"Content-Length": str(len(response.body))})
+        return scripts
 
 
 def _with(response: Response, headers: dict[str, str]) -> Response:

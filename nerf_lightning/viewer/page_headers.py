@@ -7,7 +7,7 @@ import secrets
 # browsers do not count that as 'self'.
 POLICY = (
     "default-src 'none'",
-    "script-src 'nonce-{nonce}' 'wasm-unsafe-eval'",
+    "script-src {scripts} 'wasm-unsafe-eval'",
     "style-src 'unsafe-inline'",
     "img-src 'self' data: blob:",
     "font-src data:",
@@ -27,28 +27,30 @@ FIXED = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+# What runs in a page whose scripts could not be marked.
+UNMARKED = "'self' 'unsafe-inline'"
 # The page's two scripts: the one that unpacks, and the one that it unpacks and adds.
 SCRIPTS = ((b"<script ", b"<script nonce='%s' "), (b'e.type="module";', b"e.type=\"module\";e.nonce='%s';"))
 
 
-def headers_for(host: str, nonce: str) -> dict[str, str]:
+def headers_for(host: str, scripts: str) -> dict[str, str]:
     """Return the headers of every answer.
 
     Args:
         host: the name and port by which the browser found the page.
-        nonce: what scripts must carry to be run.
+        scripts: which scripts are run, in the policy's words.
     """
-    return {"Content-Security-Policy": "; ".join(POLICY).format(host=host, nonce=nonce)} | FIXED
+    return {"Content-Security-Policy": "; ".join(POLICY).format(host=host, scripts=scripts)} | FIXED
 
 
-def new_nonce() -> str:
-    """Return a word that nobody can guess."""
-    return secrets.token_urlsafe(16)
+def marked(page: bytes | bytearray) -> tuple[bytes, str] | None:
+    """Return viser's page with its own scripts marked, and the policy under which no other script is run.
 
-
-def with_nonce(page: bytes | bytearray, nonce: str) -> bytes:
-    """Return viser's page with its own scripts marked; any other script that gets into it will not be run."""
-    marked = bytes(page)
+    None: this is another page than the one that we know.
+    """
+    nonce, shown = secrets.token_urlsafe(16), bytes(page)
     for plain, with_mark in SCRIPTS:
-        marked = marked.replace(plain, with_mark % nonce.encode(), 1)
-    return marked
+        if plain not in shown:
+            return None
+        shown = shown.replace(plain, with_mark % nonce.encode(), 1)
+    return shown, f"'nonce-{nonce}'"

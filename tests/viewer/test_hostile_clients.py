@@ -1,5 +1,6 @@
 """Whatever somebody with a token sends: it harms neither the page, nor the others, nor the terminal."""
 
+import contextlib
 import math
 import os
 import socket
@@ -8,6 +9,7 @@ import time
 import msgspec
 import pytest
 from support.served_page import HEIGHT, served
+from websockets.exceptions import InvalidStatus
 
 from nerf_lightning.viewer import limits
 
@@ -225,6 +227,28 @@ def test_only_so_many_look_on(page):
     for each in (*crowd, late):
         each.close()
     wait(all_gone)
+    page.still_serves()
+
+
+def test_half_open_connections_are_limited(page):
+    lines = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(limits.MOST_SOCKETS)]
+    late = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(20)]
+    for line in late:
+        line.settimeout(20)
+        with contextlib.suppress(ConnectionResetError):
+            assert line.recv(1) == b""
+    for line in (*lines, *late):
+        line.close()
+    page.still_serves()
+
+
+def test_only_so_many_connect(page):
+    crowd = [page.client() for _ in range(limits.MOST_CONNECTIONS)]
+    with pytest.raises(InvalidStatus) as caught:
+        page.client()
+    assert caught.value.response.status_code == 503
+    for each in crowd:
+        each.close()
     page.still_serves()
 
 
