@@ -10,6 +10,8 @@ MOST_SOCKETS = 64
 """TCP connections of any kind, half-open ones too: far below the file descriptors that a process has."""
 MOST_MESSAGES_PER_SECOND = 200
 """Messages of one client beyond this are dropped unread; the page itself sends 20 to 50."""
+MOST_BYTES_PER_SECOND, MOST_BYTES_AT_ONCE = 100 * 1024, 1024 * 1024
+"""Who sends more is hung up on; the page sends some 15 kB a second."""
 MOST_MESSAGE_BYTES = 64 * 1024
 """A larger message closes its connection; the page's own have some hundred bytes."""
 SEND_SECONDS = 20.0
@@ -18,7 +20,9 @@ SEND_SECONDS = 20.0
 MOST_SIDE = 4096
 """A window counts as no wider and no higher than this (pixels)."""
 MOST_PIXELS = 3840 * 2160
-"""A window counts as no larger than this, at its own shape: about 60 bytes of memory each while a picture is made."""
+"""A window counts as no larger than this (pixels), at its own shape."""
+MOST_SQUARES = 4
+"""A picture has no more pixels than so many squares of max_height; a wider window than 4:1 gets a less fine one."""
 LEAST_FOV, MOST_FOV = math.radians(0.1), math.radians(170.0)
 """Vertical field of view (radians)."""
 MOST_COORDINATE = 1e6

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
+from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.slices import SlicedRenderer, View
 
@@ -96,4 +97,5 @@ class Refinement:
         return Job(look, height, False, renderer.slices(look, height))
 
     def _full_height(self, look: Look) -> int:
-        return min(look.height, self.most_height)
+        widest = int(self.most_height * (limits.MOST_SQUARES * look.height / look.width) ** 0.5)
+        return max(1, min(look.height, self.most_height, widest))

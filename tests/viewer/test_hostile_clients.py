@@ -57,13 +57,14 @@ def test_a_camera_in_an_impossible_place_harms_nothing(page, client, key):
     client.wait_for_height(HEIGHT)
 
 
-@pytest.mark.parametrize(("width", "height"), [(10**9, 10), (10, 10**9), (10**9, 10**9), (1, 1)])
+@pytest.mark.parametrize(("width", "height"), [(10**9, 10), (10, 10**9), (10**9, 10**9), (1, 1), (4096, 720)])
 def test_a_window_of_an_impossible_shape_asks_for_a_bounded_picture(page, client, width, height):
     client.look_from(0, image_width=width, image_height=height)
     client.wait_for(len)
     picture = client.pictures[-1]
     assert picture.shape[0] <= HEIGHT
     assert picture.shape[1] <= limits.MOST_SIDE
+    assert picture.shape[0] * picture.shape[1] <= limits.MOST_SQUARES * HEIGHT**2 * 1.05 + limits.MOST_SIDE
     page.still_serves()
 
 
@@ -181,6 +182,16 @@ def test_a_flood_of_messages_is_thinned(page, client, monkeypatch):
     client.socket.ping().wait(20)
     seconds = time.monotonic() - began
     assert 0 < len(wishes) <= (seconds + 1.5) * limits.MOST_MESSAGES_PER_SECOND
+
+
+def test_a_flood_of_pings_closes_its_client_alone(page, client):
+    """Each wants an answer, which waits in memory where nobody reads it."""
+    client.look_from(0)
+    client.wait_for(len)
+    pings = 200_000 * (b"\x89\xfd\x00\x00\x00\x00" + bytes(125))
+    with pytest.raises(OSError, match=r"reset|pipe"):
+        client.socket.socket.sendall(pings)
+    page.still_serves()
 
 
 def test_an_error_while_drawing_for_one_ends_neither_the_page_nor_the_loop(page, client, monkeypatch, caplog):
