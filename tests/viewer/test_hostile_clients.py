@@ -5,6 +5,7 @@ import math
 import os
 import socket
 import time
+from http.client import HTTPException
 
 import msgspec
 import pytest
@@ -250,6 +251,12 @@ def test_half_open_connections_are_limited(page):
             assert line.recv(1) == b""
     for line in (*lines, *late):
         line.close()
+
+    def answers():
+        with contextlib.suppress(OSError, HTTPException):
+            return page.get(f"/?token={page.token}")[0] == 200
+
+    wait(answers)
     page.still_serves()
 
 
