@@ -32,6 +32,9 @@ def trained(folder: Path, capture: Path, *model: str) -> None:
 class Resumed:
     """A run of 25 steps that is to go on from checkpoints of `trained`."""
 
+    def __repr__(self) -> str:
+        return str(self.file)
+
     def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
@@ -40,14 +43,18 @@ class Resumed:
         parts = _build_parts(composed("train", *settings))
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
-        self.scene, self.file = parts.scene, folder / "last.ckpt"
+        self.file = folder / "last.ckpt"
         self.sound: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
 
     def take(self, change: Callable[[dict[str, Any]], object]) -> None:
-        """Take the sound checkpoint, changed; then update the weights once, as compiled optimizers do: unseen."""
+        """Take the sound checkpoint, changed, and update the weights once: compiled optimizers look at no shapes."""
         content = copy.deepcopy(self.sound)
         change(content)
         torch.save(content, self.file)
+        self.take_file()
+
+    def take_file(self) -> None:
+        """Take what lies in the file."""
         threads = torch.get_num_threads()
         try:
             content = AtomicCheckpointIO().load_checkpoint(self.file)
