@@ -1,5 +1,6 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -14,9 +15,33 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import pytest
 import torch
+from _pytest import runner
 from support import fork_server
+from support.large_frame import in_large_frame
 
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Let the collector of cycles rest while tests are imported, and later pass over the million objects that stay."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def pytest_unconfigure():
+    """Give it back: libraries in C++ complain of what is left at the end."""
+    gc.unfreeze()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Run a test as pytest does, but with room for its frames."""
+    return in_large_frame(runner.pytest_runtest_protocol, item, nextitem)
 
 
 @pytest.fixture(autouse=True)

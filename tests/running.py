@@ -4,9 +4,13 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from support.fork_server import Forked, fits_a_fork
+
+from nerf_lightning.errors import InputError
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -73,7 +77,21 @@ def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
 def said(result, *parts: str) -> None:
     """Expect one paragraph with these words, exit code 2, and no traceback."""
     assert result.code == 2, result.err
-    paragraph = result.err.strip()
+    _is_one_paragraph(result.err.strip(), *parts)
+
+
+def refused(call: Callable[..., object], *arguments: object, parts: tuple[str, ...]) -> str:
+    """Expect one paragraph with these words of what lies below the command line, and return it.
+
+    What a command makes of an InputError is the same for all of them, and tried with one of each kind.
+    """
+    with pytest.raises(InputError) as caught:
+        call(*arguments)
+    _is_one_paragraph(str(caught.value), *parts)
+    return str(caught.value)
+
+
+def _is_one_paragraph(paragraph: str, *parts: str) -> None:
     assert len(paragraph.splitlines()) == 1, paragraph
     assert "Traceback" not in paragraph
     for part in parts:

@@ -19,18 +19,24 @@ from websockets.sync.client import connect  # noqa: E402
 
 
 class ViserClient:
-    """Somebody who looks on from a circle around the middle; reads what is sent unless told to be slow."""
+    """Somebody who looks on from a circle around the middle; reads what is sent unless told to be slow.
 
-    def __init__(self, port: int, width: int = 160, height: int = 120, reads: bool = True):
+    `address` is the one that is printed, with its token; `handshake` goes to the websocket's `connect`.
+    """
+
+    def __init__(self, address: str, width: int = 160, height: int = 120, reads: bool = True, **handshake):
         self.width, self.height = width, height
         self.pictures: list[np.ndarray] = []
+        self.said: list[dict] = []
+        """What is put on the panel, and notifications."""
         protocol = f"viser-v{viser.__version__}"
-        self.socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None)
+        url = address.replace("http", "ws", 1)
+        self.socket = connect(url, subprotocols=[protocol], max_size=None, **handshake)
         if reads:
             threading.Thread(target=self._read, daemon=True).start()
 
-    def look_from(self, degrees: float, distance: float = 4.0) -> None:
-        """Say that the camera stands there now."""
+    def look_from(self, degrees: float, distance: float = 4.0, **changed) -> None:
+        """Say that the camera stands there now; `changed` takes the place of parts of the message."""
         angle = math.radians(degrees)
         eye = distance * np.array([math.cos(angle), math.sin(angle), 0.4])
         forward = -eye / np.linalg.norm(eye)
@@ -49,13 +55,30 @@ class ViserClient:
             "look_at": [0.0, 0.0, 0.0],
             "up_direction": [0.0, 0.0, 1.0],
         }
+        self.send(message | changed)
+
+    def set(self, label: str, value: object) -> None:
+        """Give what stands under this label on the panel a value; True presses a button."""
+        self.update(label, {"value": value})
+
+    def update(self, label: str, updates: dict) -> None:
+        """Wait for a control of the panel, and send changes of it."""
+        self.wait_until(lambda: label in self._uuids)
+        self.send({"type": "GuiUpdateMessage", "uuid": self._uuids[label], "updates": updates})
+
+    def send(self, message: object) -> None:
+        """Send a message as it is."""
         self.socket.send(msgspec.msgpack.encode(message))
 
     def wait_for(self, enough, seconds: float = 60.0) -> None:
         """Wait until `enough(pictures)`; give up loudly."""
+        self.wait_until(lambda: enough(self.pictures), seconds)
+
+    def wait_until(self, true, seconds: float = 60.0) -> None:
+        """Wait until `true()`; give up loudly."""
         end = time.monotonic() + seconds
-        while not enough(self.pictures):
-            assert time.monotonic() < end, f"{len(self.pictures)} pictures came, and not the one waited for"
+        while not true():
+            assert time.monotonic() < end, f"{len(self.pictures)} pictures came, and not what was waited for"
             time.sleep(0.02)
 
     def wait_for_height(self, height: int, after: int = 0) -> np.ndarray:
@@ -66,6 +89,11 @@ class ViserClient:
     def close(self) -> None:
         self.socket.close()
 
+    @property
+    def _uuids(self) -> dict[str, str]:
+        made = [each for each in list(self.said) if "label" in (each.get("props") or {})]
+        return {each["props"]["label"]: each["uuid"] for each in made}
+
     def _read(self) -> None:
         try:
             for raw in self.socket:
@@ -74,5 +102,7 @@ class ViserClient:
                 for message in msgspec.msgpack.decode(inner)["messages"]:
                     if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                         self.pictures.append(np.array(Image.open(io.BytesIO(message["rgb_data"]))))
+                    elif message["type"].startswith(("Gui", "Notification")):
+                        self.said.append(message)
         except ConnectionClosed:
             pass

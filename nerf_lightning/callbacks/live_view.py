@@ -1,7 +1,7 @@
 """The page of `nerf view` while training."""
 
-import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning.callbacks.validation_view import WHOLE_BATCH_POINTS
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.errors import InputError
+from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import require_address
@@ -21,8 +22,6 @@ from nerf_lightning.viewer.studio import Studio
 MOVING_SECONDS = 0.5
 # Time for pictures that nobody wanted is not saved up.
 MOST_CREDIT = 0.1
-
-log = logging.getLogger(__name__)
 
 
 class LiveView(Callback):
@@ -37,9 +36,11 @@ class LiveView(Callback):
         share: largest part of the time that goes into pictures.
         refresh_seconds: time between two pictures of the same view.
         max_height: the finest picture, in pixels.
+        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1]; each at the page's port
+            unless it has its own, like gate.example:443.
 
     Raises:
-        InputError: no viser, or no place to listen.
+        InputError: no viser, no place to listen, or a host that is none.
     """
 
     def __init__(
@@ -49,12 +50,14 @@ class LiveView(Callback):
         share: float = 0.15,
         refresh_seconds: float = 3.0,
         max_height: int = 480,
+        hosts: Sequence[str] | None = None,
     ):
         require_viser()
         require_address(host, port)
+        named_places(hosts)
         if not 0 < share < 1:
             raise InputError(f"viewer.live_view.share={share}: give a part of the time between 0 and 1, like 0.15.")
-        self.host, self.port = host, port
+        self.host, self.port, self.hosts = host, port, hosts
         self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
         self.page: Page | None = None
         self.credit, self.last, self.refreshed = 0.0, 0.0, 0.0
@@ -74,9 +77,11 @@ class LiveView(Callback):
         )
         photographs = Photographs(renderer.scene, scene, scene.background)
         folder = Path(trainer.default_root_dir) / "viewer"
-        self.page = Page(Studio(renderer), photographs, folder, self.host, self.port, self.max_height)
+        where = self.host, self.port, self.max_height, self.hosts
+        self.page = Page(Studio(renderer), photographs, folder, *where)
         self.last = self.refreshed = time.perf_counter()
-        log.info("watch the training at %s", self.page.address)
+        # Its token is for this terminal: others may read train.log.
+        print(f"Watch the training at {self.page.address}", flush=True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Render for as long as the share allows."""

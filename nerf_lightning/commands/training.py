@@ -105,7 +105,9 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values(), *build(config.viewer).values()]
+    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    if "live_view" in config.viewer:
+        callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.

@@ -4,6 +4,7 @@ import logging
 import signal
 import webbrowser
 from types import FrameType
+from urllib.parse import urlsplit
 
 from omegaconf import DictConfig
 
@@ -14,6 +15,7 @@ from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
 from nerf_lightning.types.scene import Scene
+from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.photographs import Photographs
@@ -29,6 +31,7 @@ log = logging.getLogger(__name__)
 def view(config: DictConfig) -> None:
     """Serve the page until Ctrl-C or SIGTERM."""
     require_viser()
+    named_places(config.viewer.hosts)
     settings = build(config.trainer)
     settings.prepare_machine()
     checkpoint = read_checkpoint(config.ckpt)
@@ -42,7 +45,8 @@ def view(config: DictConfig) -> None:
     renderer = SlicedRenderer(model, record, background, settings.inference_tile_points)
     warm_up(renderer)
     studio = Studio(renderer)
-    page = Page(studio, Photographs(record, scene, background), folder, config.host, config.port, config.max_height)
+    where = config.host, config.port, config.max_height, config.viewer.hosts
+    page = Page(studio, Photographs(record, scene, background), folder, *where)
     stopped = _stop_signals()
     print(f"The page is at {page.address} (Ctrl-C ends it)", flush=True)
     if config.open_browser:
@@ -74,8 +78,8 @@ def open_browser(address: str) -> None:
             "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
             "ssh -L %s:%s THIS_MACHINE.",
             address,
-            address.rpartition(":")[2],
-            address.removeprefix("http://"),
+            urlsplit(address).port,
+            urlsplit(address).netloc,
         )
 
 

@@ -6,6 +6,7 @@ so that the two cannot drift apart; the tests draw their malformed files from it
 
 import math
 import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -73,7 +74,8 @@ class Number(Description):
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""
-        if type(value) not in (int, float) or not math.isfinite(value) or not self.low <= value <= self.high:  # type: ignore[arg-type, operator]
+        sound = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+        if not sound or not self.low <= value <= self.high:  # type: ignore[operator]
             raise Unfit(place, f"is {shown(value)}, not a finite number from {self.low:g} to {self.high:g}")
 
 

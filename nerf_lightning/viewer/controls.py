@@ -2,20 +2,27 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.export.pictures import save_png
 from nerf_lightning.geometry.clipping import CropBox
+from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.free_name import free_name, not_saved
 from nerf_lightning.viewer.frusta import Frusta
-from nerf_lightning.viewer.recorded_path import RecordedPath
+from nerf_lightning.viewer.plain_text import as_plain_markdown
+from nerf_lightning.viewer.recorded_path import LEAST_SECONDS, RecordedPath
 from nerf_lightning.viewer.session import Session
 
+Number = TypeVar("Number", int, float)
+
 AXES = ("x", "y", "z")
+LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
+# The crop box keeps this share of the scene's box along each axis.
+LEAST_SHARE = 0.01
 NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
 
@@ -30,6 +37,7 @@ class Controls:
     def __init__(self, session: Session, folder: Path):
         self.session, self.folder = session, folder
         self.gui = session.client.gui
+        self.harmless = session.studio.complaints.harmless
         self.frusta = Frusta(session, self._enter)
         self.path = RecordedPath(session, folder, self.frusta.add_keyframe)
         self._wants_snapshot = False
@@ -42,19 +50,24 @@ class Controls:
     def _add_view(self) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
         degrees = round(math.degrees(self.session.client.camera.fov))
-        fov = self.gui.add_slider("Field of view", 10.0, 120.0, 1.0, float(min(120, max(10, degrees))))
+        shown = within(float(degrees), LEAST_DEGREES, MOST_DEGREES)
+        fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, shown)
         snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
 
         @channel.on_update
+        @self.harmless
         def _(_: Any) -> None:
-            self.session.channel = channel.value
-            self.session.present()
+            if channel.value in CHANNELS:
+                self.session.channel = channel.value
+                self.session.present()
 
         @fov.on_update
+        @self.harmless
         def _(_: Any) -> None:
-            self.session.client.camera.fov = math.radians(fov.value)
+            self.session.client.camera.fov = math.radians(within(fov.value, LEAST_DEGREES, MOST_DEGREES))
 
         @snapshot.on_click
+        @self.harmless
         def _(_: Any) -> None:
             self._wants_snapshot = True
             self.session.refinement.refresh()
@@ -73,26 +86,30 @@ class Controls:
             self._leave = self.gui.add_button("Leave", visible=False)
 
         @visible.on_update
+        @self.harmless
         def _(_: Any) -> None:
             self.frusta.show(visible.value)
 
         @enter.on_click
+        @self.harmless
         def _(_: Any) -> None:
-            self._enter(min(number.value, len(names) - 1))
+            self._enter(within(number.value, 0, len(names) - 1))
 
         @self._split.on_update
+        @self.harmless
         def _(_: Any) -> None:
-            self.session.split = self._split.value
+            self.session.split = within(self._split.value, 0.0, 1.0)
             self.session.present()
 
         @self._leave.on_click
+        @self.harmless
         def _(_: Any) -> None:
             self.session.leave()
 
     def _enter(self, view: int) -> None:
         photographs = self.session.photographs
         there = photographs.has(view)
-        self._name.content = f"Through the camera of **{photographs.record.view_names[view]}**" + (
+        self._name.content = f"Through the camera of {as_plain_markdown(photographs.record.view_names[view])}" + (
             "" if there else " (its photograph is not at hand)"
         )
         self._name.visible = self._leave.visible = True
@@ -107,20 +124,25 @@ class Controls:
     def _add_path(self) -> None:
         with self.gui.add_folder("Camera path", expand_by_default=False):
             add = self.gui.add_button("Add keyframe", hint="The camera as it is now")
-            seconds = self.gui.add_number("Seconds between", 2.0, min=0.1, step=0.1)
+            seconds = self.gui.add_number(
+                "Seconds between", 2.0, min=LEAST_SECONDS, max=limits.MOST_SECONDS_BETWEEN, step=0.1
+            )
             undo = self.gui.add_button("Remove last")
             save = self.gui.add_button("Save as yaml")
             said = self.gui.add_markdown("No keyframes yet.")
 
         @add.on_click
+        @self.harmless
         def _(_: Any) -> None:
             said.content = self.path.add(float(seconds.value))
 
         @undo.on_click
+        @self.harmless
         def _(_: Any) -> None:
             said.content = self.path.remove_last()
 
         @save.on_click
+        @self.harmless
         def _(_: Any) -> None:
             said.content = self.path.save()
 
@@ -133,18 +155,19 @@ class Controls:
             low, high = in_user_frame(record)
             on = self.gui.add_checkbox("Show only what is in the box", False)
             sliders = [
-                self.gui.add_multi_slider(axis, a, b, (b - a) / 100, (a, b), min_range=(b - a) / 100)
+                self.gui.add_multi_slider(axis, a, b, LEAST_SHARE * (b - a), (a, b), min_range=LEAST_SHARE * (b - a))
                 for axis, a, b in zip(AXES, low, high, strict=True)
             ]
 
         def update(_: Any) -> None:
-            lower, upper = zip(*(slider.value for slider in sliders), strict=True)
+            ends = (ends_within(slider.value, a, b) for slider, a, b in zip(sliders, low, high, strict=True))
+            lower, upper = zip(*ends, strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
             self.frusta.draw_box(self.session.crop)
             self.session.look()
 
         for each in (on, *sliders):
-            each.on_update(update)
+            each.on_update(self.harmless(update))
 
     def _keep_snapshot(self) -> None:
         picture = self.session.latest()
@@ -152,12 +175,33 @@ class Controls:
             return
         self._wants_snapshot = False
         try:
-            path = free_name(self.folder, "snapshot", ".png")
+            path = free_name(self.folder, "snapshot", ".png", limits.MOST_SNAPSHOTS)
             save_png(path, picture)
         except OSError as error:  # nothing that is clicked ends a training
             self.session.client.add_notification("Snapshot", not_saved(error), color="red")
         else:
             self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
+
+
+def within(value: Number, least: Number, most: Number) -> Number:
+    """Return the nearest number in a range: a browser may send what its slider does not have.
+
+    >>> within(7, 0, 5)
+    5
+    """
+    return min(max(value, least), most)
+
+
+def ends_within(ends: tuple[float, ...], least: float, most: float) -> tuple[float, float]:
+    """Return the two ends of an interval within a range, the second one greater.
+
+    >>> ends_within((9.0, -9.0), 0.0, 4.0)
+    (3.96, 4.0)
+    """
+    lower, upper = ends
+    gap = LEAST_SHARE * (most - least)
+    lower = within(lower, least, most - gap)
+    return lower, within(upper, lower + gap, most)
 
 
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:

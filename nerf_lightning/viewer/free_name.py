@@ -3,12 +3,17 @@
 from pathlib import Path
 
 
-def free_name(folder: Path, stem: str, suffix: str) -> Path:
-    """Return a path with the first number that no file has; names never come from the page."""
-    number = 1
-    while (folder / f"{stem}_{number:03d}{suffix}").exists():
-        number += 1
-    return folder / f"{stem}_{number:03d}{suffix}"
+def free_name(folder: Path, stem: str, suffix: str, most: int) -> Path:
+    """Return a path with the first number that no file has; names never come from the page.
+
+    Raises:
+        OSError: so many there are already, and whoever clicks on would fill the disk.
+    """
+    for number in range(1, most + 1):
+        path = folder / f"{stem}_{number:03d}{suffix}"
+        if not path.exists():
+            return path
+    raise OSError(f"{folder} holds {most} of them, the most that the page writes")
 
 
 def not_saved(error: OSError) -> str:

@@ -69,7 +69,7 @@ class Frusta:
         thumbnail = photographs.thumbnail(view)
         image = None if thumbnail is None else thumbnail.numpy()
         handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)
-        handle.on_click(lambda _: self.on_click(view))
+        handle.on_click(self.session.studio.complaints.harmless(lambda _: self.on_click(view)))
 
     def _frustum(
         self, name: str, c2w: Tensor, fov: float, aspect: float, color: tuple[int, int, int], image: np.ndarray | None

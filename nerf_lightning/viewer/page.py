@@ -1,7 +1,8 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
-import logging
+import threading
 import warnings
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import torch
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.paths.base import frame_of
+from nerf_lightning.viewer import limits
+from nerf_lightning.viewer.admission import Admission
 from nerf_lightning.viewer.controls import Controls
 from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import free_port
@@ -19,6 +22,9 @@ from nerf_lightning.viewer.studio import Studio
 
 # People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
+FULL = (
+    f"{limits.MOST_CLIENTS} people look on already, and more are not drawn for: close a page, then load this one again."
+)
 
 
 def require_viser() -> Any:
@@ -46,32 +52,49 @@ class Page:
         host: the address to listen on; 127.0.0.1 is heard by this machine alone.
         port: the port, or the first to try.
         most_height: the finest picture, in pixels.
+        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
 
     Raises:
-        InputError: no viser, or no place to listen.
+        InputError: no viser, or one that cannot be guarded; no place to listen; a host that is none.
     """
 
     def __init__(
-        self, studio: Studio, photographs: Photographs, folder: Path, host: str, port: int, most_height: int
+        self,
+        studio: Studio,
+        photographs: Photographs,
+        folder: Path,
+        host: str,
+        port: int,
+        most_height: int,
+        hosts: Sequence[str] | None = None,
     ) -> None:
         viser = require_viser()
+        from nerf_lightning.viewer.guarded_server import Guard  # websockets comes with viser
+
         self.studio, self.photographs, self.folder = studio, photographs, folder
         self.most_height = most_height
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb)
         # A page that is closed amid a picture is nothing to speak of.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        logging.getLogger("websockets").setLevel(logging.ERROR)
-        with _quietly():
+        self.admission = Admission(host, hosts)
+        guard = Guard(self.admission, studio.complaints)
+        with _quietly(), guard.in_place():
             self.server = viser.ViserServer(host, free_port(host, port), label="nerf_lightning", verbose=False)
+        if not guard.is_in_place:
+            self.close()
+            guard.require_in_place()
         self._dress(record)
-        self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(lambda client: studio.remove(client.client_id))
+        self._seats: set[int] = set()
+        self._lock = threading.Lock()
+        self.server.on_client_connect(studio.complaints.harmless(self._welcome))
+        self.server.on_client_disconnect(studio.complaints.harmless(self._take_leave))
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page."""
-        return address_of(self.server.get_host(), self.server.get_port())
+        """Where a browser finds the page; who has this address has the token."""
+        place = address_of(self.server.get_host(), self.server.get_port())
+        return f"{place}/?token={self.admission.token}"
 
     def close(self) -> None:
         """Stop listening; open pages say that the connection is lost."""
@@ -92,9 +115,27 @@ class Page:
         start.near, start.far = 0.01 * self.around.radius, 100 * self.around.radius
 
     def _welcome(self, client: Any) -> None:
+        if not self._has_seat(client.client_id):
+            client.add_notification("Full", FULL, color="red")
+            return
         session = Session(client, self.studio, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
         Controls(session, self.folder)
+        # Who has left meanwhile may have been seen off before being here.
+        if client.client_id not in self.server.get_clients():
+            self._take_leave(client)
+
+    def _has_seat(self, client: int) -> bool:
+        with self._lock:
+            if len(self._seats) >= limits.MOST_CLIENTS:
+                return False
+            self._seats.add(client)
+            return True
+
+    def _take_leave(self, client: Any) -> None:
+        self.studio.remove(client.client_id)
+        with self._lock:
+            self._seats.discard(client.client_id)
 
 
 def address_of(host: str, port: int) -> str:

@@ -12,8 +12,14 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.geometry.paths.keyframes import Keyframe, Point, write_keyframes
+from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.free_name import free_name, not_saved
+from nerf_lightning.viewer.plain_text import as_plain_markdown
 from nerf_lightning.viewer.session import Session
+
+LEAST_SECONDS = 0.1
+# Letters of a message: it names a file, and shall be whole.
+MOST_SAID = 5000
 
 
 class RecordedPath:
@@ -33,7 +39,10 @@ class RecordedPath:
         self.handles: list[Any] = []
 
     def add(self, seconds: float) -> str:
-        """Add the camera as it is now, so many seconds after the one before; return what to say."""
+        """Add the camera as it is now, so many seconds after the one before; return what to say (markdown)."""
+        if len(self.keyframes) >= limits.MOST_KEYFRAMES:
+            return f"A path has {limits.MOST_KEYFRAMES} keyframes at most. Save it, then remove some."
+        seconds = min(max(seconds, LEAST_SECONDS), limits.MOST_SECONDS_BETWEEN)
         camera = self.session.client.camera
         self.times.append(self.times[-1] + seconds if self.times else 0.0)
         record = self.session.photographs.record
@@ -51,16 +60,18 @@ class RecordedPath:
         return self._count()
 
     def save(self) -> str:
-        """Write the yaml; return what to say."""
+        """Write the yaml; return what to say (markdown)."""
         if len(self.keyframes) < 2:
             return "A path needs two keyframes or more."
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            path = free_name(self.folder, "camera_path", ".yaml")
+            path = free_name(self.folder, "camera_path", ".yaml", limits.MOST_PATHS)
             write_keyframes(path, self.keyframes)
         except OSError as error:
-            return not_saved(error)
-        return f"Saved. To film it, add to nerf render: path=keyframes path.file={path}"
+            return as_plain_markdown(not_saved(error), MOST_SAID)
+        return (
+            f"Saved. To film it, add to nerf render: {as_plain_markdown(f'path=keyframes path.file={path}', MOST_SAID)}"
+        )
 
     def _count(self) -> str:
         if not self.keyframes:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
+from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.slices import SlicedRenderer, View
 
@@ -51,6 +52,13 @@ class Refinement:
         """Render the finest picture once more: the model has changed, or somebody wants to keep it."""
         self.is_stale = True
 
+    def give_up(self) -> None:
+        """Drop what could not be rendered, and wait for another wish."""
+        failed = self.wish if self._job is None else self._job.look
+        if self.wish is failed:
+            self.wish = self.shown = None
+        self._job = None
+
     @property
     def is_moving(self) -> bool:
         """Whether nothing at all has been shown of the present wish."""
@@ -89,4 +97,5 @@ class Refinement:
         return Job(look, height, False, renderer.slices(look, height))
 
     def _full_height(self, look: Look) -> int:
-        return min(look.height, self.most_height)
+        widest = int(self.most_height * (limits.MOST_SQUARES * look.height / look.width) ** 0.5)
+        return max(1, min(look.height, self.most_height, widest))

@@ -1,5 +1,6 @@
 """One person in front of the page: where they look from, what they see, and what is sent to them."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -48,10 +49,11 @@ class Session:
         self._arrived = False
         self._seen: tuple[View, Look] | None = None
         self._shown: UInt8[Tensor, "h w 3"] | None = None
+        self._wants_present, self._presenting = False, threading.Lock()
 
     def start(self) -> None:
         """Follow the camera from now on; there is a picture at once."""
-        self.client.camera.on_update(lambda _: self.look())
+        self.client.camera.on_update(self.studio.complaints.harmless(lambda _: self.look()))
         self.look()
         self.studio.add(self.client.client_id, self.refinement)
 
@@ -95,9 +97,19 @@ class Session:
             self.look()
 
     def present(self) -> None:
-        """Send the newest view again, as another channel or with the comparison cut elsewhere."""
-        if self._seen is not None:
-            self._send(*self._seen, FINE_QUALITY)
+        """Send the newest view again, as another channel or with the comparison cut elsewhere.
+
+        A slider asks for it more often than it can be done: who finds it being done leaves the next turn to whoever
+        does it.
+        """
+        self._wants_present = True
+        while self._wants_present and self._presenting.acquire(blocking=False):
+            try:
+                self._wants_present = False
+                if self._seen is not None:
+                    self._send(*self._seen, FINE_QUALITY)
+            finally:
+                self._presenting.release()
 
     def latest(self) -> UInt8[Tensor, "h w 3"] | None:
         """Return the picture that was sent last."""

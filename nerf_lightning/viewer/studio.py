@@ -1,10 +1,14 @@
 """Who is served next: every slice of rendering goes to one of the people who look on."""
 
+import logging
 import threading
 import time
 
+from nerf_lightning.viewer.complaints import Complaints
 from nerf_lightning.viewer.refinement import Refinement
 from nerf_lightning.viewer.slices import SlicedRenderer
+
+log = logging.getLogger(__name__)
 
 
 class Studio:
@@ -16,6 +20,7 @@ class Studio:
 
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
+        self.complaints = Complaints(log)
         self._refinements: dict[int, Refinement] = {}
         self._lock = threading.Lock()
         self._wish = threading.Event()
@@ -48,12 +53,18 @@ class Studio:
     def work(self) -> bool:
         """Render one slice for somebody; return False where nobody has a wish that is not fulfilled.
 
-        Who moves comes first; among equals, who was served longest ago.
+        Who moves comes first; among equals, who was served longest ago. What cannot be drawn is dropped: it ends
+        neither the page of the others nor a training.
         """
         self._wish.clear()
         for refinement in self._in_order():
             refinement.served = time.monotonic()
-            if refinement.work(self.renderer):
+            try:
+                if refinement.work(self.renderer):
+                    return True
+            except Exception as error:
+                refinement.give_up()
+                self.complaints.say("a picture of the viewer could not be drawn", error)
                 return True
         return False
 

@@ -1,8 +1,11 @@
 """The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
 
+import math
 import re
 import socket
 from types import SimpleNamespace
+from unittest.mock import MagicMock
+from urllib.parse import urlsplit
 
 import pytest
 import torch
@@ -13,7 +16,9 @@ from viser_client import ViserClient
 
 from nerf_lightning.callbacks.live_view import LiveView
 from nerf_lightning.errors import InputError
+from nerf_lightning.viewer.look import Look
 from nerf_lightning.viewer.refinement import Refinement
+from nerf_lightning.viewer.slices import SlicedRenderer
 from nerf_lightning.viewer.studio import Studio
 
 
@@ -39,9 +44,9 @@ def run(capture, folder, *arguments):
 
 def address_in(process):
     for line in process.stdout:
-        found = re.search(r"watch the training at http://127\.0\.0\.1:(\d+)", line)
+        found = re.search(r"Watch the training at (http://\S+)", line)
         if found:
-            return int(found[1])
+            return found[1]
     raise AssertionError("it never said where the page is")
 
 
@@ -57,15 +62,18 @@ def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(captu
         f"viewer.live_view.port={unused_port()}",
         "viewer.live_view.max_height=48",
     )
-    port = address_in(watched)
-    client, lazy = ViserClient(port, 64, 48), ViserClient(port, 64, 48, reads=False)
+    address = address_in(watched)
+    client, lazy = ViserClient(address, 64, 48), ViserClient(address, 64, 48, reads=False)
     client.look_from(0)
     lazy.look_from(0)
     client.wait_for(len)
     client.close()
-    again = ViserClient(port, 64, 48)
+    again = ViserClient(address, 64, 48)
     again.look_from(90)
     again.wait_for(len)
+    hostile = ViserClient(address, 64, 48)
+    for changed in ({"fov": 0.0}, {"fov": math.inf}, {"image_width": 4e8}, {"image_width": 10**9, "image_height": 10}):
+        hostile.look_from(0, **changed)
     for process in (alone, watched):
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 0, output
@@ -77,7 +85,8 @@ def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(captu
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     with socket.socket() as freed:
         freed.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        freed.bind(("127.0.0.1", port))
+        freed.bind(("127.0.0.1", urlsplit(address).port))
+    assert "token" not in (tmp_path / "watched" / "train.log").read_text()
 
 
 @pytest.fixture
@@ -156,3 +165,20 @@ def test_a_place_where_nobody_can_listen_is_refused_at_once():
         LiveView(host="192.0.2.1")
     with pytest.raises(InputError, match="port=0"):
         LiveView(port=0)
+    with pytest.raises(InputError, match="no name of a machine"):
+        LiveView(hosts=["a b"])
+
+
+def test_what_cannot_be_drawn_ends_no_training(trainer, caplog):
+    renderer = MagicMock(spec=SlicedRenderer)
+    renderer.slices.side_effect = ZeroDivisionError("float division by zero")
+    renderer.height_while_moving.return_value = 16
+    studio, refinement = Studio(renderer), Refinement(lambda *_: None)
+    studio.add(1, refinement)
+    callback = LiveView(share=0.9)
+    callback.page = SimpleNamespace(studio=studio)
+    for _ in range(5):
+        refinement.ask(Look(torch.eye(4)[:3], 0.0, 16, 16))
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+    assert renderer.slices.call_count > 1
+    assert caplog.text.count("could not be drawn: ZeroDivisionError") == 1

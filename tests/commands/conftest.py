@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from running import FAST, start_cold
+from hydra._internal.hydra import Hydra
+from running import FAST, FAST_PATH, start_cold
 from scenes import ball_scene
 from support.made_once import made_once
+from support.one_composition import mode_as_typed
+from support.resumed import trained
 
 from nerf_lightning import cli
 
@@ -45,6 +48,7 @@ def nerf(monkeypatch, capfd):
 
     def call(*arguments: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
+        monkeypatch.setattr(Hydra, "get_mode", mode_as_typed)
         capfd.readouterr()
         code, environment = 0, dict(os.environ)
         try:
@@ -89,3 +93,15 @@ def table(nerf, tmp_path):
         return result, list(csv.DictReader(written.read_text().splitlines())) if result.code == 0 else []
 
     return call
+
+
+@pytest.fixture(scope="session")
+def stopped(tmp_path_factory, capture):
+    """A run whose optimizer is fused Adam."""
+    return made_once(tmp_path_factory, "stopped", lambda folder: trained(folder, capture)) / "run"
+
+
+@pytest.fixture(scope="session")
+def stopped_fast(tmp_path_factory, capture):
+    """A run with an occupancy grid, and the optimizer of tables."""
+    return made_once(tmp_path_factory, "stopped_fast", lambda folder: trained(folder, capture, *FAST_PATH)) / "run"

@@ -7,7 +7,10 @@ import time
 import pytest
 import torch
 import yaml
-from running import FAST, said, start
+from running import FAST, refused, said, start
+
+from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.commands.build import load_model
 
 
 @pytest.fixture
@@ -25,7 +28,10 @@ def test_a_missing_checkpoint(nerf, tmp_path, command):
 @pytest.mark.parametrize("size", [0, 100, 5000])
 def test_a_truncated_checkpoint(nerf, last, tmp_path, size):
     (tmp_path / "cut.ckpt").write_bytes(last.read_bytes()[:size])
-    said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), "cut.ckpt cannot be read", f"{size} bytes", "train again")
+    words = ("cut.ckpt cannot be read", f"{size} bytes", "train again")
+    refused(read_checkpoint, tmp_path / "cut.ckpt", parts=words)
+    if size == 5000:
+        said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), *words)
 
 
 def changed(last, tmp_path, change):
@@ -33,6 +39,14 @@ def changed(last, tmp_path, change):
     change(content)
     torch.save(content, tmp_path / "changed.ckpt")
     return f"ckpt={tmp_path}/changed.ckpt"
+
+
+def refused_when_planted(nerf, last, tmp_path, plant, *words, by_command):
+    """Plant something in the config of a checkpoint: its model is not built, and `render` says so."""
+    command = ("render", changed(last, tmp_path, plant))
+    refused(lambda: load_model(read_checkpoint(tmp_path / "changed.ckpt")), parts=words)
+    if by_command:
+        said(nerf(*command), *words)
 
 
 def test_a_checkpoint_of_another_format(nerf, last, tmp_path):
@@ -80,7 +94,8 @@ def test_a_checkpoint_builds_only_our_own_model_parts(nerf, last, tmp_path, targ
         config["model"]["levels"]["fine"]["field"]["_target_"] = target
         content["nerf_lightning"]["config"] = yaml.safe_dump(config)
 
-    said(nerf("render", changed(last, tmp_path, plant)), f"asks for {target}", "so it is not built")
+    words = (f"asks for {target}", "so it is not built")
+    refused_when_planted(nerf, last, tmp_path, plant, *words, by_command=target == "os.system")
 
 
 @pytest.mark.parametrize(("key", "value"), [("density_bias", "${oc.env:HOME}"), ("_partial_", True), ("_args_", [1])])
@@ -90,7 +105,8 @@ def test_a_checkpoint_holds_no_interpolations_or_instructions(nerf, last, tmp_pa
         config["model"]["levels"]["fine"]["field"][key] = value
         content["nerf_lightning"]["config"] = yaml.safe_dump(config)
 
-    said(nerf("render", changed(last, tmp_path, plant)), "which is not read from files")
+    words = "which is not read from files"
+    refused_when_planted(nerf, last, tmp_path, plant, words, by_command=key == "density_bias")
 
 
 def test_weights_that_do_not_fit(nerf, last, capture, tmp_path):

@@ -2,8 +2,10 @@ import subprocess
 import sys
 
 import pytest
+from omegaconf import OmegaConf
 
 from nerf_lightning.cli import find_commands
+from nerf_lightning.conf_folder import conf_folder
 
 
 def test_help_lists_every_command_with_its_line(nerf):
@@ -31,6 +33,13 @@ def test_help_of_a_command_lists_groups_and_examples(nerf, command):
     assert "Examples:" in result.out
     assert f"nerf {command}" in result.out
     assert "trainer: auto, cpu, ddp, gpu" in result.out
+
+
+def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
+    """tests/support/one_composition.py counts on it."""
+    configs = [OmegaConf.load(file) for file in conf_folder().rglob("*.yaml")]
+    assert len(configs) > 50
+    assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]
 
 
 def test_an_unknown_command_has_a_near_match(nerf):

@@ -1,94 +1,26 @@
 """The state that training goes on from, changed key by key: refused in words, before anything is computed with it."""
 
-import copy
 import os
 import shutil
 
 import pytest
 import torch
-from configs import composed
-from hydra.core.hydra_config import HydraConfig
-from running import FAST, FAST_PATH, start
-from support.made_once import made_once
+from running import FAST_PATH
+from support.resumed import Resumed
 
-from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
-from nerf_lightning.commands.training import _build_parts
 from nerf_lightning.errors import InputError
 
-SHORT = ("final.evaluate=false", "final.video=false", "trainer.precision=32-true")
 HUGE = 10**10
-
-
-def trained(folder, capture, *model):
-    process = start("train", "scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=12",
-                    f"paths.output_dir={folder}/run")  # fmt: skip
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-
-
-@pytest.fixture(scope="session")
-def stopped(tmp_path_factory, capture):
-    """A run whose optimizer is fused Adam."""
-    return made_once(tmp_path_factory, "stopped", lambda folder: trained(folder, capture)) / "run"
-
-
-@pytest.fixture(scope="session")
-def stopped_fast(tmp_path_factory, capture):
-    """A run with an occupancy grid, and the optimizer of tables."""
-    return made_once(tmp_path_factory, "stopped_fast", lambda folder: trained(folder, capture, *FAST_PATH)) / "run"
-
-
-def gate_of(run, capture, *model):
-    """Return what takes a checkpoint's content as a resume would, up to the first computation."""
-    config = composed("train", "scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25",
-                      "hydra.job.name=train", "hydra.mode=RUN")  # fmt: skip
-    HydraConfig.instance().set_config(composed_with_hydra())
-    parts = _build_parts(config)
-    trainer = parts.settings.build(run, 25, parts.callbacks, [])
-    parts.system.trainer = trainer
-    trainer.datamodule = parts.data
-    return parts.system
-
-
-def composed_with_hydra():
-    from hydra import compose
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.initialize import initialize_config_dir
-
-    from nerf_lightning.conf_folder import conf_folder
-
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        return compose("train", return_hydra_config=True)
 
 
 @pytest.fixture(scope="module")
 def resume(stopped, capture, tmp_path_factory):
-    return taker(stopped, gate_of(stopped, capture), tmp_path_factory.mktemp("gate"))
+    return Resumed(stopped, capture, tmp_path_factory.mktemp("gate")).take
 
 
 @pytest.fixture(scope="module")
 def resume_fast(stopped_fast, capture, tmp_path_factory):
-    return taker(stopped_fast, gate_of(stopped_fast, capture, *FAST_PATH), tmp_path_factory.mktemp("gate_fast"))
-
-
-def taker(run, system, folder):
-    sound = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-
-    def take(change):
-        content = copy.deepcopy(sound)
-        change(content)
-        torch.save(content, folder / "last.ckpt")
-        threads = torch.get_num_threads()
-        try:
-            content = AtomicCheckpointIO().load_checkpoint(folder / "last.ckpt")
-            system.on_load_checkpoint(content)
-            system.load_state_dict(content["state_dict"])
-            system.configure_optimizers().load_state_dict(content["optimizer_states"][0])
-        finally:
-            torch.set_num_threads(threads)
-
-    return take
+    return Resumed(stopped_fast, capture, tmp_path_factory.mktemp("gate_fast"), *FAST_PATH).take
 
 
 def run_state(**values):

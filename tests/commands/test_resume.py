@@ -9,7 +9,7 @@ import torch
 from running import FAST, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-STEPS = 150
+STEPS = 110
 
 
 def arguments(capture, folder, steps=STEPS, threads=1):

@@ -5,6 +5,7 @@ import signal
 import socket
 from dataclasses import dataclass
 from subprocess import Popen
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ class Served:
 
     @property
     def port(self):
-        return int(self.address.rpartition(":")[2])
+        return urlsplit(self.address).port
 
 
 def serve(*arguments):
@@ -54,7 +55,7 @@ def page(finished_run, tmp_path_factory):
 
 @pytest.fixture
 def client(page):
-    client = ViserClient(page.port)
+    client = ViserClient(page.address)
     yield client
     client.close()
 
@@ -73,10 +74,10 @@ def test_a_client_sees_a_coarse_picture_then_a_fine_one_and_another_when_it_move
 
 @pytest.mark.slow
 def test_clients_that_leave_or_never_read_harm_nobody(page, client):
-    slow = ViserClient(page.port, reads=False)
+    slow = ViserClient(page.address, reads=False)
     for degrees in range(20):
         slow.look_from(degrees)
-    gone = ViserClient(page.port)
+    gone = ViserClient(page.address)
     gone.look_from(30)
     gone.close()
     client.look_from(60)
@@ -92,7 +93,7 @@ def test_clients_that_leave_or_never_read_harm_nobody(page, client):
 def test_ctrl_c_ends_it_and_frees_the_port(finished_run, tmp_path):
     checkpoint = finished_run / "checkpoints" / "last.ckpt"
     served = serve(f"ckpt={checkpoint}", f"port={unused_port()}", f"paths.output_dir={tmp_path}", "photographs=false")
-    client = ViserClient(served.port)
+    client = ViserClient(served.address)
     client.look_from(0)
     client.wait_for(len)
     served.process.send_signal(signal.SIGINT)
@@ -134,6 +135,7 @@ def test_a_missing_checkpoint_and_a_port_that_is_none_are_said(finished_run, ner
     arguments = [f"ckpt={checkpoint}", f"paths.output_dir={tmp_path}", "photographs=false"]
     said(nerf("view", *arguments, "port=0"), "port=0: give a number from 1 to 65535")
     said(nerf("view", *arguments, "host=192.0.2.1"), "host=192.0.2.1: this machine cannot listen there")
+    said(nerf("view", *arguments, "viewer.hosts=['a b']"), "viewer.hosts: 'a b' is no name of a machine")
 
 
 @pytest.fixture
@@ -188,6 +190,6 @@ def test_photographs_that_nobody_knows_are_not_guessed(of_unknown_scene, caplog)
 
 def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):
     monkeypatch.setattr(viewing.webbrowser, "open", lambda address: False)
-    viewing.open_browser("http://127.0.0.1:8080")
-    assert "There is no browser here to open. Open http://127.0.0.1:8080 in one yourself" in caplog.text
-    assert "ssh -L 8080:127.0.0.1:8080" in caplog.text
+    viewing.open_browser("http://127.0.0.1:8080/?token=x")
+    assert "There is no browser here to open. Open http://127.0.0.1:8080/?token=x in one yourself" in caplog.text
+    assert "ssh -L 8080:127.0.0.1:8080 THIS" in caplog.text

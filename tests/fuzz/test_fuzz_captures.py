@@ -13,7 +13,7 @@ from captures import npz_content, write_blender
 from hypothesis import given
 from hypothesis import strategies as st
 from posed_captures import READERS, Known, read, ring, write_colmap, write_llff, write_transforms
-from support.fuzzing import harmless, tries
+from support.fuzzing import fuzzed, harmless
 from support.mutations import changed_array, damaged, damaged_text, mutated, saved
 
 from nerf_lightning.checkpoints import make_record
@@ -96,7 +96,7 @@ def test_a_sound_capture_is_read(captures, kind):
     assert captures.read(kind, {}) is not None
 
 
-@tries(40)
+@fuzzed(40)
 @given(data=st.data())
 def test_transforms(captures, data):
     sound = json.loads(captures.content("transforms", "transforms.json")) | LENS | APPLIED
@@ -108,14 +108,14 @@ def test_transforms(captures, data):
     captures.read("transforms", {"transforms.json": content})
 
 
-@tries(10)
+@fuzzed(10)
 @given(data=st.data())
 def test_transforms_of_damaged_bytes(captures, data):
     content = data.draw(damaged(captures.content("transforms", "transforms.json")))
     captures.read("transforms", {"transforms.json": content})
 
 
-@tries(30)
+@fuzzed(30)
 @given(data=st.data())
 def test_blender(captures, data):
     name = data.draw(st.sampled_from(("transforms_train.json", "transforms_test.json")))
@@ -123,7 +123,7 @@ def test_blender(captures, data):
     captures.read("blender", {name: content})
 
 
-@tries(40)
+@fuzzed(40)
 @given(data=st.data())
 def test_colmap(captures, data):
     names = ("cameras", "images", "points3D")
@@ -131,7 +131,7 @@ def test_colmap(captures, data):
     captures.read("colmap", {name: data.draw(damaged(captures.content("colmap", name)))})
 
 
-@tries(30)
+@fuzzed(30)
 @given(data=st.data())
 def test_colmap_texts(captures, data):
     names = ("cameras", "images", "points3D")
@@ -139,7 +139,7 @@ def test_colmap_texts(captures, data):
     captures.read("text", {name: data.draw(damaged_text(captures.content("text", name).decode()))})
 
 
-@tries(25)
+@fuzzed(25)
 @given(data=st.data())
 def test_llff(captures, data):
     rows = np.load(io.BytesIO(captures.content("llff", "poses_bounds.npy")))
@@ -149,7 +149,7 @@ def test_llff(captures, data):
     captures.read("llff", {"poses_bounds.npy": content})
 
 
-@tries(25)
+@fuzzed(25)
 @given(data=st.data())
 def test_npz(captures, data):
     arrays = {key: np.asarray(array) for key, array in npz_content(count=4).items()}
@@ -166,7 +166,7 @@ def test_npz(captures, data):
     captures.read("npz", {"a.npz": content})
 
 
-@tries(10)
+@fuzzed(10)
 @given(data=st.data())
 def test_a_photograph_of_a_capture(captures, data):
     kind = data.draw(st.sampled_from(("llff", "blender")))

@@ -231,6 +231,14 @@ def import_everything() -> None:
                 importlib.import_module(module.name)
 
 
+def compose_once() -> None:
+    """Let no fork compose its config twice; processes that start from nothing do."""
+    from hydra._internal.hydra import Hydra
+    from one_composition import mode_as_typed  # beside this file, which is a script here
+
+    Hydra.get_mode = mode_as_typed
+
+
 def serve(channel: socket.socket) -> dict[str, Any] | None:
     """Fork a child per request; return in each child what was asked for, and here None when nobody can ask any more."""
     poll = select.poll()
@@ -330,12 +338,15 @@ def main() -> None:
     """Serve, and in each fork become what was asked for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.update(SET_BY_NERF | os.environ)
+    gc.disable()
+    compose_once()
     # Not this file's folder, but where our package is.
     sys.path[0] = str(REPOSITORY)
     import_everything()
     # What is there is there to stay: no fork need look through it, and so copy it.
     gc.collect()
     gc.freeze()
+    gc.enable()
     request = serve(socket.socket(fileno=int(sys.argv[1])))
     # What was frozen cannot be taken apart in order, and some libraries would complain of that.
     os._exit(0) if request is None else end(run(request))

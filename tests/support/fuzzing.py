@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, settings
 
 from nerf_lightning.errors import InputError
 
@@ -32,17 +32,14 @@ class Hang(BaseException):
     """Report a case that goes on for too long; nothing that expects damaged files catches it."""
 
 
-def tries(cases: int) -> settings:
-    """Return how a test is tried: so many cases that are the same each time, or many times as many that are new."""
-    if not TIMES:
-        return settings(max_examples=cases, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
-    # The database lies in .hypothesis: what failed is tried first the next time.
-    phases = [Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink]
+def fuzzed(cases: int) -> settings:
+    """Return the settings of a test that tries so many cases in `make test`, the same ones each time."""
     return settings(
-        max_examples=TIMES * cases,
+        max_examples=cases * (TIMES or 1),
+        derandomize=not TIMES,
+        database=None,
         deadline=None,
         suppress_health_check=list(HealthCheck),
-        phases=phases,
         print_blob=True,
     )
 

@@ -1,5 +1,6 @@
 """The panel: what is saved where it can be, and what is not there is said."""
 
+import math
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -8,7 +9,7 @@ from scenes import ball_scene, tiny_model
 
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.geometry.paths.base import frame_of
-from nerf_lightning.viewer import controls
+from nerf_lightning.viewer import controls, limits
 from nerf_lightning.viewer.controls import Controls
 from nerf_lightning.viewer.frusta import quaternion_of
 from nerf_lightning.viewer.photographs import Photographs
@@ -104,6 +105,52 @@ def test_a_full_disk_is_said_and_ends_nothing(tmp_path, monkeypatch):
 def test_a_place_that_cannot_be_a_folder_is_said(tmp_path):
     (tmp_path / "viewer").write_text("")
     assert "could not be saved" in Panel(tmp_path / "viewer" / "deeper").snapshot()
+
+
+def test_snapshots_are_limited_and_it_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "MOST_SNAPSHOTS", 2)
+    panel = Panel(tmp_path)
+    assert [panel.snapshot() for _ in range(3)][-1].startswith(
+        f"It could not be saved: {tmp_path} holds 2 of them, the most that the page writes. Make room"
+    )
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_values_that_no_slider_has_are_clamped(tmp_path):
+    panel = Panel(tmp_path)
+    made = panel.gui.made
+    made["Field of view"].value = 1e9
+    made["Field of view"].act(None)
+    assert panel.client.camera.fov == pytest.approx(math.radians(120))
+    made["Show"].value = "no channel"
+    made["Show"].act(None)
+    assert panel.session.channel == "colour"
+    made["x"].value = (5.0, -5.0)
+    made["Show only what is in the box"].value = True
+    made["x"].act(None)
+    assert panel.session.crop.size[0].item() == pytest.approx(0.02)
+    made["Photograph | render"].value = -3.0
+    made["Photograph | render"].act(None)
+    assert panel.session.split == 0
+    made["View"].value = -(10**9)
+    made["Look through it"].act(None)
+    assert panel.session.photograph == 0
+
+
+def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):
+    panel = Panel(tmp_path)
+    monkeypatch.setattr(panel.session, "enter", lambda view: 1 / 0)
+    for _ in range(3):
+        panel.gui.made["Look through it"].act(None)
+    assert caplog.text.count("ZeroDivisionError") == 1
+    assert "Traceback" not in caplog.text
+
+
+def test_a_name_is_shown_as_text(tmp_path):
+    names = ("<iframe srcdoc='<script>1</script>'></iframe>", "b", "c", "d")
+    panel = Panel(tmp_path, view_names=names)
+    panel.gui.made["Look through it"].act(None)
+    assert f"`{names[0]}`" in panel.gui.made[""].content
 
 
 def test_the_crop_box_is_the_scenes(tmp_path):

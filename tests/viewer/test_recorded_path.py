@@ -11,6 +11,7 @@ from scenes import ball_scene
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.geometry.frames import points_from_user, similarity, upright_rotation
 from nerf_lightning.geometry.paths.keyframes import read_keyframes
+from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.recorded_path import RecordedPath
 from nerf_lightning.viewer.session import Session
 
@@ -82,3 +83,25 @@ def test_files_are_never_overwritten(session, tmp_path):
     path.save()
     path.save()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["camera_path_001.yaml", "camera_path_002.yaml"]
+
+
+def test_keyframes_and_files_are_limited_and_it_is_said(session, tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "MOST_KEYFRAMES", 2)
+    monkeypatch.setattr(limits, "MOST_PATHS", 1)
+    path = RecordedPath(session, tmp_path, lambda *_: None)
+    said = [path.add(seconds) for seconds in (1.0, 1e12, 1.0)]
+    assert said[1:] == [
+        f"2 keyframes, {limits.MOST_SECONDS_BETWEEN:.1f} s",
+        "A path has 2 keyframes at most. Save it, then remove some.",
+    ]
+    assert path.save().startswith("Saved")
+    assert "holds 1 of them, the most that the page writes" in path.save()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_folders_name_is_no_markup(session, tmp_path):
+    folder = tmp_path / "<script>"
+    path = RecordedPath(session, folder, lambda *_: None)
+    path.add(1.0)
+    path.add(1.0)
+    assert path.save().endswith(f"`path=keyframes path.file={folder}/camera_path_001.yaml`")

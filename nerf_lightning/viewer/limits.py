@@ -1,0 +1,44 @@
+"""What one browser, or all of them, may cost the viewer: everything that a stranger's message could make large."""
+
+import math
+
+MOST_CLIENTS = 8
+"""So many people are drawn for at once: each costs a picture in memory and a share of the time."""
+MOST_CONNECTIONS = 2 * MOST_CLIENTS
+"""Open websockets; who is one too many for a picture is told so through one of these."""
+MOST_SOCKETS = 64
+"""TCP connections of any kind, half-open ones too: far below the file descriptors that a process has."""
+MOST_MESSAGES_PER_SECOND = 200
+"""Messages of one client beyond this are dropped unread; the page itself sends 20 to 50."""
+MOST_BYTES_PER_SECOND, MOST_BYTES_AT_ONCE = 100 * 1024, 1024 * 1024
+"""Who sends more is hung up on; the page sends some 15 kB a second."""
+MOST_MESSAGE_BYTES = 64 * 1024
+"""A larger message closes its connection; the page's own have some hundred bytes."""
+SEND_SECONDS = 20.0
+"""Who has not taken a picture after this time (seconds) is let go: what waits for them stays in memory."""
+
+MOST_SIDE = 4096
+"""A window counts as no wider and no higher than this (pixels)."""
+MOST_PIXELS = 3840 * 2160
+"""A window counts as no larger than this (pixels), at its own shape."""
+MOST_SQUARES = 4
+"""A picture has no more pixels than so many squares of max_height; a wider window than 4:1 gets a less fine one."""
+LEAST_FOV, MOST_FOV = math.radians(0.1), math.radians(170.0)
+"""Vertical field of view (radians)."""
+MOST_COORDINATE = 1e6
+"""Cameras stand no farther from the origin along any axis (the model's frame, where a scene measures some units)."""
+MOST_VALUE = 1e9
+"""Numbers of the panel, before each control's own range."""
+MOST_LETTERS = 200
+"""Texts of a message, and names that the page shows."""
+
+MOST_SNAPSHOTS = 1000
+"""Files of snapshots in one folder."""
+MOST_PATHS = 200
+"""Files of camera paths in one folder."""
+MOST_KEYFRAMES = 1000
+"""Keyframes of one path; each is drawn in the page."""
+MOST_SECONDS_BETWEEN = 3600.0
+"""Time between two keyframes (seconds)."""
+MOST_COMPLAINTS = 20
+"""Lines in the log about what went wrong for those who look on; then the viewer is silent."""

@@ -1,0 +1,69 @@
+"""A checkpoint taken as a resume takes it, up to the first computation, without a process of its own."""
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from configs import composed
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.initialize import initialize_config_dir
+from running import FAST, start
+
+from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.commands.training import _build_parts
+from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.system import RadianceFieldSystem
+
+SHORT = ("final.evaluate=false", "final.video=false", "trainer.precision=32-true")
+
+
+def trained(folder: Path, capture: Path, *model: str) -> None:
+    """Leave a run of 12 steps in folder/run."""
+    process = start("train", "scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=12",
+                    f"paths.output_dir={folder}/run")  # fmt: skip
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+
+
+class Resumed:
+    """A run of 25 steps that is to go on from checkpoints of `trained`."""
+
+    def __repr__(self) -> str:
+        return str(self.file)
+
+    def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            HydraConfig.instance().set_config(compose("train", return_hydra_config=True))
+        settings = ("scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25")
+        parts = _build_parts(composed("train", *settings))
+        self.system: RadianceFieldSystem = parts.system
+        self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
+        self.file = folder / "last.ckpt"
+        self.sound: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+
+    def take(self, change: Callable[[dict[str, Any]], object]) -> None:
+        """Take the sound checkpoint, changed, and update the weights once: compiled optimizers look at no shapes."""
+        content = copy.deepcopy(self.sound)
+        change(content)
+        torch.save(content, self.file)
+        self.take_file()
+
+    def take_file(self) -> None:
+        """Take what lies in the file."""
+        threads = torch.get_num_threads()
+        try:
+            content = AtomicCheckpointIO().load_checkpoint(self.file)
+            self.system.on_load_checkpoint(content)
+            self.system.load_state_dict(content["state_dict"])
+            optimizer = self.system.configure_optimizers()
+            optimizer.load_state_dict(content["optimizer_states"][0])
+            for parameter in self.system.model.parameters():
+                parameter.grad = torch.ones_like(parameter)
+            optimizer.step()
+        finally:
+            torch.set_num_threads(threads)

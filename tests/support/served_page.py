@@ -1,0 +1,88 @@
+"""A page in this process, over a ball, and whoever calls on it."""
+
+import http.client
+import socket
+import threading
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+from scenes import ball_scene, tiny_model
+from support.ports import unused_port
+from viser_client import ViserClient
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.viewer.page import Page
+from nerf_lightning.viewer.photographs import Photographs
+from nerf_lightning.viewer.slices import SlicedRenderer
+from nerf_lightning.viewer.studio import Studio
+
+HEIGHT = 24
+
+
+@dataclass
+class ServedPage:
+    """The page, the studio that draws for it, and where it is."""
+
+    page: Page
+    studio: Studio
+    worker: threading.Thread
+
+    @property
+    def address(self) -> str:
+        return self.page.address
+
+    @property
+    def port(self) -> int:
+        return self.page.server.get_port()
+
+    @property
+    def token(self) -> str:
+        return parse_qs(urlsplit(self.address).query).get("token", ["none"])[0]
+
+    def client(self, width: int = 32, height: int = HEIGHT, **handshake) -> ViserClient:
+        return ViserClient(self.address, width, height, **handshake)
+
+    def as_host(self, name: str, **handshake) -> ViserClient:
+        """Call on the page under another name, as a browser whose DNS was deceived does."""
+        line = socket.create_connection(("127.0.0.1", self.port))
+        return ViserClient(f"http://{name}/?token={self.token}", sock=line, **handshake)
+
+    def get(self, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
+        """Return status, headers and text of a page."""
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)) as connection:
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            return response.status, dict(response.getheaders()), response.read().decode("utf-8", "replace")
+
+    def still_serves(self) -> None:
+        """Expect a picture, for somebody who comes now."""
+        client = self.client()
+        client.look_from(10)
+        client.wait_for(lambda pictures: any(len(each) == HEIGHT for each in pictures), seconds=20)
+        client.close()
+        assert self.worker.is_alive()
+
+
+@contextmanager
+def served(folder: Path, record: dict | None = None, **options):
+    """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture."""
+    record = replace(scene_record(ball_scene(num_views=4, size=16)), **(record or {}))
+    studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
+    page = Page(studio, Photographs(record, None, "white"), folder, "127.0.0.1", unused_port(), HEIGHT, **options)
+    over = threading.Event()
+
+    def work() -> None:
+        while not over.is_set():
+            if not studio.work():
+                studio.wait(0.02)
+
+    worker = threading.Thread(target=work, daemon=True)
+    worker.start()
+    try:
+        yield ServedPage(page, studio, worker)
+    finally:
+        over.set()
+        worker.join()
+        page.close()
