@@ -9,10 +9,8 @@ from torch import Tensor
 from nerf_lightning.budgets import require_within
 from nerf_lightning.escaping import require_printable
 from nerf_lightning.files.schema import Unfit
+from nerf_lightning.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.geometry.poses import is_rigid
-
-LEAST_UNIT, LARGEST_UNIT = 1e-12, 1e12
-"""Scene units in the user's own: from atoms to planets."""
 
 
 def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:

@@ -101,6 +101,7 @@ def check_capture(capture: Capture) -> None:
     if not capture.views:
         raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
     names = [view.name for view in capture.views]
+    require_within("name_characters", max(map(len, names)), str(capture.source), "characters in a name")
     twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if twice:
         raise InputError(f"{capture.source} lists {listed(twice)} more than once. Remove all but one of each.")

@@ -12,7 +12,7 @@ from nerf_lightning.data.base import Reader
 from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.capture import Capture, cameras_of, check_capture, filtered
 from nerf_lightning.data.checks import check_step, is_there, known_background, listed
-from nerf_lightning.data.extents import extent_of
+from nerf_lightning.data.extents import extent_of, require_possible
 from nerf_lightning.data.images import ENDINGS, image_size
 from nerf_lightning.data.photographs import read_photographs
 from nerf_lightning.data.spaces import choose_space
@@ -99,6 +99,8 @@ class CaptureReader(Reader):
                 "%d photographs have no pose and are left out: %s", len(capture.left_out), listed(capture.left_out, 5)
             )
         extent = extent_of(capture, cameras, space, self.near, self.far)
+        to_user = (capture.undo @ extent.to_user).float()
+        require_possible(extent, to_user, capture)
         return Scene(
             name=self.name,
             cameras=replace(cameras, c2w=poses_from_user(cameras.c2w, extent.to_user).float(), ndc=extent.ndc),
@@ -111,7 +113,7 @@ class CaptureReader(Reader):
             background=background,
             space=space,
             points=points_from_user(capture.points, extent.to_user).float(),
-            to_user=(capture.undo @ extent.to_user).float(),
+            to_user=to_user,
             protocol=self._protocol(),
             truth=None,
             left_out=capture.left_out,

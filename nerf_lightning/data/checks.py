@@ -158,7 +158,7 @@ def check_present(files: Iterable[Path], named_in: Path) -> None:
     Raises:
         InputError: the absent files, capped at ten, and the file that names them.
     """
-    absent = [path for path in files if not path.is_file()]
+    absent = [path for path in files if not is_there(path)]
     if absent:
         raise InputError(
             f"{named_in} names {len(absent)} image(s) that do not exist: {listed(absent)}. Copy them there, "

@@ -7,10 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.capture import Capture
+from nerf_lightning.data.checks import FARTHEST
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half
 from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.geometry.frames import (
+    LARGEST_UNIT,
+    LEAST_UNIT,
     average_pose,
     focus_point,
     points_from_user,
@@ -89,6 +92,37 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
             f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."
         )
     return Extent(to_user, nearest.float(), farthest.float(), aabb, None)
+
+
+def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Capture) -> None:
+    """Refuse an extent that no checkpoint could keep: it follows from numbers of the capture that are mistakes.
+
+    Args:
+        extent: in the working frame.
+        to_user: from there to the frame that the capture's maker knows.
+        capture: where they come from.
+
+    Raises:
+        InputError: content reaches beyond all digits, its box has no inside, or the frame's unit is none.
+    """
+    reach = torch.cat([extent.near, extent.far, extent.aabb.flatten()]).abs().max()
+    if not float(reach) <= FARTHEST:  # NaN, too
+        raise InputError(
+            f"{capture.source}: the content (its depths, its sparse points or its box) would reach {float(reach):g} "
+            "times the cameras' distance from the middle, which is a mistake of the reconstruction. Find and remove "
+            "what lies so far away, or export the capture again."
+        )
+    if not bool((extent.aabb[0] < extent.aabb[1]).all() and (extent.near < extent.far).all()):
+        raise InputError(
+            f"{capture.source}: all of the content lies in one plane or at one distance, so there is no room for a "
+            "scene. Add scene.space=contracted, or remove what describes the content (sparse points, aabb_scale)."
+        )
+    unit = float(torch.linalg.det(to_user[:3, :3].double()).abs().pow(1 / 3))
+    if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
+        raise InputError(
+            f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "
+            "is so small or so large. Mend applied_scale and applied_transform, or the cameras' distances."
+        )
 
 
 def depths_of(capture: Capture, cameras: Cameras, view: int) -> Float[Tensor, "points"]:

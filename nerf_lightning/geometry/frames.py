@@ -10,6 +10,9 @@ from nerf_lightning.products import own_precision
 # An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
 CLEAR = 0.05
 
+LEAST_UNIT, LARGEST_UNIT = 1e-12, 1e12
+"""Scene units in the user's own: from atoms to planets."""
+
 
 @own_precision
 def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
