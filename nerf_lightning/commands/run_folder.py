@@ -22,7 +22,7 @@ from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
-from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.run_summary import number, read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
@@ -87,7 +87,7 @@ class RunFolder:
     def _note(self, **values: Any) -> float:
         note = read_note(self.path)
         now = time.monotonic()
-        seconds: float = round(note.get("seconds", 0.0) + now - self.began, 1)
+        seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)
         self.began = now
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
         return seconds
@@ -213,7 +213,7 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
     for file in notes:
         note = read_note(file.parent)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
-        if ours and note.get("finished_at_step", -1) < num_steps:
+        if ours and (number(note.get("finished_at_step")) or -1) < num_steps:
             return file.parent
     return None
 

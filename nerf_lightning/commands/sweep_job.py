@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerf_lightning.commands.run_identity import finished_run
-from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.run_summary import number, read_note
 from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.commands.suggestions import paragraph
 from nerf_lightning.conf_folder import conf_folder
@@ -89,8 +89,7 @@ def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
     if former != own and not any(own.iterdir()):
         own.rmdir()
     replace(record, folder=str(former), state="finished before").write(sweep_folder)
-    psnr: float | None = read_note(former).get("psnr")
-    return psnr
+    return number(read_note(former).get("psnr"))
 
 
 def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecord:

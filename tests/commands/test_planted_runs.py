@@ -1,5 +1,6 @@
 """Run folders from strangers: what they would repeat, and where their links would make a resumed run write."""
 
+import json
 import sys
 
 import pytest
@@ -159,6 +160,21 @@ def test_a_garbled_note_is_another_run(nerf, capture, run, note):
     (run / "run.json").write_text(note)
     write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
     said(nerf("train", f"resume={run}"), "is occupied by a run of another config")
+
+
+@pytest.mark.parametrize("note", [{"finished_at_step": "x"}, {"seconds": "x"}, {"seconds": 10**400}, {"seconds": [1]}])
+def test_a_note_of_other_kinds_is_no_number(tmp_path, note):
+    from configs import composed
+
+    config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
+    open_run(config, 100, None).release()
+    file = tmp_path / "here" / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | note))
+    run = open_run(composed("train", f"paths.root_dir={tmp_path}", "resume=auto"), 100, None)
+    run.finish(100)
+    run.release()
+    assert run.path == tmp_path / "here"
+    assert json.loads(file.read_text())["seconds"] < 100
 
 
 @pytest.mark.parametrize("content", ["a: &a [x, x]\nb: [*a, *a]\n", "[1]\n", "x: ${oc.env:HOME}\nscene: 3\n"])

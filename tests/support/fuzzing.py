@@ -41,6 +41,7 @@ def fuzzed(cases: int) -> settings:
         deadline=None,
         suppress_health_check=list(HealthCheck),
         print_blob=True,
+        report_multiple_bugs=False,
     )
 
 
