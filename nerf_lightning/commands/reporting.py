@@ -20,7 +20,8 @@ from nerf_lightning.data.doctor.examine import examine
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
-from nerf_lightning.plain_yaml import read_plain_yaml
+from nerf_lightning.files.regular import read_text
+from nerf_lightning.plain_yaml import MOST_CHARACTERS, plain_yaml, read_plain_yaml
 from nerf_lightning.reports.coverage import coverage
 from nerf_lightning.reports.curves import curve_drawings
 from nerf_lightning.reports.embedding import embedded_file, embedded_video
@@ -97,8 +98,10 @@ class Gathering:
         self.report.steps.append((f"step {file.stem.partition('_')[2].lstrip('0')}", embedded_file(file)))
 
     def _add_config(self) -> None:
-        read_plain_yaml(self.run / ".hydra" / "config.yaml")  # bounded, and a config at all
-        self.report.config = (self.run / ".hydra" / "config.yaml").read_text(encoding="utf-8")
+        config = self.run / ".hydra" / "config.yaml"
+        text = read_text(config, MOST_CHARACTERS)
+        plain_yaml(text, str(config))  # a config at all
+        self.report.config = text
         overrides = read_plain_yaml(self.run / ".hydra" / "overrides.yaml")
         self.report.overrides = "\n".join(map(str, overrides)) if isinstance(overrides, list) else ""
 

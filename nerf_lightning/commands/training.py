@@ -1,5 +1,6 @@
 """The training run: build the parts, take the folder, fit, evaluate, film."""
 
+import io
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -30,6 +31,8 @@ from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
+from nerf_lightning.escaping import EscapingFormatter
+from nerf_lightning.files.regular import open_to_append
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.scene import Scene
 
@@ -177,11 +180,11 @@ def _resume_command(folder: Path) -> str:
 
 @contextmanager
 def _log_file(folder: Path) -> Iterator[None]:
-    handler = logging.FileHandler(folder / "train.log", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.getLogger().addHandler(handler)
-    try:
-        yield
-    finally:
-        logging.getLogger().removeHandler(handler)
-        handler.close()
+    with open_to_append(folder / "train.log", "Remove it.") as binary, io.TextIOWrapper(binary, "utf-8") as file:
+        handler = logging.StreamHandler(file)
+        handler.setFormatter(EscapingFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(handler)
+        try:
+            yield
+        finally:
+            logging.getLogger().removeHandler(handler)

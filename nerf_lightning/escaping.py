@@ -1,0 +1,124 @@
+"""Text that leaves the program: names from files stay text in a terminal, a page, a table, and another program's file.
+
+A name of a photograph, a model or a run may come from anybody, and may hold escape sequences, markup or formulas. What
+it holds is shown, as Python would write it, and never acted on.
+"""
+
+import html
+import logging
+import re
+import unicodedata
+from typing import Any
+
+from nerf_lightning.errors import InputError
+
+FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # the wide ones count in some languages
+"""What a spreadsheet takes for the beginning of a formula."""
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+MARKUP = re.compile(r"[\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])|^[#+=-]|^\d{1,9}[.)](?=\s|$)")
+"""What Markdown takes for markup, the latter ones at the beginning of a text alone."""
+ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
+UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
+LONGEST_FILE_NAME = 200
+"""In bytes; file systems take 255, and endings are added."""
+
+
+def for_terminal(text: str) -> str:
+    r"""Return a text in one line that steers no terminal.
+
+    Control characters, ends of lines, marks that reverse the direction of writing, and lone surrogates are written as
+    in Python.
+
+    >>> for_terminal("a\x1b[2Jb\nc")
+    'a\\x1b[2Jb\\nc'
+    """
+    return text if text.isprintable() else "".join(map(_visible, text))
+
+
+def for_html(text: str) -> str:
+    r"""Return a text as HTML shows it, within an element or an attribute in quotes; ends of lines stay.
+
+    >>> for_html("<a href='x'>\x00")
+    '&lt;a href=&#x27;x&#x27;&gt;\\x00'
+    """
+    return html.escape("\n".join(map(for_terminal, text.split("\n"))))
+
+
+def for_markdown(text: str) -> str:
+    r"""Return a text as Markdown shows it in a paragraph or a cell of a table: no markup, HTML, link, picture or code.
+
+    >>> for_markdown("fast_proposal *a* [b](c) | <d>")
+    'fast_proposal \\*a\\* \\[b\\](c) \\| &lt;d&gt;'
+    """
+    text = html.escape(for_terminal(text).strip(), quote=False)
+    # Of an underscore between letters, of which there are many in our names, nothing is made.
+    text = MARKUP.sub(_after_backslash, text)
+    # Addresses are made links without any markup.
+    return ADDRESS.sub(lambda found: f"&#{ord(found[0])};", text)
+
+
+def for_csv(value: Any) -> Any:
+    r"""Return a value as a cell of a CSV file: a text that a spreadsheet would take for a formula is quoted.
+
+    >>> [for_csv(value) for value in ("=1+1", "-1.5", "-a", 2.0)]
+    ["'=1+1", '-1.5', "'-a", 2.0]
+    """
+    if not isinstance(value, str):
+        return value
+    is_formula = value.startswith(FORMULAS) and not NUMBER.fullmatch(value)
+    return f"'{for_terminal(value)}" if is_formula else for_terminal(value)
+
+
+def for_file_name(name: str) -> str:
+    r"""Return the name of a file that any file system takes, and that lies in the folder it is put into.
+
+    >>> for_file_name("../a\x00:b")
+    '.._a__b'
+    """
+    plain = "".join("_" if letter in '/\\<>:"|?*' or _is_unprintable(letter) else letter for letter in name)
+    return plain.encode()[:LONGEST_FILE_NAME].decode(errors="ignore")
+
+
+def require_printable(name: str, where: str) -> None:
+    """Refuse a name that is not UTF-8 or holds control characters, before anything is called by it.
+
+    Args:
+        name: as the file, or the folder, has it.
+        where: what has this name, and where it stands, for the message.
+
+    Raises:
+        InputError: with the name, escaped.
+    """
+    if any(map(_is_unprintable, name)):
+        raise InputError(
+            f"{where} has the name '{for_terminal(name[:200])}', which holds control characters or is not UTF-8. "
+            "Rename it, in the files that list it too."
+        )
+
+
+class EscapingFormatter(logging.Formatter):
+    """Format log records so that whatever their messages name stays text; only tracebacks take several lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        record.message = for_terminal(record.message)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: Any) -> str:
+        """Return a traceback."""
+        return "\n".join(map(for_terminal, super().formatException(ei).split("\n")))
+
+
+def _visible(letter: str) -> str:
+    if letter.isprintable() or unicodedata.category(letter) == "Zs":  # blanks of other widths
+        return letter
+    return letter.encode("unicode_escape").decode("ascii")
+
+
+def _is_unprintable(letter: str) -> bool:
+    return not letter.isprintable() and unicodedata.category(letter) in UNPRINTABLE
+
+
+def _after_backslash(found: re.Match[str]) -> str:
+    return f"{found[0][:-1]}\\{found[0][-1]}"
