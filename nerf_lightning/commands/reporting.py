@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import newest_checkpoint
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.links import require_nothing_from_outside
 from nerf_lightning.commands.measured_parts import facts, per_image, tables, views_on_page
 from nerf_lightning.commands.output_folder import output_folder
@@ -49,7 +50,7 @@ def report(config: DictConfig) -> str:
     with whole_file(target) as part:
         part.write_text(page(gathered), encoding="utf-8")
     lines = [f"left out     {line}" for line in gathered.missing]
-    print("\n".join([*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)"]))
+    say(*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)")
     return str(target)
 
 

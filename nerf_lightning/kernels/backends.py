@@ -52,8 +52,8 @@ def _imported(module: str) -> ModuleType:
         if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
             raise
     _cache_elsewhere(
-        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where that "
-        "is set). Set NUMBA_CACHE_DIR to a folder that can be written."
+        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
+        "that is set). Set NUMBA_CACHE_DIR to a folder that can be written."
     )
     return importlib.import_module(name)
 
