@@ -13,9 +13,9 @@ from posed_captures import read
 from running import said
 from support.waiting import fifo, within
 
+from nerf_lightning.commands.log_file import log_file
 from nerf_lightning.commands.run_curves import read_curves
 from nerf_lightning.commands.sweep_job import read_records
-from nerf_lightning.commands.training import _log_file
 from nerf_lightning.data.blender import BlenderReader
 from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.data.npz import NpzReader
@@ -56,7 +56,7 @@ def test_a_report_leaves_them_out(nerf, tmp_path, name):
 
 def test_a_log_is_not_written_into_one(tmp_path):
     fifo(tmp_path / "train.log")
-    with within(SECONDS), pytest.raises(InputError, match=r"train\.log is a named pipe"), _log_file(tmp_path):
+    with within(SECONDS), pytest.raises(InputError, match=r"train\.log is a named pipe"), log_file(tmp_path):
         logging.getLogger().warning("a line")
 
 
