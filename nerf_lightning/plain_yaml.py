@@ -14,6 +14,7 @@ from nerf_lightning.files.regular import read_text
 
 MOST_CHARACTERS = 1 << 20
 """A hundred times what a run's config takes."""
+MOST_BYTES = 4 * MOST_CHARACTERS
 MOST_DEPTH = 50
 CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
@@ -61,4 +62,4 @@ def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     Raises:
         InputError: it cannot be read, or `plain_yaml` refuses it.
     """
-    return plain_yaml(read_text(path, 4 * MOST_CHARACTERS, cure), str(path), cure)
+    return plain_yaml(read_text(path, MOST_BYTES, cure), str(path), cure)

@@ -16,6 +16,7 @@ from markdown_it import MarkdownIt
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import (
+    JOINERS,
     EscapingFormatter,
     for_csv,
     for_file_name,
@@ -34,7 +35,7 @@ MARKUP = st.text(st.sampled_from("`*_[]()!<>|~#+-=.&\\:/@$ a1w\n")) | st.sampled
 @given(ANYTHING)
 def test_nothing_reaches_a_terminal_but_letters(text):
     shown = for_terminal(text)
-    assert all(letter.isprintable() or unicodedata.category(letter) == "Zs" for letter in shown)
+    assert all(letter.isprintable() or unicodedata.category(letter) == "Zs" or letter in JOINERS for letter in shown)
     assert len(shown.splitlines()) <= 1
     shown.encode()
     assert for_terminal(shown) == shown

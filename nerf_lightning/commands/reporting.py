@@ -22,7 +22,7 @@ from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.plain_yaml import MOST_CHARACTERS, plain_yaml, read_plain_yaml
+from nerf_lightning.plain_yaml import MOST_BYTES, plain_yaml, read_plain_yaml
 from nerf_lightning.reports.coverage import coverage
 from nerf_lightning.reports.curves import curve_drawings
 from nerf_lightning.reports.embedding import embedded_file, embedded_video
@@ -100,7 +100,7 @@ class Gathering:
 
     def _add_config(self) -> None:
         config = self.run / ".hydra" / "config.yaml"
-        text = read_text(config, MOST_CHARACTERS)
+        text = read_text(config, MOST_BYTES)
         plain_yaml(text, str(config))  # a config at all
         self.report.config = text
         overrides = read_plain_yaml(self.run / ".hydra" / "overrides.yaml")

@@ -26,7 +26,7 @@ COUNTS = ("steps", "parameters", "runs")
 
 def print_rows(rows: list[Row], title: str) -> None:
     """Print the table to the terminal, whole even where the terminal is narrow."""
-    table = Table(title=Text(title))
+    table = Table(title=Text(for_terminal(title)))
     for column in rows[0]:
         is_number = column in (*DECIMALS, *COUNTS)
         table.add_column(Text(for_terminal(column)), justify="right" if is_number else "left", overflow="fold")

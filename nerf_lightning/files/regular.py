@@ -80,16 +80,6 @@ def read_text(path: Path, most_bytes: int, cure: str = CURE, encoding: str = "ut
         raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
 
 
-def require_regular(path: Path, most_bytes: int | None, cure: str = CURE) -> None:
-    """Refuse what is no regular file, where a library will open it by its name.
-
-    Raises:
-        InputError: it cannot be opened, is no regular file, or is larger.
-    """
-    with explained(path, cure), open_regular(path, most_bytes, cure):
-        pass
-
-
 @contextmanager
 def explained(path: Path, cure: str = CURE) -> Iterator[None]:
     """Say of a file that cannot be opened or read what to do about it.

@@ -2,13 +2,12 @@
 
 import os
 import socket
-from pathlib import Path
 
 import pytest
 from support.waiting import fifo, within
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.files.regular import open_regular, open_to_append, read_bytes, read_text, require_regular
+from nerf_lightning.files.regular import open_regular, open_to_append, read_bytes, read_text
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs, sockets and devices are posix's")
 
@@ -43,7 +42,6 @@ OPENED = {
     "open_regular": lambda path: open_regular(path, 10, "Mend it."),
     "read_bytes": lambda path: read_bytes(path, 10, "Mend it."),
     "read_text": lambda path: read_text(path, 10, "Mend it."),
-    "require_regular": lambda path: require_regular(path, 10, "Mend it."),
 }
 
 
@@ -110,6 +108,5 @@ def test_what_is_no_text_is_named(tmp_path):
 
 @pytest.mark.parametrize("name", ["absent", "nul\0", "x" * 300, "folder/it"])
 def test_what_cannot_be_opened_is_named(tmp_path, name):
-    for open_ in (OPENED["read_bytes"], OPENED["require_regular"]):
-        with pytest.raises(InputError, match=r"cannot be read: .*\. Mend it\."):
-            open_(Path(tmp_path / name))
+    with pytest.raises(InputError, match=r"cannot be read: .*\. Mend it\."):
+        read_bytes(tmp_path / name, 10, "Mend it.")
