@@ -138,7 +138,7 @@ def _near(word: str, known: list[str]) -> str:
 
 def _complain(message: str) -> None:
     # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
-    print(
-        f"nerf: {for_terminal(message[:MOST_LETTERS])}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr
-    )
+    # Libraries say some things in several lines.
+    shown = for_terminal(message[:MOST_LETTERS].replace("\n", " "))
+    print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -12,6 +12,9 @@ import torch
 from nerf_lightning.commands import memory_plan
 from nerf_lightning.commands.memory_plan import MemoryPlan, Row
 from nerf_lightning.commands.peak_bytes import peak_bytes
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.system import RadianceFieldSystem
 
 CPU = torch.device("cpu")
 
@@ -173,7 +176,8 @@ def test_a_plan_is_logged_row_by_row(monkeypatch, caplog):
     """What is logged is escaped, ends of lines too."""
     plan = MemoryPlan([Row("pixels", 10, "memory")], [Row("a step", 20, "memory")], free=1000)
     monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
+    parts = (kind.__new__(kind) for kind in (TrainerSettings, RadianceFieldSystem, RayDataModule))
     with caplog.at_level(logging.INFO):
-        memory_plan.announce_memory(None, None, None)
+        memory_plan.announce_memory(*parts)
     assert caplog.messages == str(plan).splitlines()
     assert len(caplog.messages) == 4
