@@ -22,6 +22,10 @@ from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.commands.suggestions import paragraph
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.export.json_file import write_json
+from nerf_lightning.files.regular import read_text
+
+MOST_BYTES = 1 << 20
+"""Of a record."""
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +106,8 @@ def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecor
 
 def read_records(sweep_folder: Path) -> list[JobRecord]:
     """Return what the jobs of a sweep have left, in their order."""
-    records = [JobRecord(**json.loads(file.read_text())) for file in records_folder(sweep_folder).glob("*.json")]
+    files = records_folder(sweep_folder).glob("*.json")
+    records = [JobRecord(**json.loads(read_text(file, MOST_BYTES))) for file in files]
     return sorted(records, key=lambda record: record.number)
 
 

@@ -170,9 +170,9 @@ class Record(Description):
 
 @dataclass(frozen=True)
 class Named(Description):
-    """A dictionary from names to likes."""
+    """A dictionary from names, or numbers, to likes."""
 
-    name: Text
+    name: Text | Whole
     each: Description
     most: int
 
@@ -224,10 +224,14 @@ class Numbers(Description):
 
 @dataclass(frozen=True)
 class Plain(Description):
-    """Anything made of numbers, words, lists and dictionaries that is not deeper than `depth`, nor more than `most`."""
+    """Anything made of numbers, words, lists and dictionaries that is not deeper than `depth`, nor more than `most`.
+
+    There may be tensors in it where that is said.
+    """
 
     depth: int = 8
     most: int = 1 << 20
+    tensors: bool = False
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""
@@ -240,7 +244,7 @@ class Plain(Description):
                     below += [*node.keys(), *node.values()]
                 elif isinstance(node, (list, tuple)):
                     below += node
-                elif not isinstance(node, (bool, int, float, str, type(None), Tensor)):
+                elif not (node is None or isinstance(node, (bool, int, float, str, *([Tensor] * self.tensors)))):
                     raise Unfit(place, f"holds a {type(node).__name__}")
             level = below
             if found + len(level) > self.most:

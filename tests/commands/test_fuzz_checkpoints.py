@@ -56,6 +56,6 @@ def refusal_of(action):
 @given(st.data())
 def test_an_altered_checkpoint(runs, data):
     run = data.draw(st.sampled_from(runs))
-    torch.save(data.draw(alterations(run.sound)).content, run.file)
+    torch.save(data.draw(alterations(run.whole)).content, run.file)
     refusal_of(lambda: render_a_pixel(run.file))
     refusal_of(lambda: run.take_file())

@@ -17,6 +17,7 @@ def _nothing_elsewhere(tmp_path_factory, monkeypatch):
         (elsewhere / name).mkdir()
     monkeypatch.chdir(elsewhere / "work")
     monkeypatch.setenv("HOME", str(elsewhere / "home"))
+    monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path_factory.getbasetemp() / "fonts"))
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(elsewhere / "cache"))
     yield
     left = [str(Path(base) / name) for base, _, names in os.walk(elsewhere) for name in names]

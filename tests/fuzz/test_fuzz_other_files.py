@@ -1,6 +1,7 @@
 """Damaged files of the other kinds: camera paths, caches, curves, weights of LPIPS."""
 
 import io
+import json
 import shutil
 import struct
 import zipfile
@@ -60,30 +61,34 @@ def cameras_on_path(file, **settings):
 
 @pytest.fixture(scope="module")
 def colmap(tmp_path_factory):
-    """A capture that was read before, so that its pixels lie in the cache."""
+    """A capture that was read before, and the files of the cache in which its pixels lie."""
     root = write_colmap(tmp_path_factory.mktemp("cached") / "capture", Known(c2w=ring(4)))
-    return root, read("colmap", root).pixels.rgba.clone()
+    pixels = read("colmap", root).pixels
+    files = {path.suffix: path for path in (root.parent / "cache").iterdir()}
+    return root, pixels.rgba.shape, {kind: (files[kind], files[kind].read_bytes()) for kind in (".json", ".pixels")}
 
 
 @fuzzed(40)
 @given(data=st.data())
 def test_the_cache_of_pixels(colmap, data):
-    """Somebody has written to the user's own cache: the pixels may be others then, but there are as many."""
-    root, pixels = colmap
-    cache = root.parent / "cache"
-    kept = {path: path.read_bytes() for path in cache.iterdir()}
-    path = data.draw(st.sampled_from(sorted(path for path in kept if path.suffix in (".json", ".pixels"))))
-    path.unlink()
+    """The user's own cache was written to: the pixels may be others then, but there are as many."""
+    root, shape, kept = colmap
+    for path, sound in kept.values():
+        path.unlink(missing_ok=True)  # it is mapped, perhaps
+        path.write_bytes(sound)
+        path.chmod(0o600)
+    path, sound = kept[data.draw(st.sampled_from((".json", ".pixels")))]
     if path.suffix == ".json" and data.draw(st.booleans()):
-        path.write_text(yaml.safe_dump(data.draw(mutated(yaml.safe_load(kept[path]))), default_flow_style=True))
+        content = json.dumps(data.draw(mutated(json.loads(sound)))).encode()
     else:
-        path.write_bytes(data.draw(damaged(kept[path])))
+        content = data.draw(damaged(sound))
+    path.unlink()
+    path.write_bytes(content)
+    path.chmod(0o600)
     found = harmless(read, "colmap", root)
     if found is not None:
-        assert found.pixels.rgba.shape == pixels.shape
+        assert found.pixels.rgba.shape == shape
         assert int(found.pixels.rgba.sum()) >= 0  # all of it can be touched
-    shutil.rmtree(cache)
-    read("colmap", root)
 
 
 @fuzzed(25)

@@ -1,6 +1,7 @@
 """Nested content of files, altered in one place: what a stranger, or a failing disk, would leave."""
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -61,14 +62,20 @@ class Altered:
     def __init__(self, what: str, content: Any):
         self.what, self.content = what, content
 
+    @cached_property
+    def places(self) -> list[Path]:
+        """Where it can be altered."""
+        return list(places(self.content))
+
     def __repr__(self) -> str:
         return self.what
 
 
 @st.composite
-def alterations(draw: st.DrawFn, content: Any) -> Altered:
+def alterations(draw: st.DrawFn, of: Altered) -> Altered:
     """Draw content that differs in one place: a value that is missing, added, of another kind, or extreme."""
-    path = draw(st.sampled_from(list(places(content))))
+    content = of.content
+    path = of.places[draw(st.integers(0, len(of.places) - 1))]
     old = at(content, path)
     kinds = ["replace", "remove"] + ["add"] * isinstance(old, dict) + ["tensor"] * 3 * isinstance(old, torch.Tensor)
     kind = draw(st.sampled_from(kinds))
@@ -87,7 +94,9 @@ def _other_tensors(draw: st.DrawFn, tensor: torch.Tensor) -> torch.Tensor:
     """Draw a tensor that differs from one in shape, type, or a single number."""
     kind = draw(st.sampled_from(["shape", "type", "number", "all"]))
     if kind == "shape":
-        return draw(st.sampled_from([tensor[None], tensor.flatten()[:-1], tensor.flatten(), tensor.repeat(2)[None]]))
+        return draw(
+            st.sampled_from([tensor[None], tensor.flatten()[:-1], tensor.flatten(), torch.stack([tensor, tensor])])
+        )
     if kind == "type":
         return tensor.to(
             draw(st.sampled_from([torch.float64, torch.float16, torch.int32, torch.complex64, torch.bool]))

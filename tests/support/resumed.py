@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
 from running import FAST, start
+from support.altered import Altered
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.commands.training import _build_parts
@@ -45,6 +47,11 @@ class Resumed:
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"
         self.sound: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+
+    @cached_property
+    def whole(self) -> Altered:
+        """The sound checkpoint, to be altered."""
+        return Altered("nothing", self.sound)
 
     def take(self, change: Callable[[dict[str, Any]], object]) -> None:
         """Take the sound checkpoint, changed, and update the weights once: compiled optimizers look at no shapes."""
