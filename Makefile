@@ -7,6 +7,8 @@ XLA_VENV := .venv-xla
 ARGS ?=
 # How long make soak lasts.
 SECONDS ?= 1800
+# How many times as many cases as in make test make fuzz tries.
+TIMES ?= 200
 # How many tests run at a time.
 WORKERS ?= 2
 
@@ -28,7 +30,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak clean
+.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -101,6 +103,9 @@ bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 
 soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
 	@$(VENV)/bin/python tests/soak.py $(SECONDS)
+
+fuzz: setup ## Try damaged files, TIMES as many as make test does, that are others each time
+	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_checkpoints.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
 	rm -rf $(VENV) $(XLA_VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

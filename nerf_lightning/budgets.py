@@ -16,6 +16,8 @@ class Budgets:
 
     views: int = 200_000
     """Photographs of a capture."""
+    points: int = 20_000_000
+    """Sparse points of a capture."""
     view_pixels: int = 1 << 28
     """Pixels of one camera's picture."""
     megapixels: int = 178
@@ -28,6 +30,8 @@ class Budgets:
     """Steps of a march through an occupancy grid, from near to far."""
     json_bytes: int = 1 << 26
     """Of a json file."""
+    json_lists: int = 2_000_000
+    """Lists and objects in a json file, each of which takes a hundred times its bytes in memory."""
     json_depth: int = 32
     """Brackets within brackets in a json file."""
     yaml_characters: int = 1 << 20

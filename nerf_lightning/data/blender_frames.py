@@ -7,6 +7,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.checks import check_present, pose_from_matrix
 from nerf_lightning.data.images import ENDINGS
 from nerf_lightning.data.json_files import keys_of, read_json
@@ -45,6 +46,7 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
         )
     if not isinstance(entries, list):
         raise InputError(f"{path}: frames must be a list of views, but it is {type(entries).__name__}.")
+    require_within("views", len(entries), str(path), "views")
     frames = [_frame(path, index, entries[index], float(fov)) for index in range(0, len(entries), step)]
     check_present((frame.image for frame in frames), path)
     return frames

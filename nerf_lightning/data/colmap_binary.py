@@ -3,6 +3,7 @@
 import mmap
 import os
 import struct
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, MOST_BYTES, ColmapCamera, ColmapImage
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
@@ -21,7 +23,9 @@ class BinaryFiles:
     def cameras(self, path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         """Return the cameras with their numbers."""
         data = _Bytes(path)
-        for _ in range(data.count(24)):
+        count = data.count(24)
+        require_within("views", count, str(path), "views")
+        for _ in range(count):
             number, model, width, height = data.take("<IiQQ")
             if model not in MODELS:
                 raise InputError(f"{path} holds a camera of the unknown model number {model}. {CURE_MODEL}")
@@ -32,7 +36,9 @@ class BinaryFiles:
     def images(self, path: Path) -> Iterator[ColmapImage]:
         """Return the photographs; the features in them are passed over."""
         data = _Bytes(path)
-        for _ in range(data.count(73)):
+        count = data.count(73)
+        require_within("views", count, str(path), "views")
+        for _ in range(count):
             values = data.take("<I7dI")
             name = data.text()
             data.skip(24 * data.take("<Q")[0])
@@ -42,11 +48,13 @@ class BinaryFiles:
     def points(self, path: Path) -> Float[ndarray, "points 3"]:
         """Return the sparse points; the photographs that they were seen in are passed over."""
         data = _Bytes(path)
-        found = []
-        for _ in range(data.count(51)):
+        count = data.count(51)
+        require_within("points", count, str(path), "points")
+        found = array("d")
+        for _ in range(count):
             values = data.take("<Q3d3Bd")
             data.skip(8 * data.take("<Q")[0])
-            found.append(values[1:4])
+            found.extend(values[1:4])
         data.end()
         return np.array(found, np.float64).reshape(-1, 3)
 

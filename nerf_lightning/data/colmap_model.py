@@ -5,20 +5,24 @@ truncated ones. The format is documented at colmap.github.io/format.html.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.colmap_binary import BinaryFiles
 from nerf_lightning.data.colmap_records import CURE, ColmapCamera, ColmapImage, ModelFiles
 from nerf_lightning.data.colmap_text import TextFiles
 from nerf_lightning.errors import InputError
 
+Record = TypeVar("Record")
 FILES = ("cameras", "images", "points3D")
 KINDS: dict[str, ModelFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
 # Twins agree to so much, relative and absolute: text may have been written with few digits.
@@ -82,7 +86,8 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
     if not images_path.is_file():
         raise InputError(f"{folder} holds {cameras_path.name} but no {images_path.name}: it is not whole. {CURE}")
     files = KINDS[ending]
-    cameras, images = list(files.cameras(cameras_path)), list(files.images(images_path))
+    cameras = _no_more_than_allowed(files.cameras(cameras_path), cameras_path)
+    images = _no_more_than_allowed(files.images(images_path), images_path)
     _once((number for number, _ in cameras), cameras_path)
     _once((image.name for image in images), images_path)
     if any(not image.name for image in images):
@@ -91,6 +96,18 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
     if not np.isfinite(points).all():
         raise InputError(f"{points_path} holds points with NaN or infinity. {CURE}")
     return ColmapModel(dict(cameras), tuple(sorted(images, key=lambda image: image.name)), points)
+
+
+def _no_more_than_allowed(records: Iterator[Record], path: Path) -> list[Record]:
+    # A text does not say how many there are: it is read no further than that.
+    most = allowed().views
+    kept = list(islice(records, most + 1))
+    if len(kept) > most:
+        raise InputError(
+            f"{path} has more than {most:,} views, which are not taken from a file unasked. If you trust it, add "
+            "budgets.views=N; else use another file."
+        )
+    return kept
 
 
 def _once(keys: Iterable[object], path: Path) -> None:

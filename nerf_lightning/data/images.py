@@ -25,6 +25,8 @@ GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
 MOST_MEGAPIXELS = 178
+JPEG_BLOCK = 64
+"""Pixels of a block."""
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
 LIMIT_VARIABLE = "NERF_LIGHTNING_MAX_MEGAPIXELS"
@@ -193,8 +195,18 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             ) from error
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
+        _check_whole(image, os.fstat(file.fileno()).st_size, path)
         _check_plain(image, path)
         yield image
+
+
+def _check_whole(image: Image.Image, size: int, path: Path) -> None:
+    """Refuse a JPEG whose decoder would make up most of its pixels: it has a bit at least for each block of them."""
+    width, height = image.size
+    if image.format == "JPEG" and 8 * size * JPEG_BLOCK < width * height:
+        raise InputError(
+            f"{path} announces {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. {CURE}"
+        )
 
 
 def _check_plain(image: Image.Image, path: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.capture import Capture, View
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
 from nerf_lightning.data.checks import contents, listed
@@ -107,6 +108,7 @@ def _rows(path: Path) -> Float[ndarray, "views 17"]:
             f"{path} is {shape} of {rows.dtype}, but each view needs one row of {COLUMNS} numbers: a 3 x 5 matrix and "
             f"two depths. {CURE}"
         )
+    require_within("views", len(rows), str(path), "views")
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.checks import (
     FARTHEST,
@@ -168,6 +169,7 @@ def _check_headers(headers: dict[str, ArrayHeader], present: list[str], path: Pa
     missing = [key for key in KEYS if key not in headers]
     if missing:
         raise InputError(f"{path} lacks {listed(missing)}; it has {listed(present) or 'nothing'}. {LAYOUT}")
+    require_within("views", headers["images"].shape[0] if headers["images"].shape else 0, str(path), "views")
     cure = "If you trust it, allow more with scene.max_gigabytes=N; else use another file."
     check_unpacked(path, sum(header.num_bytes for header in headers.values()), 1e9 * max_gigabytes, cure)
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.capture import Capture, View, common_lens_model
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
 from nerf_lightning.data.checks import contents, is_absolute, is_there, listed, pose_from_matrix
@@ -47,6 +48,7 @@ class TransformsReader(CaptureReader):
         (frames,) = keys_of(content, ("frames",), str(path), FORMAT)
         if not isinstance(frames, list):
             raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
+        require_within("views", len(frames), str(path), "views")
         views, lenses = [], set()
         for index, frame in enumerate(frames):
             view, lens_model = self._view(path, f"{path}: frames[{index}]", content, frame)

@@ -116,6 +116,10 @@ def _mismatch(state: object, wanted: dict[str, Tensor]) -> str | None:
             return f"{name} is missing"
         if found.shape != tensor.shape:
             return f"{name} has shape {tuple(found.shape)}, not {tuple(tensor.shape)}"
+        if not found.is_floating_point():
+            return f"{name} is of the type {str(found.dtype).removeprefix('torch.')}"
+        if not bool(torch.isfinite(found).all()):
+            return f"{name} holds NaN or infinity"
     return None
 
 

@@ -125,3 +125,19 @@ def test_a_wrong_file_is_named(tmp_path):
         path.write_bytes(junk)
         with pytest.raises(InputError, match="not a file of weights"):
             load_lpips(str(path))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda tensor: tensor * float("nan"), "features.0.weight holds NaN or infinity"),
+        (lambda tensor: tensor / 0, "features.0.weight holds NaN or infinity"),
+        (lambda tensor: tensor.to(torch.complex64), "features.0.weight is of the type complex64"),
+        (lambda tensor: tensor.to(torch.int8), "features.0.weight is of the type int8"),
+    ],
+)
+def test_weights_that_are_no_weights(tmp_path, change, words):
+    state = LPIPS("alex").state_dict()
+    torch.save({**state, "features.0.weight": change(state["features.0.weight"])}, tmp_path / "alexnet.pth")
+    with pytest.raises(InputError, match=words):
+        load_lpips(str(tmp_path / "alexnet.pth"))

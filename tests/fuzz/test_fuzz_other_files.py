@@ -36,7 +36,7 @@ KEYFRAMES = {
 }
 
 
-@fuzzed(50)
+@fuzzed(30)
 @given(data=st.data())
 def test_keyframes(tmp_path_factory, data):
     file = tmp_path_factory.getbasetemp() / "keys.yaml"
