@@ -220,7 +220,7 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
 
 def _fresh(parent: Path) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    for name in itertools.chain([stamp], (f"{stamp}_{number}" for number in itertools.count(2))):
+    for name in itertools.chain([stamp], (f"{stamp}_{count}" for count in itertools.count(2))):
         with contextlib.suppress(FileExistsError):
             (parent / name).mkdir(parents=True)
             return parent / name

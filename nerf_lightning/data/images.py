@@ -205,7 +205,8 @@ def _check_whole(image: Image.Image, size: int, path: Path) -> None:
     width, height = image.size
     if image.format == "JPEG" and 8 * size * JPEG_BLOCK < width * height:
         raise InputError(
-            f"{path} announces {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. {CURE}"
+            f"{path} announces {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. "
+            f"{CURE}"
         )
 
 

@@ -4,7 +4,6 @@ import io
 import json
 import shutil
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import torch
 from captures import npz_content, write_blender
 from hypothesis import given
 from hypothesis import strategies as st
-from posed_captures import READERS, Known, read, ring, write_colmap, write_llff, write_transforms
+from posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
 from support.fuzzing import fuzzed, harmless
 from support.mutations import changed_array, damaged, damaged_text, mutated, saved
 
@@ -156,7 +155,9 @@ def test_npz(captures, data):
     key = data.draw(st.sampled_from(sorted(arrays)))
     arrays[key] = data.draw(changed_array(arrays[key]))
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", data.draw(st.sampled_from((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))) as archive:
+    with zipfile.ZipFile(
+        stream, "w", data.draw(st.sampled_from((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    ) as archive:
         for name, array in arrays.items():
             content = saved(array)
             archive.writestr(f"{name}.npy", content)

@@ -134,7 +134,9 @@ def record(content: bytes) -> bytes:
 
 def drawn_event(draw) -> bytes:
     event = Event(step=draw(st.integers(-(2**63), 2**63 - 1)), wall_time=draw(st.floats()))
-    names = st.sampled_from(("train/psnr_fine", "val/psnr", "train/loss", "speed/rays_per_second", "<b>", "", "a" * 9000))
+    names = st.sampled_from(
+        ("train/psnr_fine", "val/psnr", "train/loss", "speed/rays_per_second", "<b>", "", "a" * 9000)
+    )
     value = event.summary.value.add(tag=draw(names))
     kind = draw(st.sampled_from(("simple", "tensor", "image")))
     if kind == "simple":

@@ -116,8 +116,12 @@ def test_a_damaged_picture(file, kind, data):
 @given(data=st.data())
 def test_a_png_with_other_chunks(file, data):
     """Chunks have checksums, so that changed bytes alone never come through."""
-    kinds = st.sampled_from((b"iCCP", b"zTXt", b"iTXt", b"tEXt", b"eXIf", b"tRNS", b"PLTE", b"acTL", b"fcTL", b"gAMA", b"pHYs", b"cHRM"))
-    content = st.binary(max_size=40) | st.sampled_from((b"n\0\0" + zlib.compress(bytes(5000)), b"n\0\1\0\0\0", bytes(900)))
+    kinds = st.sampled_from(
+        (b"iCCP", b"zTXt", b"iTXt", b"tEXt", b"eXIf", b"tRNS", b"PLTE", b"acTL", b"fcTL", b"gAMA", b"pHYs", b"cHRM")
+    )
+    content = st.binary(max_size=40) | st.sampled_from(
+        (b"n\0\0" + zlib.compress(bytes(5000)), b"n\0\1\0\0\0", bytes(900))
+    )
     chunks = data.draw(st.lists(st.builds(chunk, kinds, content), max_size=4))
     sides = st.sampled_from((0, 1, 12, 16, 65535, 1 << 24, (1 << 31) - 1, 1 << 31))
     form = data.draw(st.just((8, 2, 0, 0, 0)) | st.tuples(*[st.integers(0, 17)] * 5))
@@ -129,8 +133,33 @@ def test_a_png_with_other_chunks(file, data):
 @fuzzed(20)
 @given(data=st.data())
 def test_a_tiff_with_other_tags(file, data):
-    numbers = (254, 256, 257, 258, 259, 262, 266, 273, 274, 277, 278, 279, 284, 317, 320, 322, 323, 330, 338, 339, 34665, 34675)
-    tag = st.tuples(st.integers(0, 18), st.sampled_from(EXTREMES[:12]), st.integers(0, 300) | st.sampled_from(EXTREMES[:12]))
+    numbers = (
+        254,
+        256,
+        257,
+        258,
+        259,
+        262,
+        266,
+        273,
+        274,
+        277,
+        278,
+        279,
+        284,
+        317,
+        320,
+        322,
+        323,
+        330,
+        338,
+        339,
+        34665,
+        34675,
+    )
+    tag = st.tuples(
+        st.integers(0, 18), st.sampled_from(EXTREMES[:12]), st.integers(0, 300) | st.sampled_from(EXTREMES[:12])
+    )
     found = data.draw(st.dictionaries(st.sampled_from(numbers).map(lambda number: f"t{number}"), tag, max_size=3))
     tags = {key: tuple(number & 0xFFFFFFFF for number in value) for key, value in found.items()}
     file.write_bytes(tiff(**{key: (kind & 0xFFFF, count, value) for key, (kind, count, value) in tags.items()}))

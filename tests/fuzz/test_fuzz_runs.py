@@ -99,7 +99,9 @@ def test_table(folder, run, replaced, data):
     replaced(path, data.draw(damage(path)), tabulate, composed("table", *settings, "force=true"))
     text = (folder / "out" / "table.csv").read_text()
     for row in csv.reader(text.splitlines()):
-        assert not [cell for cell in row if cell.startswith(FORMULAS) and not re.fullmatch(r"-[\d.]+(e[+-]?\d+)?", cell)]
+        assert not [
+            cell for cell in row if cell.startswith(FORMULAS) and not re.fullmatch(r"-[\d.]+(e[+-]?\d+)?", cell)
+        ]
     page = (folder / "out" / "table.md").read_text()
     assert "<script" not in page
     assert all(letter.isprintable() or letter == "\n" for letter in text + page)
@@ -123,7 +125,9 @@ def test_resumed_runs(run, replaced, data):
 
 
 def require_tame(lines):
-    assert not [line for line in lines if "_target_" in line or "${" in line or line.lstrip("+~").startswith("hydra.run")]
+    assert not [
+        line for line in lines if "_target_" in line or "${" in line or line.lstrip("+~").startswith("hydra.run")
+    ]
 
 
 @fuzzed(25)

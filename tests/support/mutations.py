@@ -22,7 +22,22 @@ WORDS = (
 )
 OTHERS: tuple[Any, ...] = (None, True, False, [], {}, [[]], [None], {"": None}, [{}], [1, "a"], {"a": {"b": [1]}})
 KEYS = ("", "_target_", "frames", "near", "lens", "\ud800", "a.b", "__class__", "<b>", "\n", "w", "psnr", "0")
-EXTREMES = (0, 1, -1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1)
+EXTREMES = (
+    0,
+    1,
+    -1,
+    0x7F,
+    0x80,
+    0xFF,
+    0x7FFF,
+    0x8000,
+    0xFFFF,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    1 << 40,
+    (1 << 63) - 1,
+)
 TYPES = ("?", "i1", "u1", "<i2", ">i4", "<u8", "<f2", "<f4", ">f8", "<c8", "<c16", "S3", "U2", "M8[s]", "m8[ns]", "V4")
 
 
@@ -36,14 +51,14 @@ def deep(levels: int) -> Any:
 
 def scalars() -> st.SearchStrategy[Any]:
     """Return numbers and words that a file may hold and nobody expects."""
-    return st.one_of(
-        st.sampled_from(NUMBERS), st.sampled_from(WORDS), st.floats(), st.integers(), st.text(max_size=8)
-    )
+    return st.one_of(st.sampled_from(NUMBERS), st.sampled_from(WORDS), st.floats(), st.integers(), st.text(max_size=8))
 
 
 def values() -> st.SearchStrategy[Any]:
     """Return anything that json can say."""
-    large = st.sampled_from((30, 60, 200)).map(deep) | st.just([0.0] * 20_000) | st.just({str(n): n for n in range(5000)})
+    large = (
+        st.sampled_from((30, 60, 200)).map(deep) | st.just([0.0] * 20_000) | st.just({str(n): n for n in range(5000)})
+    )
     return st.one_of(scalars(), scalars(), st.sampled_from(OTHERS).map(copy.deepcopy), large)
 
 
@@ -72,7 +87,9 @@ def _changed(draw: DrawFn, tree: Any) -> Any:
 
 def _change(draw: DrawFn, parent: Any, key: Any) -> None:
     node = parent[key]
-    kind = draw(st.sampled_from(("value", "value", "scalar", "scalar", "remove", "copy", "more", "wrap", "scale", "swap")))
+    kind = draw(
+        st.sampled_from(("value", "value", "scalar", "scalar", "remove", "copy", "more", "wrap", "scale", "swap"))
+    )
     if kind == "remove":
         del parent[key]
     elif kind == "copy":
@@ -166,7 +183,9 @@ def changed_array(draw: DrawFn, sound: np.ndarray) -> np.ndarray:
     """Return an array of another type, another shape or with other numbers."""
     array = sound.copy()
     for _ in range(draw(st.integers(1, 2))):
-        kind = draw(st.sampled_from(("number", "number", "number", "type", "object", "shape", "rows", "flat", "order", "scale")))
+        kind = draw(
+            st.sampled_from(("number", "number", "number", "type", "object", "shape", "rows", "flat", "order", "scale"))
+        )
         if kind == "number" and array.size and array.dtype.kind in "fiu":
             number = draw(st.sampled_from(NUMBERS[12:]) | st.floats())
             with np.errstate(all="ignore"):
@@ -178,7 +197,9 @@ def changed_array(draw: DrawFn, sound: np.ndarray) -> np.ndarray:
         elif kind == "object":
             array = np.array([{"a": 1}, None], dtype=object)
         elif kind == "shape":
-            array = np.zeros(draw(st.sampled_from(((), (0,), (1,), (0, 17), (1, 0, 3), (2, 2, 2, 2, 2), (1,) * 20))), array.dtype)
+            array = np.zeros(
+                draw(st.sampled_from(((), (0,), (1,), (0, 17), (1, 0, 3), (2, 2, 2, 2, 2), (1,) * 20))), array.dtype
+            )
         elif kind == "rows" and array.ndim:
             array = np.concatenate([array] * draw(st.sampled_from((0, 2, 3))) or [array[:0]])
         elif kind == "flat":
