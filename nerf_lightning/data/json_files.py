@@ -5,13 +5,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import read_text
 
-MOST_BYTES = 1 << 26
-"""A hundred thousand frames take less."""
-MOST_DEPTH = 32
 CURE = "Export it again, or mend it with a json checker."
 
 
@@ -22,7 +20,7 @@ def read_json(path: Path) -> Any:
         InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
     """
     try:
-        content = json.loads(read_text(path, MOST_BYTES, CURE, "utf-8-sig"))
+        content = json.loads(read_text(path, allowed().json_bytes, CURE, "utf-8-sig"))
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
@@ -36,12 +34,14 @@ def read_json(path: Path) -> Any:
 
 def _require_flat(content: object, path: Path) -> None:
     # What follows walks through the content, and prints parts of it, by recursion.
-    level = [content]
-    for _ in range(MOST_DEPTH):
+    level, most = [content], allowed().json_depth
+    for _ in range(most):
         level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
         if not level:
             return
-    raise InputError(f"{path} nests its brackets too deeply to be a capture (more than {MOST_DEPTH} deep). {CURE}")
+    raise InputError(
+        f"{path} nests its brackets too deeply to be a capture (more than budgets.json_depth={most}). {CURE}"
+    )
 
 
 def _children(node: list[Any] | dict[str, Any]) -> Iterable[Any]:

@@ -279,7 +279,7 @@ def bombs(folder):
         "wide": "its config describes a model of",
         "deep": "give 1 to 100 layers",
         "repeated": "repeats few numbers",
-        "described": "describes its tensors in",
+        "described": "bytes beside its numbers",
     }
 
 
