@@ -40,6 +40,8 @@ class Budgets:
     """Brackets within brackets in a yaml text."""
     object_bytes: int = 1 << 24
     """Of that part of a PyTorch file that is not numbers."""
+    tensor_bytes: int = 1 << 36
+    """Of a PyTorch file."""
     event_bytes: int = 1 << 29
     """Of a run's TensorBoard files."""
     film_frames: int = 100_000

@@ -9,13 +9,10 @@ from typing import Any
 
 import yaml
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import read_text
 
-MOST_CHARACTERS = 1 << 20
-"""A hundred times what a run's config takes."""
-MOST_BYTES = 4 * MOST_CHARACTERS
-MOST_DEPTH = 50
 CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
 
@@ -28,8 +25,8 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it holds references (*name), which are not read from files")
         self.depth += 1
-        if self.depth > MOST_DEPTH:
-            raise yaml.YAMLError(f"it nests more than {MOST_DEPTH} deep")
+        if self.depth > allowed().yaml_depth:
+            raise yaml.YAMLError(f"it nests more than {allowed().yaml_depth} deep")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -46,7 +43,7 @@ def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
     Raises:
         InputError: it is no yaml, too long, or holds references.
     """
-    if len(text) > MOST_CHARACTERS:
+    if len(text) > allowed().yaml_characters:
         raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
     try:
         return yaml.load(text, Loader=_PlainLoader)
@@ -62,4 +59,4 @@ def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     Raises:
         InputError: it cannot be read, or `plain_yaml` refuses it.
     """
-    return plain_yaml(read_text(path, MOST_BYTES, cure), str(path), cure)
+    return plain_yaml(read_text(path, 4 * allowed().yaml_characters, cure), str(path), cure)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning import ranks
-from nerf_lightning.checkpoints.format import LOOPS
+from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.resume_state import require_callbacks, require_loops, require_resumable
 from nerf_lightning.data.ray_batches import Progress, batch_size
 from nerf_lightning.encoders.base import tables_of
@@ -225,15 +225,21 @@ class RadianceFieldSystem(LightningModule):
             logger.log_metrics(values, self.trainer.global_step)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what makes the file self-contained, and the run's state beyond weights and optimizer."""
+        """Add what makes the file self-contained, and the run's state beyond weights and optimizer.
+
+        Raises:
+            InputError: the weights are not finite.
+            Unfit: what would be written is not what is read, which is a mistake of this program.
+        """
         self._require_finite_weights()
-        checkpoint["nerf_lightning"] = self.record | {
+        checkpoint[KEY] = self.record | {
             "progress": asdict(self.progress),
             "bad_steps": self.guard.state(),
             "tile_points": self.tile_points,
             "num_threads": torch.get_num_threads(),
             "world_size": ranks.world_size(),
         }
+        record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up the state again: place, tile and thread count decide the last bits of every sum.
@@ -242,7 +248,7 @@ class RadianceFieldSystem(LightningModule):
             InputError: the checkpoint is not one of this run; nothing was taken from it.
         """
         self._require_own(checkpoint)
-        state = checkpoint["nerf_lightning"]
+        state = checkpoint[KEY]
         self.progress.take_up(Progress(**state["progress"]))
         self.guard.restore(state["bad_steps"], self.device)
         self.tile_points = state["tile_points"]
@@ -264,7 +270,7 @@ class RadianceFieldSystem(LightningModule):
         require_resumable(checkpoint, self.model, self.build_optimizer, self.progress, self.configure_optimizers())
         require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
         ours = {key: getattr(trainer, key).state_dict() for key in LOOPS}
-        skipped = checkpoint["nerf_lightning"]["bad_steps"][0]
+        skipped = checkpoint[KEY]["bad_steps"][0]
         require_loops(checkpoint["loops"], ours, checkpoint["global_step"], skipped)
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:

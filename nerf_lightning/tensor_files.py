@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
+from nerf_lightning.budgets import allowed, require_within
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
 
@@ -26,10 +27,6 @@ CALLED = {
     "torch._utils _rebuild_parameter",
 }
 """What the files of this program, and state dicts, call."""
-MOST_BYTES = 1 << 36
-"""Of a whole file: a hundred times the largest model."""
-MOST_BYTES_OF_OBJECTS = 1 << 24
-"""Of the part that is not numbers: a hundred thousand views take less."""
 LEGACY_PICKLES = 5
 """Magic number, protocol, system, objects, names of the storages; then come the numbers (torch before 1.6)."""
 
@@ -42,7 +39,7 @@ def load_tensors(path: Path) -> Any:
         pickle.UnpicklingError: it holds anything else than tensors and plain containers.
         Exception: whatever torch, zipfile and pickle raise for a file that is damaged, or of another kind.
     """
-    with open_regular(path, MOST_BYTES) as file:
+    with open_regular(path, allowed().tensor_bytes) as file:
         if zipfile.is_zipfile(file):
             pickles: list[Any] = [_objects_of_archive(file, path)]
         else:
@@ -70,11 +67,7 @@ def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
         objects = [entry for entry in entries if entry.filename.endswith("data.pkl")]
         if len(objects) != 1:
             raise zipfile.BadZipFile("no data.pkl")
-        if objects[0].file_size > MOST_BYTES_OF_OBJECTS:
-            raise InputError(
-                f"{path} describes its tensors in {objects[0].file_size:,} bytes, and more than "
-                f"{MOST_BYTES_OF_OBJECTS:,} are not read: no file of weights needs them. Use another file."
-            )
+        require_within("object_bytes", objects[0].file_size, str(path), "bytes beside its numbers")
         return io.BytesIO(archive.read(objects[0]))
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.checkpoints import newest_checkpoint
 from nerf_lightning.commands.build import build
 from nerf_lightning.commands.console import say
@@ -22,7 +23,7 @@ from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.plain_yaml import MOST_BYTES, plain_yaml, read_plain_yaml
+from nerf_lightning.plain_yaml import plain_yaml, read_plain_yaml
 from nerf_lightning.reports.coverage import coverage
 from nerf_lightning.reports.curves import curve_drawings
 from nerf_lightning.reports.embedding import embedded_file, embedded_video
@@ -100,7 +101,7 @@ class Gathering:
 
     def _add_config(self) -> None:
         config = self.run / ".hydra" / "config.yaml"
-        text = read_text(config, MOST_BYTES)
+        text = read_text(config, 4 * allowed().yaml_characters)
         plain_yaml(text, str(config))  # a config at all
         self.report.config = text
         overrides = read_plain_yaml(self.run / ".hydra" / "overrides.yaml")

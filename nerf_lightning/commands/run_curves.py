@@ -4,10 +4,10 @@ import logging
 import tempfile
 from pathlib import Path
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import read_bytes
 
-MOST_BYTES = 1 << 29
 MOST_POINTS = 1000
 
 
@@ -39,7 +39,7 @@ def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:
 
 
 def _copy(files: list[Path], folder: Path) -> None:
-    left = MOST_BYTES
+    left = allowed().event_bytes
     for file in files:
         content = read_bytes(file, left, "Leave it out of the folder.")
         left -= len(content)

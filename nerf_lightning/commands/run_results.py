@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.commands.metrics_files import METRICS
 from nerf_lightning.commands.run_summary import RunSummary, number, read_json_object, read_note, read_run
 from nerf_lightning.errors import InputError
@@ -23,7 +24,6 @@ NOT_SHOWN_BELOW = (
     "scene.max_gigabytes",
 )
 SEED = re.compile(r"-?\d{1,18}", re.ASCII)
-MOST_FOLDERS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,11 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 def _runs_below(folder: Path) -> Iterator[Path]:
     for count, (base, below, names) in enumerate(os.walk(folder)):
-        if count > MOST_FOLDERS:
-            raise InputError(f"{folder} holds more than {MOST_FOLDERS:,} folders. Name the runs more closely.")
+        if count > allowed().folders:
+            raise InputError(
+                f"{folder} holds more than {allowed().folders:,} folders. Name the runs more closely, or add "
+                "budgets.folders=N."
+            )
         below.sort()
         if "run.json" in names or "metrics.json" in names:
             below.clear()

@@ -1,6 +1,5 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
-import os
 import struct
 import threading
 import warnings
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image, UnidentifiedImageError
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
 
@@ -24,12 +24,10 @@ MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
-MOST_MEGAPIXELS = 178
 JPEG_BLOCK = 64
 """Pixels of a block."""
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
-LIMIT_VARIABLE = "NERF_LIGHTNING_MAX_MEGAPIXELS"
 CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
 DECODER_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
 
@@ -151,34 +149,20 @@ def area_downscale(
     return small
 
 
-def most_megapixels() -> int:
-    """Return how large a picture may be: $NERF_LIGHTNING_MAX_MEGAPIXELS, else what the largest cameras make.
-
-    Raises:
-        InputError: the variable is no whole number above 0.
-    """
-    asked = os.environ.get(LIMIT_VARIABLE, "").strip()
-    if not asked:
-        return MOST_MEGAPIXELS
-    if not (asked.isdecimal() and len(asked) < 10 and int(asked) > 0):
-        raise InputError(f"The environment variable {LIMIT_VARIABLE} is {asked!r}: give a whole number above 0.")
-    return int(asked)
-
-
 def open_picture(path: Path) -> BufferedReader:
     """Open a file to be decoded.
 
     Raises:
-        InputError: it is no regular file, or is larger than any picture of `most_megapixels`.
+        InputError: it is no regular file, or is larger than any picture of `budgets.megapixels`.
         OSError: it cannot be opened.
     """
-    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * most_megapixels(), CURE)
+    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * allowed().megapixels, CURE)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the file, read its header, and refuse what has no one plain reading."""
-    most = most_megapixels()
+    most = allowed().megapixels
     with ExitStack() as opened:
         try:
             file = opened.enter_context(open_picture(path))
@@ -190,8 +174,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         except Image.DecompressionBombError as error:
             raise InputError(
                 f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can "
-                f"announce any number. Shrink it first, or, if you trust it, set the environment variable "
-                f"{LIMIT_VARIABLE}."
+                f"announce any number. Shrink it first, or, if you trust it, add budgets.megapixels={2 * most}."
             ) from error
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error

@@ -36,12 +36,14 @@ def read_json(path: Path) -> Any:
 
 def _require_flat(content: object, path: Path) -> None:
     # What follows walks through the content, and prints parts of it, by recursion.
-    level, depth = [content], allowed().json_depth
-    for _ in range(depth):
+    level, most = [content], allowed().json_depth
+    for _ in range(most):
         level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
         if not level:
             return
-    raise InputError(f"{path} nests its brackets too deeply to be a capture (more than {depth} deep). {CURE}")
+    raise InputError(
+        f"{path} nests its brackets too deeply to be a capture (more than budgets.json_depth={most}). {CURE}"
+    )
 
 
 def _children(node: list[Any] | dict[str, Any]) -> Iterable[Any]:

@@ -8,6 +8,7 @@ import torch
 import yaml
 from planted import Payload, compress, in_config, many_bytes, peak_of, replace_pickle, write_checkpoint
 from running import refused, said
+from support.budget import budget
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import load_model
@@ -196,6 +197,20 @@ def state(**changed):
         (camera(height=torch.full((6,), 1 << 27), width=torch.full((6,), 1 << 27)), "pixels"),
         (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
         (camera(lens="pinhole"), "lens"),
+        (camera(c2w=torch.zeros(6, 3, 4)), "a pose that is not a rotation"),
+        (camera(c2w=torch.zeros(6, 3, 4, dtype=torch.float16)), "c2w holds float16, not float32"),
+        (camera(focal=torch.zeros(6, 2)), "focal has numbers from 0 to 0, not 0.001 to"),
+        (recorded(far=torch.full((6,), 3e38)), "far has numbers from 3e+38"),
+        (recorded(near=torch.full((6,), 9.0), far=torch.full((6,), 8.0)), "near is not everywhere less than far"),
+        (recorded(aabb=torch.tensor([[1.0] * 3, [-1.0] * 3])), "a lower corner that is not below the upper one"),
+        (recorded(aabb=torch.zeros(2, 3)), "a lower corner that is not below the upper one"),
+        (recorded(to_user=torch.zeros(4, 4)), "to_user is singular"),
+        (recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))), "to_user is not a rotation, a scale"),
+        (recorded(view_names=()), "view_names has 0 entries"),
+        (recorded(view_names=("a\x00", *"bcdef")), r"a\x00', which holds control characters"),
+        (recorded(view_names=("a\udc80", *"bcdef")), r"a\udc80', which holds control characters or is not UTF-8"),
+        (recorded(view_names=("a" * 2000, *"bcdef")), "view_names[0] has 2,000 characters"),
+        (recorded(more=1), "holds 'more', which no file of this program does"),
         (recorded(near=1.0), "near"),
         (recorded(aabb=torch.zeros(3)), "aabb"),
         (recorded(background="\x1b[2Jwhite"), "background"),
@@ -279,7 +294,7 @@ def bombs(folder):
         "wide": "its config describes a model of",
         "deep": "give 1 to 100 layers",
         "repeated": "repeats few numbers",
-        "described": "describes its tensors in",
+        "described": "bytes beside its numbers",
     }
 
 
@@ -304,3 +319,14 @@ def test_bombs_stay_small(tmp_path):
     for name, words in expected.items():
         assert [line for line in lines if line.startswith(f"{name}.ckpt") and words in line], (name, lines)
     assert grown < 100 * MEGABYTE, grown
+
+
+@pytest.mark.parametrize("level", ["coarse", "fine"])
+def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
+    def many(config):
+        config["model"]["levels"][level]["sampler"]["num_samples"] = 10**7
+
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(many))
+    refused(loaded, file, parts=("a.ckpt", "samples along a ray", "add budgets.samples_per_ray=1000"))
+    with budget(samples_per_ray=10**8):
+        loaded(file)

@@ -44,7 +44,7 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
         assert shown in text, shown
     addresses = re.findall(r'(?:src|href)="([^"]{5})', text)
     assert set(addresses) == {"data:"}
-    assert 'http-equiv="Content-Security-Policy" content="default-src &#39;none&#39;' in text
+    assert 'http-equiv="Content-Security-Policy" content="default-src &#x27;none&#x27;' in text
 
 
 def test_sliders_work_in_a_browser(page_of_run):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import focal_from_fov
 from nerf_lightning.geometry.paths.base import CameraPath, PathFrame
@@ -20,7 +21,6 @@ from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types.scene import Cameras
 
 FRAMES_WITHOUT_TIMES = 120
-MOST_FRAMES = 100_000
 """An hour at 24 frames per second is less."""
 
 
@@ -90,11 +90,11 @@ class KeyframePath(CameraPath):
         return max(1, round(self.times[-1] * self.fps) + (not self.closed))
 
     def _check_length(self, file: str) -> None:
-        if self._count() > MOST_FRAMES:
+        if self._count() > allowed().film_frames:
             raise InputError(
                 f"{file}: the times of its keyframes last {self.times[-1]:,.6g} seconds, which makes {self._count():,} "
-                f"frames at path.fps={self.fps}; more than {MOST_FRAMES:,} are not taken from times. Give them in "
-                "seconds, or the number of frames with path.num_frames."
+                f"frames at path.fps={self.fps}; more than {allowed().film_frames:,} are not taken from times. "
+                "Give them in seconds, or the number of frames with path.num_frames."
             )
 
     def _zoomed(self, cameras: Cameras, knots: Tensor, at: Tensor, around: PathFrame) -> Cameras:
