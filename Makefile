@@ -105,7 +105,7 @@ soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory 
 	@$(VENV)/bin/python tests/soak.py $(SECONDS)
 
 fuzz: setup ## Try damaged files, TIMES as many as make test does, that are others each time
-	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_checkpoints.py
+	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_*.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
 	rm -rf $(VENV) $(XLA_VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

@@ -1,5 +1,6 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
+import os
 import struct
 import threading
 import warnings

@@ -10,8 +10,8 @@ from captures import write_blender, write_npz
 from malformed import WRITERS, Cases, edit_json, edit_rows, refused, refused_when_damaged
 from PIL import Image
 from posed_captures import Known, write_colmap
+from support.budget import budget
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.data.blender import BlenderReader
 from nerf_lightning.data.images import image_size, read_rgba
 from nerf_lightning.data.json_files import read_json
@@ -40,12 +40,6 @@ def huge_units(root):
 @cases("transforms", REACH, space="bounded")
 def a_huge_box(root):
     edit_json(root, lambda content: content | {"aabb_scale": 1e12})
-
-
-@pytest.fixture(autouse=True)
-def _defaults_afterwards():
-    yield
-    allow(Budgets())
 
 
 @pytest.mark.parametrize(("kind", "damage", "message", "settings"), cases.params)
@@ -120,12 +114,12 @@ def test_ten_million_cameras_in_other_files(tmp_path):
         file.write(header.getvalue())
         file.truncate(len(header.getvalue()) + 4 * 17 * 10**7)
     refused("llff", root, r"poses_bounds\.npy has .* bytes, and more than")
-    allow(Budgets(views=8))
-    refused("transforms", WRITERS["transforms"](tmp_path / "transforms"), r"transforms\.json has 9 views")
-    refused("llff", WRITERS["llff"](tmp_path / "nine"), r"poses_bounds\.npy has 9 views")
-    refused("text", WRITERS["text"](tmp_path / "text"), r"cameras\.txt has more than 8 views")
-    write_blender(tmp_path / "blender", {"train": 9, "val": 1, "test": 1})
-    with pytest.raises(InputError, match=r"transforms_train\.json has 9 views"):
-        BlenderReader(str(tmp_path / "blender")).read()
-    with pytest.raises(InputError, match=r"a\.npz has 10 views"):
-        NpzReader(str(write_npz(tmp_path / "a.npz"))).read()
+    with budget(views=8):
+        refused("transforms", WRITERS["transforms"](tmp_path / "transforms"), r"transforms\.json has 9 views")
+        refused("llff", WRITERS["llff"](tmp_path / "nine"), r"poses_bounds\.npy has 9 views")
+        refused("text", WRITERS["text"](tmp_path / "text"), r"cameras\.txt has more than 8 views")
+        write_blender(tmp_path / "blender", {"train": 9, "val": 1, "test": 1})
+        with pytest.raises(InputError, match=r"transforms_train\.json has 9 views"):
+            BlenderReader(str(tmp_path / "blender")).read()
+        with pytest.raises(InputError, match=r"a\.npz has 10 views"):
+            NpzReader(str(write_npz(tmp_path / "a.npz"))).read()

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from commands.conftest import nerf  # noqa: F401
 from hypothesis import given
 from hypothesis import strategies as st
 from measured_runs import leave_measured_run
