@@ -30,7 +30,11 @@ JPEG_BLOCK = 64
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
 CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
-DECODER_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
+DECODER_ERRORS = (
+    *(OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error),
+    *(TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, AssertionError),
+)
+"""What PIL lets through of damaged files, the latter ones by mistake."""
 
 
 # Python's list of warning filters belongs to all threads at once.

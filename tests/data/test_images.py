@@ -212,3 +212,14 @@ def test_size_is_width_then_height(tmp_path):
 def test_absent_file(tmp_path):
     with pytest.raises(InputError, match=r"a.png cannot be read: .*No such file"):
         read_rgba(tmp_path / "a.png")
+
+
+def test_a_page_without_a_size_is_damage(tmp_path):
+    Image.fromarray(picture(0)[..., :3]).save(tmp_path / "a.tif")
+    content = (tmp_path / "a.tif").read_bytes()
+    (first,) = struct.unpack_from("<I", content, 4)
+    (tags,) = struct.unpack_from("<H", content, first)
+    end = first + 2 + 12 * tags
+    (tmp_path / "a.tif").write_bytes(content[:end] + struct.pack("<I", len(content)) + content[end + 4 :] + bytes(6))
+    with pytest.raises(InputError, match=r"a.tif cannot be read: Missing dimensions. It is damaged"):
+        image_size(tmp_path / "a.tif")
