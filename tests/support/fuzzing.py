@@ -17,7 +17,7 @@ from nerf_lightning.errors import InputError
 TIMES = int(os.environ.get("FUZZ_TIMES", "0"))
 """How many times as many cases are tried as in `make test`, with seeds of their own; 0: those of `make test`."""
 SECONDS = 20
-"""A case takes some milliseconds; the machine may be busy."""
+"""Of the processor; a case takes some milliseconds."""
 GIGABYTE = 1 << 30
 
 
@@ -72,16 +72,16 @@ def _bounded() -> Iterator[None]:
         raise Hang(f"more than {SECONDS} s")
 
     before, limits = _restarted_peak(), resource.getrlimit(resource.RLIMIT_AS)
-    former = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    former = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     if before:
         # What asks for more than the machine has is told no, and shows as a `MemoryError`.
         resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + 8 * GIGABYTE, limits[1]))
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, former)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, former)
         resource.setrlimit(resource.RLIMIT_AS, limits)
     grown = _status("VmHWM") - before if before else 0
     assert grown < GIGABYTE, f"{grown:,} bytes of memory"
