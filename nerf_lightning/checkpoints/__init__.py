@@ -125,9 +125,10 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
             f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
             "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
         )
-    if record.get("format") != FORMAT:
+    written = record.get("format")
+    if type(written) is not int or written != FORMAT:
         raise InputError(
-            f"{path} has checkpoint format {shown(record.get('format'))} (written by nerf_lightning "
+            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning "
             f"{shown(record.get('version'))}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )

@@ -223,6 +223,7 @@ def state(**changed):
         (state(choices=["scene"]), "choices"),
         (state(config=3), "config"),
         (state(format=[[["1"]]]), "format a list"),
+        (state(format=torch.zeros(2)), "format a tensor"),
     ],
 )
 def test_a_garbled_record_is_named(nerf, tmp_path, change, words):
