@@ -104,7 +104,7 @@ bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
 	@$(VENV)/bin/python tests/soak.py $(SECONDS)
 
-fuzz: setup ## Try damaged files, TIMES as many as make test does, that are others each time
+fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each time
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_*.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)

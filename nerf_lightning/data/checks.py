@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.geometry.poses import is_rigid
 from nerf_lightning.types.scene import Background
 
@@ -19,12 +20,12 @@ LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:
-    """Return the items separated by commas, at most `cap` of them.
+    """Return the items separated by commas in one line, at most `cap` of them.
 
     >>> listed([1, 2, 3, 4], cap=2)
     '1, 2 and 2 more'
     """
-    names = [str(item) for item in items]
+    names = [for_terminal(str(item)) for item in items]
     shown = ", ".join(names[:cap])
     return shown if len(names) <= cap else f"{shown} and {len(names) - cap} more"
 

@@ -123,3 +123,9 @@ def test_ten_million_cameras_in_other_files(tmp_path):
             BlenderReader(str(tmp_path / "blender")).read()
         with pytest.raises(InputError, match=r"a\.npz has 10 views"):
             NpzReader(str(write_npz(tmp_path / "a.npz"))).read()
+
+
+def test_names_that_no_frame_has_stay_in_one_line(tmp_path):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    edit_json(root, lambda content: content | {"test_filenames": ["a\nb"]})
+    refused("transforms", root, r"test_filenames lists a\\nb, which no frame has")
