@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from running import FAST_PATH
 from support.altered import alterations
-from support.fuzzing import fuzzed
+from support.fuzzing import fuzzed, harmless
 from support.resumed import Resumed
 
 from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import load_model
-from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import rays_through_pixels
 from nerf_lightning.types.rays import PixelIndex
 
@@ -40,22 +39,10 @@ def render_a_pixel(file):
     assert bool(torch.isfinite(rgb).all())
 
 
-def refusal_of(action):
-    """Return the paragraph with which something is refused; None where it is taken."""
-    try:
-        action()
-    except InputError as error:
-        message = str(error)
-        assert "\n" not in message, message
-        assert message.endswith((".", ")")), message
-        return message
-    return None
-
-
 @fuzzed(80)
 @given(st.data())
 def test_an_altered_checkpoint(runs, data):
     run = data.draw(st.sampled_from(runs))
     torch.save(data.draw(alterations(run.whole)).content, run.file)
-    refusal_of(lambda: render_a_pixel(run.file))
-    refusal_of(lambda: run.take_file())
+    harmless(render_a_pixel, run.file)
+    harmless(run.take_file)

@@ -44,7 +44,7 @@ def a_photograph_of_no_pixels(root):
     one_picture(root).write_bytes(png_header(0, 0))
 
 
-@case("colmap", r"p_3.png announces more than 178 megapixels; .* set the environment variable NERF_LIGHTNING_MAX")
+@case("colmap", r"p_3.png announces more than 178 megapixels; .* add budgets.megapixels=")
 def a_photograph_of_200_megapixels(root):
     one_picture(root).write_bytes(png_header(20_000, 10_000))
 
