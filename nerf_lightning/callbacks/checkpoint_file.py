@@ -23,7 +23,7 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
     """
     part = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
         with part.open("wb") as file:
             torch.save(checkpoint, file)
             file.flush()

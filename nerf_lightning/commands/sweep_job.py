@@ -103,7 +103,9 @@ def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecor
 
 def read_records(sweep_folder: Path) -> list[JobRecord]:
     """Return what the jobs of a sweep have left, in their order."""
-    records = [JobRecord(**json.loads(file.read_text())) for file in records_folder(sweep_folder).glob("*.json")]
+    # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
+    files = records_folder(sweep_folder).glob("[!.]*.json")
+    records = [JobRecord(**json.loads(file.read_text())) for file in files]
     return sorted(records, key=lambda record: record.number)
 
 

@@ -15,8 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoints import Checkpoints
+from nerf_lightning.callbacks.folder_guard import FolderGuard
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.callbacks.time_budget import TimeBudget
+from nerf_lightning.callbacks.writers import failures_told_once
 from nerf_lightning.checkpoints import make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
@@ -61,7 +63,7 @@ def train(config: DictConfig) -> float | None:
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
-        with _log_file(path) if ranks.is_first() else nullcontext():
+        with _log_file(path) if ranks.is_first() else nullcontext(), failures_told_once():
             trainer = _fit(config, parts, path, former)
             for folder in held:
                 folder.trained()
@@ -105,7 +107,7 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, FolderGuard(), *build(config.callbacks).values()]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
