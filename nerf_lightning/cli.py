@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.closed_pipe import ends_quietly
 from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.sweep_arguments import is_sweep, sweep_arguments
 
 if TYPE_CHECKING:
@@ -139,12 +140,9 @@ def _near(word: str, known: list[str]) -> str:
     return f" Did you mean {' or '.join(close)}?" if close else ""
 
 
-def _escaped(letter: str) -> str:
-    return " " if letter.isspace() else letter.encode("unicode_escape").decode("ascii")
-
-
 def _complain(message: str) -> None:
     # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
-    shown = "".join(letter if letter.isprintable() else _escaped(letter) for letter in message[:MOST_LETTERS])
+    # Libraries say some things in several lines.
+    shown = for_terminal(message[:MOST_LETTERS].replace("\n", " "))
     print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
     sys.exit(USAGE_ERROR)

@@ -20,6 +20,7 @@ MARKUP = re.compile(r"[\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])|^[#+=-]|^\d{1,9}[.)
 ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
 UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
+JOINERS = "\u200c\u200d"
 LONGEST_FILE_NAME = 200
 """In bytes; file systems take 255, and endings are added."""
 
@@ -70,6 +71,15 @@ def for_csv(value: Any) -> Any:
     return f"'{for_terminal(value)}" if is_formula else for_terminal(value)
 
 
+def for_colmap(name: str) -> str:
+    r"""Return a photograph's name for COLMAP's images.txt, where it ends a line: every name that is read stays exact.
+
+    >>> for_colmap("a\u200db c.png\n2 1 0 0 0 0 0 0 1 d.png") == "a\u200db c.png\\n2 1 0 0 0 0 0 0 1 d.png"
+    True
+    """
+    return "".join(_as_in_python(letter) if _is_unprintable(letter) else letter for letter in name)
+
+
 def for_file_name(name: str) -> str:
     r"""Return the name of a file that any file system takes, and that lies in the folder it is put into.
 
@@ -111,8 +121,12 @@ class EscapingFormatter(logging.Formatter):
 
 
 def _visible(letter: str) -> str:
-    if letter.isprintable() or unicodedata.category(letter) == "Zs":  # blanks of other widths
-        return letter
+    # Blanks of other widths, and what joins letters in Persian, in Indian languages and in emojis, do no harm.
+    is_harmless = letter.isprintable() or letter in JOINERS or unicodedata.category(letter) == "Zs"
+    return letter if is_harmless else _as_in_python(letter)
+
+
+def _as_in_python(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
 
 

@@ -10,9 +10,11 @@ from typing import Any
 import yaml
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import read_text
 
 MOST_CHARACTERS = 1 << 20
 """A hundred times what a run's config takes."""
+MOST_BYTES = 4 * MOST_CHARACTERS
 MOST_DEPTH = 50
 CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
@@ -60,13 +62,4 @@ def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     Raises:
         InputError: it cannot be read, or `plain_yaml` refuses it.
     """
-    try:
-        size = path.stat().st_size
-        if size > 4 * MOST_CHARACTERS:
-            raise InputError(f"{path} has {size:,} bytes, more than any file of this program. {cure}")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. {cure}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
-    return plain_yaml(text, str(path), cure)
+    return plain_yaml(read_text(path, MOST_BYTES, cure), str(path), cure)

@@ -6,16 +6,18 @@ need none of that, so that all of it is refused before, or as soon as, it is see
 """
 
 import io
+import os
 import pickle
 import pickletools
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 
 CALLED = {
     "collections OrderedDict",
@@ -24,6 +26,8 @@ CALLED = {
     "torch._utils _rebuild_parameter",
 }
 """What the files of this program, and state dicts, call."""
+MOST_BYTES = 1 << 36
+"""Of a whole file: a hundred times the largest model."""
 MOST_BYTES_OF_OBJECTS = 1 << 24
 """Of the part that is not numbers: a hundred thousand views take less."""
 LEGACY_PICKLES = 5
@@ -34,28 +38,29 @@ def load_tensors(path: Path) -> Any:
     """Return the tensors and plain containers of a file that `torch.save` wrote, on the CPU.
 
     Raises:
-        InputError: it was made to fill the memory.
+        InputError: it is no regular file, or was made to fill the memory.
         pickle.UnpicklingError: it holds anything else than tensors and plain containers.
         Exception: whatever torch, zipfile and pickle raise for a file that is damaged, or of another kind.
     """
-    with path.open("rb") as file:
+    with open_regular(path, MOST_BYTES) as file:
         if zipfile.is_zipfile(file):
-            pickles: list[Any] = [_objects_of_archive(path)]
+            pickles: list[Any] = [_objects_of_archive(file, path)]
         else:
             file.seek(0)
             pickles = [file] * LEGACY_PICKLES
         for stream in pickles:
             _require_plain(stream)
-    content = torch.load(path, map_location="cpu", weights_only=True)
+        file.seek(0)
+        content = torch.load(file, map_location="cpu", weights_only=True)
     _require_own_memory(content, path)
     return content
 
 
-def _objects_of_archive(path: Path) -> io.BytesIO:
+def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
     """Return the part of the archive that is not numbers."""
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
-        announced, size = sum(entry.file_size for entry in entries), path.stat().st_size
+        announced, size = sum(entry.file_size for entry in entries), os.fstat(file.fileno()).st_size
         # torch.save compresses nothing. Entries that share their bytes are counted each.
         if announced > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise InputError(

@@ -30,6 +30,6 @@ def require_run(folder: Path) -> None:
     """
     if not (folder / "run.json").is_file():
         raise InputError(
-            f"The run folder {folder} was deleted, moved or renamed while the run was going on, so it stops here. Where "
+            f"The run folder {folder} was deleted, moved or renamed while the run was going on, so it stops here. If "
             "the folder has another name now, go on with resume=NEW_NAME."
         )

@@ -109,14 +109,15 @@ def checkpoint(resumable: bool) -> Record:
         "global_step": Whole(),
         KEY: record(resumable),
     }
-    entry = Plain(depth=2, most=100)  # what exactly, the optimizer itself says (`optimizer_state`)
+    # What exactly an optimizer keeps, it says itself (`optimizer_state`).
+    kept, group = Named(name, Plain(depth=0, tensors=True), 100), Named(name, Plain(depth=1, most=100_000), 100)
     run: dict[str, Description] = {
         "epoch": Whole(),
         "pytorch-lightning_version": Text(40, VERSION),
         "loops": Record({key: Plain(most=1000) for key in LOOPS}),
         "callbacks": Named(name, Plain(), 100),
         "optimizer_states": Many(
-            Record({"state": Plain(depth=3), "param_groups": Many(entry, 100, least=1)}), 1, least=1
+            Record({"state": Named(Whole(), kept, 100_000), "param_groups": Many(group, 100, least=1)}), 1, least=1
         ),
         "lr_schedulers": Many(Plain(), 0),
     }

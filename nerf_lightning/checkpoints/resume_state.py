@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from nerf_lightning.checkpoints.format import KEY
@@ -61,6 +62,8 @@ def require_fitting_weights(weights: Mapping[str, Tensor], known: Mapping[str, T
                 f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the model {known[name].dtype} in "
                 f"{tuple(known[name].shape)}",
             )
+        if tensor.dtype == torch.bool and not tensor.dim() and not torch.equal(tensor.cpu(), known[name].cpu()):
+            raise Unfit(f"state_dict.model.{name}", f"is {bool(tensor)}, which the run's scene and settings are not")
 
 
 def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:

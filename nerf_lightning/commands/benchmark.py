@@ -26,7 +26,7 @@ from nerf_lightning.commands.bench_stages import seconds_to_psnr, stage_seconds
 from nerf_lightning.commands.bench_table import peak_memory, print_table, spread
 from nerf_lightning.commands.bench_watching import watching_seconds
 from nerf_lightning.commands.build import build, build_system
-from nerf_lightning.commands.console import stderr_console
+from nerf_lightning.commands.console import say, stderr_console
 from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.timing import seconds_of
 from nerf_lightning.commands.trainer import TrainerSettings
@@ -119,7 +119,7 @@ def benchmark(config: DictConfig) -> float:
     print_table(result)
     folder = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
     write_json(folder / "bench.json", result)
-    print(f"written to {folder / 'bench.json'}")
+    say(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])
 
 

@@ -1,8 +1,14 @@
-"""The terminals that tables are printed to and progress bars are drawn on."""
+"""The terminals that results and tables are printed to and progress bars are drawn on."""
 
 from rich.console import Console
 
 from nerf_lightning import ranks
+from nerf_lightning.escaping import for_terminal
+
+
+def say(*lines: str) -> None:
+    """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
+    print("\n".join(map(for_terminal, lines)), flush=True)
 
 
 class StdoutConsole(Console):

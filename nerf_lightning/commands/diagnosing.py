@@ -11,10 +11,11 @@ from omegaconf import DictConfig
 from rich.text import Text
 
 from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import StdoutConsole
+from nerf_lightning.commands.console import StdoutConsole, say
 from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.data.doctor.examine import examine
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.doctor_picture import doctor_picture
 from nerf_lightning.export.json_file import write_json
 from nerf_lightning.export.pictures import save_png
@@ -33,8 +34,8 @@ def diagnose(config: DictConfig) -> int:
     save_png(folder / "doctor.png", doctor_picture(evidence, checks))
     print_checks(checks)
     seconds = time.monotonic() - started
-    print(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
-    print(f"written to  {folder / 'doctor.json'} and {folder / 'doctor.png'}")
+    say(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
+    say(f"written to  {folder / 'doctor.json'} and {folder / 'doctor.png'}")
     return sum(check.verdict == "wrong" for check in checks)
 
 
@@ -54,8 +55,8 @@ def print_checks(checks: Sequence[Check]) -> None:
     width = max(len(check.name) for check in checks)
     for check in checks:
         line = Text.assemble(
-            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {check.message}"
+            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {for_terminal(check.message)}"
         )
         console.print(line)
         if check.cure:
-            console.print(Text(f"{'':<{width + 9}}cure: {check.cure}"))
+            console.print(Text(f"{'':<{width + 9}}cure: {for_terminal(check.cure)}"))

@@ -5,6 +5,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.finish import metric_lines
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.protocol import measured_of
@@ -24,5 +25,5 @@ def evaluate(config: DictConfig) -> float:
     scoring, tile_points = build(config.evaluation), settings.inference_tile_points
     with torch.no_grad():
         metrics = scoring.score(model, scene, scene.background, tile_points, folder, origin)
-    print("\n".join(metric_lines(metrics, folder)))
+    say(*metric_lines(metrics, folder))
     return float(metrics["psnr"])

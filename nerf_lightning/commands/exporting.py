@@ -6,6 +6,7 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.export.base import Export
 
@@ -24,4 +25,4 @@ def export(config: DictConfig) -> None:
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     with torch.no_grad():
         written = what.export(model, checkpoint.scene, folder, settings.inference_tile_points)
-    print("\n".join(str(file) for file in written))
+    say(*map(str, written))

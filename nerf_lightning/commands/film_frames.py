@@ -11,17 +11,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from jaxtyping import UInt8
-from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
 from nerf_lightning.commands.console import stderr_console
 from nerf_lightning.commands.film_settings import Form
 from nerf_lightning.commands.run_summary import read_json_object
+from nerf_lightning.data.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.pictures import save_png
@@ -123,8 +122,8 @@ class FilmFrames:
         for number in track(numbers, description=f"encoding {film}", transient=True, console=stderr_console()):
             file = self._file(film, number)
             try:
-                yield torch.from_numpy(np.array(Image.open(file).convert("RGB")))
-            except (OSError, SyntaxError) as error:
+                yield torch.from_numpy(read_rgba(file)[..., :3].copy())
+            except InputError as error:
                 raise InputError(f"The frame {file} cannot be read. Remove it.") from error
 
     def _hold(self) -> None:

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.film_memory import require_room
 from nerf_lightning.commands.film_settings import FilmSettings
 from nerf_lightning.commands.filming import film
@@ -79,7 +80,7 @@ class Finish:
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
         lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
-        print("\n".join(lines))
+        say(*lines)
         return None if psnr is None else float(psnr)
 
 

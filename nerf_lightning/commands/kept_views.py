@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.escaping import for_file_name
 from nerf_lightning.export.view_pictures import ScoredView, save_view
 
 
@@ -43,5 +44,5 @@ def picture_name(split: str, view_name: str) -> str:
     >>> picture_name("test", "r_0"), picture_name("test", "test/r_0")
     ('test_r_0', 'test_r_0')
     """
-    plain = view_name.replace("/", "_").replace("\\", "_")
+    plain = for_file_name(view_name)
     return plain if plain.startswith(f"{split}_") else f"{split}_{plain}"

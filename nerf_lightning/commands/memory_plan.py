@@ -120,7 +120,8 @@ def _compiled(system: RadianceFieldSystem) -> int:
 def announce_memory(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> None:
     """Log the plan; warn where the room is short."""
     plan = memory_plan(settings, system, data)
-    log.info("%s", plan)
+    for line in str(plan).splitlines():
+        log.info("%s", line)
     if plan.warning is not None:
         log.warning(plan.warning)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from nerf_lightning import ranks
 from nerf_lightning.commands.bench_table import peak_memory
+from nerf_lightning.escaping import for_csv
 from nerf_lightning.evaluation.lpips import LPIPS_HINT
 from nerf_lightning.evaluation.metrics import mean_over_images, median_over_images, worst_of_images
 from nerf_lightning.export.atomic import whole_file
@@ -43,7 +44,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def write_metrics(folder: Path, result: dict[str, Any]) -> None:
     """Write `metrics.json`, and `metrics.csv` with a row per picture."""
     write_json(folder / "metrics.json", result)
-    with whole_file(folder / "metrics.csv") as part, part.open("w", newline="") as file:
+    with whole_file(folder / "metrics.csv") as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
-        writer.writerows(result["per_image"])
+        writer.writerows({key: for_csv(value) for key, value in row.items()} for row in result["per_image"])

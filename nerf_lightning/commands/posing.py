@@ -10,6 +10,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.run_folder import job_folder
 from nerf_lightning.commands.schema import require_fitting_values
@@ -41,7 +42,7 @@ def find_poses(config: DictConfig) -> int:
         if not isinstance(config.allow_outside, bool):
             raise InputError(f"allow_outside={config.allow_outside} does not fit: it must be true or false.")
         model, matching = _from_photographs(Path(config.images), folder, settings, config.allow_outside)
-    print("\n".join(_summary(model, matching, config, folder, time.monotonic() - started)))
+    say(*_summary(model, matching, config, folder, time.monotonic() - started))
     return len(model.registered)
 
 

@@ -61,7 +61,7 @@ def split_hash(scene: Scene, views: list[int]) -> str:
     """Return a fingerprint of names, pixels and masks, so that numbers on different pictures are not compared."""
     digest = hashlib.sha256()
     for view in views:
-        digest.update(scene.view_names[view].encode())
+        digest.update(scene.view_names[view].encode("utf-8", "surrogatepass"))
         digest.update(scene.pixels.view(view).contiguous().numpy().tobytes())
         kept = scene.pixels.kept(view)
         if kept is not None:

@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.film_settings import film_settings, listed
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
@@ -39,7 +40,7 @@ def render(config: DictConfig) -> None:
     with torch.no_grad():
         shown = replace(shown, precision=settings.precision)
         written = film(subjects, path, settings.inference_tile_points, folder, shown)
-    print("\n".join(str(file) for file in written))
+    say(*map(str, written))
 
 
 def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:

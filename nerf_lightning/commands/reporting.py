@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import newest_checkpoint
 from nerf_lightning.commands.build import build
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.links import require_nothing_from_outside
 from nerf_lightning.commands.measured_parts import facts, per_image, tables, views_on_page
 from nerf_lightning.commands.output_folder import output_folder
@@ -20,7 +21,8 @@ from nerf_lightning.data.doctor.examine import examine
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
-from nerf_lightning.plain_yaml import read_plain_yaml
+from nerf_lightning.files.regular import read_text
+from nerf_lightning.plain_yaml import MOST_BYTES, plain_yaml, read_plain_yaml
 from nerf_lightning.reports.coverage import coverage
 from nerf_lightning.reports.curves import curve_drawings
 from nerf_lightning.reports.embedding import embedded_file, embedded_video
@@ -48,7 +50,7 @@ def report(config: DictConfig) -> str:
     with whole_file(target) as part:
         part.write_text(page(gathered), encoding="utf-8")
     lines = [f"left out     {line}" for line in gathered.missing]
-    print("\n".join([*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)"]))
+    say(*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)")
     return str(target)
 
 
@@ -97,8 +99,10 @@ class Gathering:
         self.report.steps.append((f"step {file.stem.partition('_')[2].lstrip('0')}", embedded_file(file)))
 
     def _add_config(self) -> None:
-        read_plain_yaml(self.run / ".hydra" / "config.yaml")  # bounded, and a config at all
-        self.report.config = (self.run / ".hydra" / "config.yaml").read_text(encoding="utf-8")
+        config = self.run / ".hydra" / "config.yaml"
+        text = read_text(config, MOST_BYTES)
+        plain_yaml(text, str(config))  # a config at all
+        self.report.config = text
         overrides = read_plain_yaml(self.run / ".hydra" / "overrides.yaml")
         self.report.overrides = "\n".join(map(str, overrides)) if isinstance(overrides, list) else ""
 

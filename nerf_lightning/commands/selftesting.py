@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.commands.build import build, load_model
-from nerf_lightning.commands.console import StdoutConsole, stderr_console
+from nerf_lightning.commands.console import StdoutConsole, say, stderr_console
 from nerf_lightning.commands.devices import DeviceType, has_tf32
 from nerf_lightning.commands.environment import environment
 from nerf_lightning.commands.output_folder import output_folder
@@ -49,12 +49,12 @@ def selftest(config: DictConfig) -> bool:
             place.runs.close()
     _print(rows, settings, time.perf_counter() - began)
     known = {"nerf_lightning": __version__} | environment() | machine(settings.device)
-    print("\n".join(machine_lines(known)))
+    say(*machine_lines(known))
     right = all(row.outcome != "wrong" for row in rows)
     file = folder / "selftest.json"
     result: dict[str, Any] = {"right": right, "device": settings.describe(), "machine": known}
     write_json(file, result | {"checks": [row.as_dict() for row in rows]})
-    print(f"written to {file}")
+    say(f"written to {file}")
     return right
 
 
@@ -92,4 +92,4 @@ def _print(rows: list[Row], settings: TrainerSettings, seconds: float) -> None:
     counts = {outcome: sum(row.outcome == outcome for row in rows) for outcome in ("ok", "wrong", "not run")}
     found = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
     StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {settings.describe()}"))
-    print("\n".join([*remarks(rows), f"{found}; {seconds:.0f} seconds"]))
+    say(*remarks(rows), f"{found}; {seconds:.0f} seconds")

@@ -21,6 +21,7 @@ from nerf_lightning.commands.sweep_job import JobRecord, read_records, records_f
 from nerf_lightning.commands.sweep_record import SweepRecord
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,8 @@ class SweepWatch(Callback):
             leftover.unlink(missing_ok=True)
         record.write(sweep.folder)
         if "sweep" in config:
-            print(f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}", file=sys.stderr)
+            said = f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}"
+            print(for_terminal(said), file=sys.stderr)
         # Optuna's database library lists its parts.
         logging.getLogger("alembic").setLevel(logging.WARNING)
         launcher = config.hydra.launcher._target_
@@ -98,6 +100,7 @@ def watched(run: Callable[[], None]) -> None:
 
 def _end() -> list[JobRecord]:
     # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
+    from nerf_lightning.commands.console import say
     from nerf_lightning.commands.sweep_table import job_rows
     from nerf_lightning.commands.table_files import print_rows, write_rows
 
@@ -110,9 +113,9 @@ def _end() -> list[JobRecord]:
     rows = job_rows(records, sweep.folder)
     print_rows(rows, f"sweep {sweep.folder}")
     write_rows(rows, sweep.folder, "sweep")
-    print(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
+    say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
-        print(f"go on with   {sweep.go_on_with()}")
+        say(f"go on with   {sweep.go_on_with()}")
     return records
 
 

@@ -22,6 +22,10 @@ from nerf_lightning.commands.slurm import was_requeued
 from nerf_lightning.commands.suggestions import paragraph
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.export.json_file import write_json
+from nerf_lightning.files.regular import read_text
+
+MOST_BYTES = 1 << 20
+"""Of a record."""
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +109,7 @@ def read_records(sweep_folder: Path) -> list[JobRecord]:
     """Return what the jobs of a sweep have left, in their order."""
     # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
     files = records_folder(sweep_folder).glob("[!.]*.json")
-    records = [JobRecord(**json.loads(file.read_text())) for file in files]
+    records = [JobRecord(**json.loads(read_text(file, MOST_BYTES))) for file in files]
     return sorted(records, key=lambda record: record.number)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.output_folder import output_folder
 from nerf_lightning.commands.run_results import FILES, RunResult, find_runs, read_result
 from nerf_lightning.commands.run_table import (
@@ -18,7 +19,7 @@ from nerf_lightning.commands.run_table import (
     one_protocol,
     without_empty,
 )
-from nerf_lightning.commands.table_files import Row, print_rows, printable, write_rows
+from nerf_lightning.commands.table_files import Row, print_rows, write_rows
 from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
 from nerf_lightning.reports.published import published_for
@@ -57,7 +58,7 @@ def tabulate(config: DictConfig) -> int:
         {key: (value or "").partition(",")[0] if key == "source" else value for key, value in r.items()} for r in rows
     ]
     print_rows(short, "1 run" if len(gathered.results) == 1 else f"{len(gathered.results)} runs")
-    print("\n".join([*map(printable, notes), f"written to  {folder / 'table.md'} and {folder / 'table.csv'}"]))
+    say(*notes, f"written to  {folder / 'table.md'} and {folder / 'table.csv'}")
     return len(rows)
 
 

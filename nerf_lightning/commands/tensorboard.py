@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.writers import tensorboard_writers
 from nerf_lightning.commands.suggestions import flatten
+from nerf_lightning.escaping import for_terminal
 
 CHOICES = ("encoder", "experiment", "field", "model", "scene")
 COMPARED = ("seed", "optimizer", "scheduler", "data", "field", "encoder", "model", "trainer", "scene")
@@ -21,7 +22,7 @@ def describe_run(loggers: list[Logger], config: DictConfig) -> None:
     values = hyper_parameters(config)
     for writer in tensorboard_writers(loggers):
         text = OmegaConf.to_yaml(config, resolve=True)
-        writer.add_text("config", "\n".join(f"    {line}" for line in text.splitlines()), 0)
+        writer.add_text("config", "\n".join(f"    {for_terminal(line)}" for line in text.split("\n")), 0)
         for summary in hparams(values, dict.fromkeys(FINAL_METRICS, 0.0)):
             writer._get_file_writer().add_summary(summary)
 

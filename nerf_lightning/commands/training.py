@@ -1,8 +1,7 @@
 """The training run: build the parts, take the folder, fit, evaluate, film."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,12 @@ from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.folder_guard import FolderGuard
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.callbacks.time_budget import TimeBudget
-from nerf_lightning.callbacks.writers import failures_told_once
+from nerf_lightning.callbacks.writers import errors_told_once
 from nerf_lightning.checkpoints import make_record, read_checkpoint
 from nerf_lightning.commands.build import build, build_system, load_weights
 from nerf_lightning.commands.finish import Finish
 from nerf_lightning.commands.former_overrides import to_give_again
+from nerf_lightning.commands.log_file import log_file
 from nerf_lightning.commands.memory_plan import announce_memory
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.preemption import wants_restart
@@ -63,7 +63,7 @@ def train(config: DictConfig) -> float | None:
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
-        with _log_file(path) if ranks.is_first() else nullcontext(), failures_told_once():
+        with errors_told_once(), log_file(path) if ranks.is_first() else nullcontext():
             trainer = _fit(config, parts, path, former)
             for folder in held:
                 folder.trained()
@@ -177,15 +177,3 @@ def _loggers(config: DictConfig, folder: Path, former: ResumePoint | None) -> li
 def _resume_command(folder: Path) -> str:
     again = to_give_again(HydraConfig.get().overrides.task)
     return " ".join(["nerf train", to_type("resume", str(folder)), *again])
-
-
-@contextmanager
-def _log_file(folder: Path) -> Iterator[None]:
-    handler = logging.FileHandler(folder / "train.log", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.getLogger().addHandler(handler)
-    try:
-        yield
-    finally:
-        logging.getLogger().removeHandler(handler)
-        handler.close()

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
 from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
 from nerf_lightning.data.checks import known_background
@@ -48,7 +49,7 @@ def view(config: DictConfig) -> None:
     where = config.host, config.port, config.max_height, config.viewer.hosts
     page = Page(studio, Photographs(record, scene, background), folder, *where)
     stopped = _stop_signals()
-    print(f"The page is at {page.address} (Ctrl-C ends it)", flush=True)
+    say(f"The page is at {page.address} (Ctrl-C ends it)")
     if config.open_browser:
         open_browser(page.address)
     try:

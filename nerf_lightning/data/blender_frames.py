@@ -11,6 +11,7 @@ from nerf_lightning.data.checks import check_present, pose_from_matrix
 from nerf_lightning.data.images import ENDINGS
 from nerf_lightning.data.json_files import keys_of, read_json
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import require_printable
 
 FORMAT = "The Blender format"
 LEAST_ANGLE = 1e-6
@@ -55,6 +56,7 @@ def _frame(path: Path, index: int, entry: object, fov: float) -> Frame:
     name, matrix = keys_of(entry, FRAME_KEYS, where, FORMAT)
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: file_path is {name!r}, but it must be the image's path as text.")
+    require_printable(name, where)
     # Only known endings count: the original files leave ".png" out, and a name may hold a dot of its own.
     image = Path(name) if name.lower().endswith(ENDINGS) else Path(name + ".png")
     return Frame(

@@ -13,6 +13,7 @@ from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL, listed
 from nerf_lightning.data.images import downscaled_size
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import require_printable
 from nerf_lightning.geometry.poses import is_rigid
 from nerf_lightning.types.scene import Cameras, LensModel, PixelStore
 
@@ -96,12 +97,15 @@ def check_capture(capture: Capture) -> None:
 
     Raises:
         InputError: with the view's name: no views, two of one name, poses that are no rotation, focal lengths that are
-            not positive, principal points outside the picture, and numbers that are not finite.
+            not positive, principal points outside the picture, and numbers that are not finite; a name that is not
+            UTF-8 or holds control characters.
     """
     require_within("views", len(capture.views), str(capture.source), "views")
     if not capture.views:
         raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
     names = [view.name for view in capture.views]
+    for name in (*names, *capture.left_out):
+        require_printable(name, f"A photograph of {capture.source}")
     twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
     if twice:
         raise InputError(f"{capture.source} lists {listed(twice)} more than once. Remove all but one of each.")

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, ColmapCamera, ColmapImage
+from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, MOST_BYTES, ColmapCamera, ColmapImage
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 
 
 class BinaryFiles:
@@ -57,7 +58,7 @@ class _Bytes:
         self.path, self.place = path, 0
         self.data: bytes | mmap.mmap
         try:
-            with path.open("rb") as file:
+            with open_regular(path, MOST_BYTES, CURE) as file:
                 # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
                 empty = os.fstat(file.fileno()).st_size == 0
                 self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

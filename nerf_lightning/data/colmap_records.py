@@ -22,6 +22,8 @@ MODELS = {
     10: ("THIN_PRISM_FISHEYE", 12),
 }
 """COLMAP's numbers of camera models, with their names and counts of parameters."""
+MOST_BYTES = 1 << 36
+"""Of a file; ten million points with long tracks take a tenth."""
 CURE = "Copy the model again, or run the reconstruction anew (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 

@@ -1,5 +1,6 @@
 """The text files of a COLMAP model: lines of words; comments begin with #."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,10 +8,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, ColmapCamera, ColmapImage
+from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, MOST_BYTES, ColmapCamera, ColmapImage
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 
 COUNTS = dict(MODELS.values())
+LONGEST_LINE = 1 << 24
+"""In characters; that of a photograph with a hundred thousand features takes less."""
 
 
 class TextFiles:
@@ -50,8 +54,10 @@ class TextFiles:
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     try:
         # Line by line: a file of empty lines is small on the disk alone.
-        with path.open(encoding="utf-8", newline="\n") as file:
-            for number, line in enumerate(file, start=1):
+        with open_regular(path, MOST_BYTES, CURE) as binary, io.TextIOWrapper(binary, "utf-8", newline="\n") as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
+                if len(line) > LONGEST_LINE:
+                    raise InputError(f"{path}, line {number} has more than {LONGEST_LINE:,} characters. {CURE}")
                 if not line.startswith("#") and (keep_empty or line.strip()):
                     yield number, line.strip()
     except UnicodeDecodeError as error:

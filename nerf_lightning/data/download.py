@@ -16,6 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn, Transf
 
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular, open_to_append
 
 TIMEOUT = 10.0
 CHUNK = 1 << 16
@@ -128,7 +129,9 @@ def _copy(response: http.client.HTTPResponse, part: Path, start: int, num_bytes:
         TransferSpeedColumn(),
         TimeRemainingColumn(),
     )
-    with part.open("ab" if start else "wb") as file, progress_bar(*columns) as bar:
+    if not start:
+        part.unlink(missing_ok=True)
+    with open_to_append(part) as file, progress_bar(*columns) as bar:
         task = bar.add_task(part.stem, total=num_bytes, completed=start)
         while start <= num_bytes and (chunk := response.read(CHUNK)):
             file.write(chunk)
@@ -144,7 +147,7 @@ def _check_content(part: Path, num_bytes: int, sha256: str | None) -> None:
         raise _Failure(f"the server's file has not {num_bytes} bytes: {size} had arrived when it was stopped")
     if sha256 is None:
         return
-    with part.open("rb") as file:
+    with open_regular(part, num_bytes) as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if found != sha256:
         part.unlink()

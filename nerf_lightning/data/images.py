@@ -6,7 +6,8 @@ import threading
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 
 # A closed list: some of PIL's other decoders start outside programs.
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
@@ -23,7 +25,10 @@ GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
 MOST_MEGAPIXELS = 178
+BYTES_PER_PIXEL = 16
+"""Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
 LIMIT_VARIABLE = "NERF_LIGHTNING_MAX_MEGAPIXELS"
+CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
 DECODER_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
 
 
@@ -158,24 +163,36 @@ def most_megapixels() -> int:
     return int(asked)
 
 
+def open_picture(path: Path) -> BufferedReader:
+    """Open a file to be decoded.
+
+    Raises:
+        InputError: it is no regular file, or is larger than any picture of `most_megapixels`.
+        OSError: it cannot be opened.
+    """
+    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * most_megapixels(), CURE)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the file, read its header, and refuse what has no one plain reading."""
     most = most_megapixels()
-    try:
-        with _filters, warnings.catch_warnings():
-            # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            Image.MAX_IMAGE_PIXELS = most * 500_000
-            image = Image.open(path, formats=FORMATS)
-    except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can announce "
-            f"any number. Shrink it first, or, if you trust it, set the environment variable {LIMIT_VARIABLE}."
-        ) from error
-    except (UnidentifiedImageError, *DECODER_ERRORS) as error:
-        raise InputError(_unreadable(path, error)) from error
-    with image:
+    with ExitStack() as opened:
+        try:
+            file = opened.enter_context(open_picture(path))
+            with _filters, warnings.catch_warnings():
+                # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                Image.MAX_IMAGE_PIXELS = most * 500_000
+                image = opened.enter_context(Image.open(file, formats=FORMATS))
+        except Image.DecompressionBombError as error:
+            raise InputError(
+                f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can "
+                f"announce any number. Shrink it first, or, if you trust it, set the environment variable "
+                f"{LIMIT_VARIABLE}."
+            ) from error
+        except (UnidentifiedImageError, *DECODER_ERRORS) as error:
+            raise InputError(_unreadable(path, error)) from error
         _check_plain(image, path)
         yield image
 
@@ -212,9 +229,8 @@ def _num_frames(image: Image.Image, path: Path) -> int:
 
 def _unreadable(path: Path, error: Exception) -> str:
     """Say what is wrong with the file itself."""
-    cure = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
     if path.is_file() and path.stat().st_size == 0:
-        return f"{path} is empty (0 bytes). {cure}"
+        return f"{path} is empty (0 bytes). {CURE}"
     if isinstance(error, UnidentifiedImageError):
-        return f"{path} is not an image that can be read. {cure}"
-    return f"{path} cannot be read: {error}. It is damaged or was cut short. {cure}"
+        return f"{path} is not an image that can be read. {CURE}"
+    return f"{path} cannot be read: {error}. It is damaged or was cut short. {CURE}"

@@ -7,6 +7,7 @@ from typing import Any
 
 from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import read_text
 
 MOST_BYTES = 1 << 26
 """A hundred thousand frames take less."""
@@ -21,22 +22,14 @@ def read_json(path: Path) -> Any:
         InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{path} has {path.stat().st_size:,} bytes, and more than {MOST_BYTES:,} of json are not read. {CURE}"
-            )
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(read_text(path, MOST_BYTES, CURE, "utf-8-sig"))
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
     except RecursionError as error:
         raise InputError(f"{path} nests its brackets too deeply to be a capture. {CURE}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {CURE}") from error
     except ValueError as error:  # a number of thousands of digits
         raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
     _require_flat(content, path)
     return content
 

@@ -1,5 +1,6 @@
 """The LLFF format: `poses_bounds.npy` beside folders of photographs (images, images_2, images_4, images_8)."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -15,8 +16,11 @@ from nerf_lightning.data.checks import contents, listed
 from nerf_lightning.data.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 
 COLUMNS = 17
+MOST_BYTES = 1 << 28
+"""A hundred thousand views take a twentieth."""
 CURE = "Make it again with LLFF's imgs2poses, or read the COLMAP model instead (scene=colmap)."
 
 
@@ -79,9 +83,9 @@ class LlffReader(CaptureReader):
 def _array(path: Path) -> ndarray:
     try:
         # Read by its own format: np.load would open archives too, and unpickle what is neither.
-        with path.open("rb") as file:
+        with open_regular(path, MOST_BYTES, CURE) as file:
             # Its size is known before memory is taken, and its header is short.
-            array_header(file.read(HEADER_BYTES), path.stat().st_size)
+            array_header(file.read(HEADER_BYTES), os.fstat(file.fileno()).st_size)
             file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:

@@ -28,6 +28,7 @@ from nerf_lightning.data.numpy_files import ArrayHeader, archive_headers, check_
 from nerf_lightning.data.pixel_store import empty_store
 from nerf_lightning.data.splits import every_kth, in_order
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 from nerf_lightning.geometry.cameras import pinhole_cameras, resized
 from nerf_lightning.types.scene import PixelStore, Scene
 
@@ -145,7 +146,8 @@ def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
     try:
-        with zipfile.ZipFile(path) as archive:
+        # What is taken of it is bounded by its headers.
+        with open_regular(path, None) as file, zipfile.ZipFile(file) as archive:
             headers = archive_headers(archive, KEYS)
             _check_headers(headers, [Path(name).stem for name in archive.namelist()], path, max_gigabytes)
             return {key: read_member(archive, key) for key in KEYS}
@@ -156,7 +158,7 @@ def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
 
 
 def _damaged(path: Path, error: Exception) -> str:
-    with path.open("rb") as file:
+    with open_regular(path, None) as file:
         if file.read(6) == b"\x93NUMPY":
             return f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}"
     return f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."

@@ -9,8 +9,9 @@ from pathlib import Path
 from PIL import ExifTags, Image, ImageOps
 
 from nerf_lightning.data.checks import listed
-from nerf_lightning.data.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, read_rgba
+from nerf_lightning.data.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, open_picture, read_rgba
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import require_printable
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 FEWEST = 3
@@ -107,16 +108,13 @@ def check_one_camera(photographs: list[FoundPhotograph]) -> None:
 
 
 def _photograph(path: Path) -> FoundPhotograph:
+    require_printable(path.name, f"A photograph in {path.parent}")
     width, height = image_size(path)
     if min(width, height) < SMALLEST_SIDE:
         raise InputError(
             f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
             f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
-    try:
-        os.fsencode(path.name).decode()
-    except UnicodeDecodeError as error:
-        raise InputError(f"The file name {path.name!r} in {path.parent} is not valid UTF-8. Rename it.") from error
     exif = _exif(path)
     details = exif.get_ifd(ExifTags.IFD.Exif)
     turned = exif.get(ORIENTATION, 1)
@@ -127,7 +125,7 @@ def _photograph(path: Path) -> FoundPhotograph:
 
 
 def _exif(path: Path) -> Image.Exif:
-    with Image.open(path, formats=FORMATS) as image:
+    with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
             return image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
@@ -137,7 +135,7 @@ def _exif(path: Path) -> Image.Exif:
 
 def _write_turned(path: Path, target: Path) -> None:
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
             upright = ImageOps.exif_transpose(image)
             profile = image.info.get("icc_profile")
             # PNG and TIFF take no notice of the quality.

@@ -24,6 +24,7 @@ from nerf_lightning.data.images import (
 from nerf_lightning.data.pixel_file import FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixel_store import in_threads
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import open_regular
 from nerf_lightning.types.scene import PixelStore
 
 # Megapixels that take a few seconds: from here on there is a progress bar.
@@ -102,7 +103,7 @@ def _hash_of_contents(photographs: Sequence[Photograph], label: str) -> str:
 
     def digest(index: int) -> bytes:
         try:
-            with paths[index].open("rb") as file:
+            with open_regular(paths[index], None) as file:  # a piece at a time
                 return hashlib.file_digest(file, "sha256").digest()
         except OSError as error:
             raise InputError(f"{paths[index]} cannot be read: {error.strerror}. Check its permissions.") from error
@@ -121,7 +122,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
     ends = np.cumsum([width * height for width, height in sizes])
     num_pixels = int(ends[-1])
     check_room(target.parent, num_pixels * (5 if masked else 4))
-    target.touch()
+    target.touch(mode=0o600)
 
     def decode(index: int) -> bool:
         rgba = _picture(photographs[index], sizes[index], downscale)

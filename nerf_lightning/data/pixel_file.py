@@ -22,14 +22,16 @@ from filelock import FileLock
 from jaxtyping import UInt8
 from torch import Tensor
 
-from nerf_lightning.data.json_files import read_json
 from nerf_lightning.data.pixel_store import layout
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.own import make_own_folder, open_own
 from nerf_lightning.types.scene import PixelStore
 
 FORMAT = 1
 SPOTS, SPOT_BYTES = 64, 4096
 LONGEST_SIDE = 1 << 24
+MOST_HEADER_BYTES = 1 << 26
+"""A million views take less."""
 GIGABYTE = 1e9
 
 log = logging.getLogger(__name__)
@@ -83,20 +85,20 @@ def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> 
         make: writes the pixels to the path it is given and describes them; `spots` is filled in here.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or others can write there, too.
     """
-    header = _sound_header(base, contents)
-    if header is None:
-        try:
-            base.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        make_own_folder(base.parent)
+        header = _sound_header(base, contents)
+        if header is None:
             with FileLock(base.with_suffix(".lock")):
                 # Another process may have made it meanwhile.
                 header = _sound_header(base, contents) or _make(base, make)
-        except OSError as error:
-            raise InputError(
-                f"The pixels of the photographs cannot be kept in {base.parent}: {error.strerror or error}. Make room "
-                "or name another folder with NERF_LIGHTNING_CACHE or scene.cache_dir."
-            ) from error
+    except OSError as error:
+        raise InputError(
+            f"The pixels of the photographs cannot be kept in {base.parent}: {error.strerror or error}. Make room "
+            "or name another folder with NERF_LIGHTNING_CACHE or scene.cache_dir."
+        ) from error
     return _mapped(base.with_suffix(".pixels"), header)
 
 
@@ -124,6 +126,7 @@ def _make(base: Path, make: Callable[[Path], Header]) -> Header:
         note.unlink(missing_ok=True)
         header = make(part)
         header = Header(**(asdict(header) | {"spots": _spots(part)}))
+        note.touch(mode=0o600)
         note.write_text(json.dumps(asdict(header)), encoding="utf-8")
         base.with_suffix(".json").unlink(missing_ok=True)
         os.replace(part, base.with_suffix(".pixels"))
@@ -139,15 +142,14 @@ def _sound_header(base: Path, contents: str | None) -> Header | None:
     """Return the header of a store that is whole and up to date, else None."""
     path = base.with_suffix(".pixels")
     try:
-        if not base.with_suffix(".json").exists():
-            return None
-        header = Header(**read_json(base.with_suffix(".json")))
+        with open_own(base.with_suffix(".json"), MOST_HEADER_BYTES) as file:
+            header = Header(**json.load(file))
         _require_numbers(header)
         sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, KeyError, InputError) as error:
-        log.warning("%s.json is damaged (%s); the photographs are read anew.", base, error)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, InputError) as error:
+        log.warning("%s is not used (%s); the photographs are read anew.", base, error)
         return None
     if not sound:
         log.warning("%s is damaged; the photographs are read anew.", path)
@@ -171,7 +173,7 @@ def _spots(path: Path) -> int:
     """Return the checksum of evenly spread spots of a file, its first and last bytes among them."""
     checksum = 0
     last = max(0, path.stat().st_size - SPOT_BYTES)
-    with path.open("rb") as file:
+    with open_own(path, None) as file:
         for number in range(SPOTS):
             file.seek(last * number // (SPOTS - 1))
             checksum = zlib.crc32(file.read(SPOT_BYTES), checksum)
@@ -198,7 +200,7 @@ def _mapped(path: Path, header: Header) -> MappedPixelStore:
 
 
 def _mapped_bytes(path: Path) -> UInt8[Tensor, "bytes"]:
-    with path.open("rb") as file:
+    with open_own(path, None) as file:
         if sys.platform == "linux":
             # A private mapping counts as memory that might be written, all of it, and a file larger than the machine's
             # memory would be refused. Nobody writes, so none is reserved. Python knows the flag's number from 3.13 on.

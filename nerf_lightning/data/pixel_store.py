@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import torch
 from jaxtyping import Int
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from nerf_lightning.cores import num_cores
 from nerf_lightning.data.images import area_downscale, read_rgba
 from nerf_lightning.data.progress import progress_bar
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.free_memory import free_memory
 from nerf_lightning.types.scene import PixelStore
 
@@ -58,7 +60,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     threads = min(MAX_THREADS, num_cores())
     with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
-        return list(bar.track(pool.map(work, range(count)), total=count, description=label))
+        return list(bar.track(pool.map(work, range(count)), total=count, description=escape(for_terminal(label))))
 
 
 def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:

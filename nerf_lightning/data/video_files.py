@@ -6,6 +6,7 @@ ffmpeg also reads playlists and scripts, whatever their ending, and opens the fi
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import explained, open_regular
 
 STARTS = {
     "Matroska, WebM": b"\x1a\x45\xdf\xa3",
@@ -30,7 +31,8 @@ def require_video(path: Path) -> None:
     Raises:
         InputError: with what is read.
     """
-    with path.open("rb") as file:
+    # However large: a few frames of it are in memory at a time.
+    with explained(path), open_regular(path, None) as file:
         start = file.read(600)
     known = start.startswith(tuple(STARTS.values())) or start[4:8] in BOXES
     riff = start[:4] == b"RIFF" and start[8:12] == b"AVI "

@@ -30,6 +30,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         with _held(part):
             yield part
             os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)  # a full disk is not said of any file
+        raise
     finally:
         part.unlink(missing_ok=True)
 

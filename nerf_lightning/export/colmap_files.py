@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
+from nerf_lightning.escaping import for_colmap
 from nerf_lightning.geometry.poses import quaternion_from_rotation
 from nerf_lightning.types.scene import Cameras
 
@@ -28,7 +29,10 @@ def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of features (none)"]
     for view, name in enumerate(names):
         camera = numbers.setdefault(_camera(cameras, view), len(numbers) + 1)
-        images += [f"{view + 1} {_pose(cameras, view)} {camera} {name}", ""]
+        images += [
+            f"{view + 1} {_pose(cameras, view)} {camera} {for_colmap(name)}",
+            "",
+        ]  # two lines each, whatever it is called
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {text}" for text, number in numbers.items())]
     return {
         "cameras.txt": "\n".join(lines) + "\n",

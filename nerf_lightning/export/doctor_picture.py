@@ -33,7 +33,10 @@ def doctor_picture(
     num_views, points = len(scene.view_names), len(content)
     what = "sparse points" if len(scene.points) else "matched details"
     figure.suptitle(
-        f"{scene.name}: {num_views} views, {points} {what}, space {scene.space}", fontsize=14, weight="bold"
+        f"{scene.name}: {num_views} views, {points} {what}, space {scene.space}",
+        fontsize=14,
+        weight="bold",
+        parse_math=False,
     )
     return picture_of(figure)
 
@@ -56,6 +59,6 @@ def _write_verdicts(axes: "Axes", checks: Sequence[Check]) -> None:
         axes.text(0.0, y, check.verdict, color=VERDICTS[check.verdict], fontsize=8.5, weight="bold", va="center")
         axes.text(0.08, y, check.name, fontsize=8.5, va="center")
         text = check.message if len(check.message) <= 80 else check.message[:78].rstrip() + " ..."
-        axes.text(0.34, y, text, fontsize=7.5, color="0.35", va="center")
+        axes.text(0.34, y, text, fontsize=7.5, color="0.35", va="center", parse_math=False)
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1)

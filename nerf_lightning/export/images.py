@@ -14,6 +14,7 @@ from nerf_lightning.checkpoints import SceneRecord
 from nerf_lightning.data.images import ENDINGS
 from nerf_lightning.data.progress import StageProgress
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_file_name
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.json_file import write_json
@@ -98,7 +99,7 @@ class ImagesExport(Export):
 
 def _plain(name: str) -> str:
     # A name comes from a file: no folders in it, and no ending of a photograph.
-    plain = name.replace("/", "_").replace("\\", "_")
+    plain = for_file_name(name)
     return plain[: -len(Path(plain).suffix)] if Path(plain).suffix.lower() in ENDINGS else plain
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.atomic import whole_file
 
 ERROR_SCALE = 0.25
@@ -141,7 +142,7 @@ def letter_size(height: int) -> int:
 
 def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int) -> UInt8[Tensor, "taller wider 3"]:
     """Return the picture under a line of text, in letters of `size` pixels."""
-    font = ImageFont.load_default(size)
+    font, text = ImageFont.load_default(size), for_terminal(text)
     height, width, _ = picture.shape
     top = round(1.5 * size)
     page = Image.new("RGB", (max(width, _length(font, text)), top + height), (_PAPER,) * 3)

@@ -6,6 +6,7 @@ so that the two cannot drift apart; the tests draw their malformed files from it
 
 import math
 import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -73,7 +74,8 @@ class Number(Description):
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""
-        if type(value) not in (int, float) or not math.isfinite(value) or not self.low <= value <= self.high:  # type: ignore[arg-type, operator]
+        sound = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+        if not sound or not self.low <= value <= self.high:  # type: ignore[operator]
             raise Unfit(place, f"is {shown(value)}, not a finite number from {self.low:g} to {self.high:g}")
 
 
@@ -168,9 +170,9 @@ class Record(Description):
 
 @dataclass(frozen=True)
 class Named(Description):
-    """A dictionary from names to likes."""
+    """A dictionary from names, or numbers, to likes."""
 
-    name: Text
+    name: Text | Whole
     each: Description
     most: int
 
@@ -222,10 +224,14 @@ class Numbers(Description):
 
 @dataclass(frozen=True)
 class Plain(Description):
-    """Anything made of numbers, words, lists and dictionaries that is not deeper than `depth`, nor more than `most`."""
+    """Anything made of numbers, words, lists and dictionaries that is not deeper than `depth`, nor more than `most`.
+
+    There may be tensors in it where that is said.
+    """
 
     depth: int = 8
     most: int = 1 << 20
+    tensors: bool = False
 
     def require(self, value: object, place: str, sizes: dict[str, int]) -> None:
         """See `Description`."""
@@ -238,7 +244,7 @@ class Plain(Description):
                     below += [*node.keys(), *node.values()]
                 elif isinstance(node, (list, tuple)):
                     below += node
-                elif not isinstance(node, (bool, int, float, str, type(None), Tensor)):
+                elif not (node is None or isinstance(node, (bool, int, float, str, *([Tensor] * self.tensors)))):
                     raise Unfit(place, f"holds a {type(node).__name__}")
             level = below
             if found + len(level) > self.most:

@@ -8,9 +8,13 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 
 import torch
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.own import make_own_folder
 
 log = logging.getLogger(__name__)
 
@@ -47,23 +51,22 @@ def _imported(module: str) -> ModuleType:
     except RuntimeError as error:
         if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
             raise
-    _cache_elsewhere()
+    _cache_elsewhere(
+        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
+        "that is set). Set NUMBA_CACHE_DIR to a folder that can be written."
+    )
     return importlib.import_module(name)
 
 
 @functools.cache
-def _cache_elsewhere() -> None:
+def _cache_elsewhere(reason: str) -> None:
     """Let numba keep what it compiles in a folder that lasts as long as this process."""
     import numba
 
     folder = tempfile.TemporaryDirectory(prefix="nerf-numba-")
     _kept.append(folder)
     numba.config.CACHE_DIR = folder.name  # type: ignore[attr-defined]
-    log.warning(
-        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
-        "that is set), so every start compiles the kernels anew, which takes about a minute. Set NUMBA_CACHE_DIR to a "
-        "folder that can be written."
-    )
+    log.warning("Until then every start compiles the kernels anew, which takes about a minute: %s", reason)
 
 
 _kept: list[tempfile.TemporaryDirectory[str]] = []
@@ -125,6 +128,18 @@ def _configure_numba() -> None:
     # The layer that every platform has, and whose threads sleep while torch works.
     if "NUMBA_THREADING_LAYER" not in os.environ:
         numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
+    _require_own_cache(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+
+
+def _require_own_cache(folder: str) -> None:
+    """Let numba read nothing of a folder that others can write to: what it keeps there are programs, and pickles."""
+    if folder:
+        try:
+            make_own_folder(Path(folder), "NUMBA_CACHE_DIR")
+        except InputError as error:
+            _cache_elsewhere(str(error))
+        except OSError:
+            pass  # numba itself notices
 
 
 @functools.cache

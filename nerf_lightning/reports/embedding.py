@@ -11,6 +11,7 @@ from PIL import Image
 
 from nerf_lightning.data.images import read_rgba
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.regular import read_bytes
 
 LONGEST_SIDE = 1600
 LOSSLESS_PIXELS = 1 << 18
@@ -59,15 +60,7 @@ def embedded_video(path: Path, most_bytes: int) -> str:
     Raises:
         InputError: it is larger, no mp4, or cannot be read.
     """
-    try:
-        size = path.stat().st_size
-        if size > most_bytes:
-            raise InputError(
-                f"{path.name} has {size / 1e6:.1f} MB, more than the {most_bytes / 1e6:.1f} MB of max_megabytes"
-            )
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+    content = read_bytes(path, most_bytes, "Larger films need a larger max_megabytes.")
     if content[4:8] != b"ftyp":
         raise InputError(f"{path.name} is not an mp4")
     return data_address("video/mp4", content)

@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from nerf_lightning.data.doctor.check import Check
+from nerf_lightning.escaping import for_html
 from nerf_lightning.reports.embedding import Embedded
 
 FOLDER = Path(__file__).parent
@@ -65,10 +66,16 @@ def page(report: Report) -> str:
         f"default-src 'none'; img-src data:; media-src data:; script-src '{_digest(script)}'; "
         f"style-src '{_digest(style)}'; base-uri 'none'; form-action 'none'"
     )
-    environment = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined, finalize=_escaped
+    )
     template = environment.get_template("page.html")
     # Ours alone are put in as they are.
     return template.render(report=report, policy=policy, script=Markup(script), style=Markup(style))
+
+
+def _escaped(value: object) -> object:
+    return Markup(for_html(value)) if type(value) is str else value
 
 
 def _text(name: str) -> str:

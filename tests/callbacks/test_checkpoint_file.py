@@ -99,6 +99,6 @@ def test_what_a_killed_process_left_is_swept(tmp_path):
 
 
 def test_a_run_folder_that_is_gone_does_not_come_back(tmp_path):
-    with pytest.raises(InputError, match="could not be saved: .*No such file"):
+    with pytest.raises(InputError, match=r"could not be saved: .*No such file"):
         write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert not (tmp_path / "run").exists()

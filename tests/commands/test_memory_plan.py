@@ -1,6 +1,7 @@
 """The memory plan against the memory that a run really takes, measured in a process of its own."""
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerf_lightning.commands import memory_plan
 from nerf_lightning.commands.memory_plan import MemoryPlan, Row
 from nerf_lightning.commands.peak_bytes import peak_bytes
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.system import RadianceFieldSystem
 
 CPU = torch.device("cpu")
 
@@ -165,3 +170,14 @@ def test_a_shortage_is_said_with_its_cure():
     assert plan(2 * 10**9, 7 * 10**9).warning is None
     assert "lower trainer.tile_points" in str(plan(4 * 10**9, 7 * 10**9).warning)
     assert "7.0 GB are free" in str(plan(4 * 10**9, 7 * 10**9).warning)
+
+
+def test_a_plan_is_logged_row_by_row(monkeypatch, caplog):
+    """What is logged is escaped, ends of lines too."""
+    plan = MemoryPlan([Row("pixels", 10, "memory")], [Row("a step", 20, "memory")], free=1000)
+    monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
+    parts = (kind.__new__(kind) for kind in (TrainerSettings, RadianceFieldSystem, RayDataModule))
+    with caplog.at_level(logging.INFO):
+        memory_plan.announce_memory(*parts)
+    assert caplog.messages == str(plan).splitlines()
+    assert len(caplog.messages) == 4

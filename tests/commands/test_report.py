@@ -199,7 +199,7 @@ def test_what_is_too_large_or_no_film_or_no_log_is_left_out(nerf, tmp_path):
     (run / "images" / "validation" / "step_0000001.png").write_bytes(b"no picture")
     result = nerf("report", run, "max_megabytes=1", "doctor=false")
     assert result.code == 0, result.err
-    assert "video.mp4 has 1.2 MB, more than the 1.0 MB of max_megabytes" in result.out
+    assert "video.mp4 has 1,200,000 bytes, and more than 1,000,000 are not read here" in result.out
     assert "depth.mp4 is not an mp4" in result.out
     assert "left out     A picture of the validation" in result.out
     assert "video" not in sections((run / "report.html").read_text())

@@ -286,7 +286,7 @@ def test_a_full_disk_is_found_before_anything_is_decoded(capture, cache, monkeyp
 
 
 def test_a_disk_that_fills_up_meanwhile_is_one_paragraph(capture, cache, monkeypatch):
-    def full(*arguments):
+    def full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.Path, "touch", full)

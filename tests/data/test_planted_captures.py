@@ -261,6 +261,10 @@ def bombs(tmp_path):
     with (root / MODEL / "points3D.bin").open("r+b") as file:
         file.truncate(50_000_000_000)
     yield "colmap", root, "goes on for"
+    root = WRITERS["text"](tmp_path / "line")
+    with (root / MODEL / "images.txt").open("r+b") as file:
+        file.truncate(20_000_000_000)
+    yield "colmap", root, "has more than 16,777,216 characters"
     root = WRITERS["text"](tmp_path / "lines")
     (root / MODEL / "points3D.txt").write_bytes(b"\n" * 4 * MEGABYTE + b"1 x\n")
     yield "colmap", root, "should hold 3 numbers"
@@ -271,7 +275,7 @@ def bombs(tmp_path):
     root = WRITERS["transforms"](tmp_path / "long")
     with (root / "transforms.json").open("r+b") as file:
         file.truncate(20_000_000_000)
-    yield "transforms", root, "bytes of json|of json are not read"
+    yield "transforms", root, "more than 67,108,864 are not read here"
 
 
 READ = """

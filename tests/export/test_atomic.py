@@ -1,5 +1,7 @@
 """Files that are whole or not there, and what processes that were killed leave of them."""
 
+import errno
+
 import pytest
 from running import start_code
 
@@ -47,9 +49,14 @@ def test_what_a_person_has_beside_it_stays(tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {*kept, ".a.12.part", "a.txt"}
 
 
-def test_a_failed_block_leaves_what_was_there(tmp_path):
+def test_a_failed_block_leaves_what_was_there_and_a_full_disk_is_said_of_its_file(tmp_path):
     (tmp_path / "a.txt").write_text("former")
-    with pytest.raises(ValueError, match="not today"), whole_file(tmp_path / "a.txt") as part:
-        part.write_text("half")
-        raise ValueError("not today")
+    with pytest.raises(OSError, match=r"No space left on device: .*/a.txt"):
+        write_half(tmp_path / "a.txt")
     assert [file.read_text() for file in tmp_path.iterdir()] == ["former"]
+
+
+def write_half(path):
+    with whole_file(path) as part:
+        part.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")

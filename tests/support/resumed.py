@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
 from running import FAST, start
+from support.altered import Altered
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.commands.training import _build_parts
@@ -32,6 +34,9 @@ def trained(folder: Path, capture: Path, *model: str) -> None:
 class Resumed:
     """A run of 25 steps that is to go on from checkpoints of `trained`."""
 
+    def __repr__(self) -> str:
+        return str(self.file)
+
     def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
@@ -40,14 +45,23 @@ class Resumed:
         parts = _build_parts(composed("train", *settings))
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
-        self.scene, self.file = parts.scene, folder / "last.ckpt"
+        self.file = folder / "last.ckpt"
         self.sound: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
 
+    @cached_property
+    def whole(self) -> Altered:
+        """The sound checkpoint, to be altered."""
+        return Altered("nothing", self.sound)
+
     def take(self, change: Callable[[dict[str, Any]], object]) -> None:
-        """Take the sound checkpoint, changed; then update the weights once, as compiled optimizers do: unseen."""
+        """Take the sound checkpoint, changed, and update the weights once: compiled optimizers look at no shapes."""
         content = copy.deepcopy(self.sound)
         change(content)
         torch.save(content, self.file)
+        self.take_file()
+
+    def take_file(self) -> None:
+        """Take what lies in the file."""
         threads = torch.get_num_threads()
         try:
             content = AtomicCheckpointIO().load_checkpoint(self.file)

@@ -16,6 +16,8 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from nerf_lightning.data.numpy_files import archive_headers, read_member
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.own import make_own_folder, open_own
 
 logger = logging.getLogger(__name__)
 
@@ -47,10 +49,10 @@ def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
         make: renders the scene.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_own_folder(path.parent)
         lock = FileLock(path.with_suffix(".lock"))
         lock.acquire()
-    except OSError as error:
+    except (OSError, InputError) as error:
         logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered anew.", path.parent, error)
         return make()
     try:
@@ -69,14 +71,14 @@ def _load(path: Path, pixels: int) -> Rendered | None:
         "normals": ((pixels, 3), "float32"),
     }
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_own(path, None) as file, zipfile.ZipFile(file) as archive:
             headers = archive_headers(archive, list(sound))
             for name, (shape, dtype) in sound.items():
                 if headers[name].shape != shape or headers[name].dtype != dtype:
                     raise ValueError(f"{name} is {headers[name].shape} of {headers[name].dtype}")
             return Rendered(**{name: read_member(archive, name) for name in sound})
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile) as error:
-        logger.warning("The cached bricks scene %s is damaged (%s); it is rendered anew.", path, error)
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile, InputError) as error:
+        logger.warning("The cached bricks scene %s is damaged (%s): it is rendered anew.", path, error)
         return None
 
 

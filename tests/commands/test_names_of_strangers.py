@@ -1,0 +1,195 @@
+"""Names from files: refused where they cannot be names, and shown as text wherever they are shown."""
+
+import csv
+import json
+import logging
+import logging.config
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from captures import write_blender
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.initialize import initialize_config_dir
+from known_fields import ball, solid
+from measured_runs import leave_measured_run
+from omegaconf import OmegaConf
+from PIL import Image
+from posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
+from scenes import ball_scene
+
+from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.commands.console import say
+from nerf_lightning.commands.evaluating import metric_lines
+from nerf_lightning.commands.kept_views import picture_name
+from nerf_lightning.commands.metrics_files import METRICS, summary, write_metrics
+from nerf_lightning.commands.protocol import split_hash
+from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.data.blender import BlenderReader
+from nerf_lightning.data.doctor.check import Check
+from nerf_lightning.data.photograph_folder import find_photographs
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.cameras import CamerasExport
+from nerf_lightning.export.colmap_files import colmap_files
+from nerf_lightning.export.doctor_picture import _write_verdicts
+from nerf_lightning.export.figures import new_figure, picture_of
+from nerf_lightning.export.images import ImagesExport
+from nerf_lightning.export.pictures import with_caption
+from nerf_lightning.reports.page import Report, page
+
+NOT_UTF8 = os.fsdecode(b"p_\xff.png")
+BAD = ["p_\n.png", "p_\x1b[2J.png", "p_\x9b2J.png", NOT_UTF8]
+FORMATS = {"llff": write_llff, "transforms": write_transforms, "colmap": write_colmap}
+
+
+def refused_names(kind):
+    # In files of text, names are UTF-8 already.
+    return [name for name in BAD if kind != "colmap" or name != NOT_UTF8]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in FORMATS for name in refused_names(kind)])
+def test_a_view_of_such_a_name_is_refused(tmp_path, kind, name):
+    known = Known(c2w=ring())
+    known = Known(c2w=ring(), names=(name, *known.names[1:]))
+    with pytest.raises(InputError, match=r"has the name '.*p_\\.*', which holds control characters or is not UTF-8"):
+        read(kind, FORMATS[kind](tmp_path / "capture", known))
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_photograph_without_a_pose_has_a_name_too(tmp_path, name):
+    root = write_colmap(tmp_path / "capture", Known())
+    (root / "images" / "p_0.png").rename(root / "images" / name)
+    Image.new("RGB", (16, 12)).save(root / "images" / "p_0.png")
+    with pytest.raises(InputError, match=r"has the name 'p_\\.*', which holds control characters"):
+        read("colmap", root)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_frame_of_the_blender_format_is_refused(tmp_path, name):
+    root = write_blender(tmp_path / "capture", {"train": 3, "val": 1, "test": 1})
+    (root / "train" / "r_1.png").rename(root / "train" / name)
+    path = root / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["file_path"] = f"train/{name}"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"frames\[1\] has the name 'train/p_\\.*', which holds control characters"):
+        BlenderReader(str(root)).read()
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_photograph_to_find_the_pose_of_is_refused(tmp_path, name):
+    for photograph in ("a.png", "b.png", name):
+        Image.new("RGB", (80, 80)).save(tmp_path / photograph)
+    with pytest.raises(InputError, match=r"has the name 'p_\\.*', which holds control characters"):
+        find_photographs(tmp_path)
+
+
+def test_names_of_all_languages_are_read_and_exported(tmp_path):
+    names = ("ü b.png", "\u0645\u06cc\u200c.png", "at 9.41\u202fAM.png", *Known(c2w=ring()).names[3:])
+    scene = read("transforms", write_transforms(tmp_path / "capture", Known(c2w=ring(), names=names)))
+    assert scene.view_names[:3] == tuple(f"images/{name}" for name in names[:3])
+    CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 4096)
+    text = (tmp_path / "out" / "sparse" / "0" / "images.txt").read_text(encoding="utf-8")
+    assert all(f" images/{name}\n" in text for name in names)
+
+
+def test_the_hash_of_a_split_takes_any_name():
+    scene = ball_scene()
+    hashes = {
+        split_hash(replace(scene, view_names=(name, *scene.view_names[1:])), [0]) for name in ("a", "\ud800", NOT_UTF8)
+    }
+    assert len(hashes) == 3
+
+
+PLANTED = "a.png\n7 1 0 0 0 0 0 0 1 planted.png\n"
+
+
+def test_a_name_adds_no_line_to_a_colmap_model():
+    scene = ball_scene()
+    names = (PLANTED, "a\rb", "c\u2028d", *scene.view_names[3:])
+    lines = colmap_files(scene.cameras, names)["images.txt"].splitlines()
+    assert len(lines) == 1 + 2 * len(names)
+    assert lines[1].endswith(r" 1 a.png\n7 1 0 0 0 0 0 0 1 planted.png\n")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", NOT_UTF8, PLANTED, "x" * 300, "ü" * 200, 'a:b*c?"<>|'])
+def test_pictures_have_names_that_file_systems_take(tmp_path, name):
+    scene = scene_record(ball_scene(num_views=4, size=9))
+    scene = replace(scene, view_names=(name, *scene.view_names[1:]))
+    ImagesExport(split="all", max_views=1).export(solid(ball()), scene, tmp_path, 1 << 15)
+    (written,) = (tmp_path / "depth").glob("*.png")
+    assert written.name.startswith("0000_")
+    assert not set(written.name) & set('\n\0:*?"<>|')
+    assert len(json.loads((tmp_path / "images.json").read_text())["views"]) == 1
+    (tmp_path / picture_name("test", name)).touch()
+
+
+def rows(*names):
+    return [dict.fromkeys(METRICS) | {"name": name, "psnr": 20.0, "seconds": 1.0} for name in names]
+
+
+def test_what_is_printed_of_a_run_steers_no_terminal(capsys, tmp_path):
+    metrics = summary(rows("\x1b[2J\nnerf: all is well\u202e")) | {"protocol": {"split": "test", "background": "white"}}
+    lines = metric_lines(metrics, tmp_path)
+    say(*lines)
+    printed = capsys.readouterr().out
+    assert len(printed.splitlines()) == len(lines)
+    assert r"(\x1b[2J\nnerf: all is well\u202e)" in printed
+
+
+@pytest.mark.parametrize("part", ["job_logging", "hydra_logging"])
+def test_what_is_logged_steers_no_terminal(part, capsys):
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        settings = OmegaConf.to_container(compose("train", return_hydra_config=True).hydra[part])
+    root = logging.getLogger()
+    former = root.handlers[:], root.level
+    try:
+        logging.config.dictConfig(settings | {"disable_existing_loggers": False})
+        logging.getLogger("nerf_lightning").warning("%s has no pose", "\x1b[2J\nnerf: all is well")
+    finally:
+        root.handlers[:], root.level = former
+    assert capsys.readouterr().err.rstrip().endswith(r"\x1b[2J\nnerf: all is well has no pose")
+
+
+def test_a_table_of_pictures_has_no_formulas(tmp_path):
+    names = ("=cmd()", "@a", "-x.png", "ü.png", "\ud800")
+    write_metrics(tmp_path, summary(rows(*names)))
+    with (tmp_path / "metrics.csv").open(encoding="utf-8") as file:
+        written = list(csv.DictReader(file))
+    assert [row["name"] for row in written] == ["'=cmd()", "'@a", "'-x.png", "ü.png", r"\ud800"]
+    assert written[0]["psnr"] == "20.0"
+
+
+def test_a_table_of_runs_has_no_markup_and_no_formulas(table, tmp_path):
+    names = ("[a](http://b)", "![a](http://b)", "`a` *b*", "-1+1", "\x1b[2J\u202e")
+    for number, name in enumerate(names):
+        leave_measured_run(tmp_path / "runs" / str(number), origin={"model": name, "config": name})
+    result, written = table("published=false", "sort=model")
+    assert result.code == 0, result.err
+    assert "\u202e" not in result.out
+    assert r"\x1b[2J\u202e" in result.out
+    assert {"'-1+1", r"\x1b[2J\u202e"} <= {row["model"] for row in written}
+    text = (tmp_path / "out" / "table.md").read_text()
+    for shown in (r" \[a\](http:&#47;/b) ", r"!\[a\](http:&#47;/b)", r"\`a\` \*b\*", r"\\x1b\[2J\\u202e"):
+        assert shown in text, shown
+
+
+def test_a_page_shows_names_as_text():
+    text = page(Report("\x1b[2J\u202e\x00<b>", overrides="a=1\nb='<'", config="x: y\n"))
+    assert r"<h1>\x1b[2J\u202e\x00&lt;b&gt;</h1>" in text
+    assert "a=1\nb=&#x27;&lt;&#x27;" in text
+
+
+def test_drawings_show_names_as_text():
+    figure = new_figure(300, 200)
+    _write_verdicts(figure.subplots(), [Check("blur", "look", r"$\nothing$ is blurred", "Remove it.")])
+    assert picture_of(figure).shape == (200, 300, 3)
+    assert with_caption(torch.zeros(4, 4, 3, dtype=torch.uint8), "a\ud800\nb", 10).shape[1] > 20
+    np.testing.assert_array_equal(
+        with_caption(torch.zeros(4, 4, 3, dtype=torch.uint8), "a\nb", 10),
+        with_caption(torch.zeros(4, 4, 3, dtype=torch.uint8), r"a\nb", 10),
+    )
