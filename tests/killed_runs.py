@@ -5,8 +5,8 @@
 PLANS is a json list; each start of the program takes the next: `{"after": SECONDS}`, or `{"in": FUNCTION, "call": N}`
 for the N-th call of one of the functions that saving goes through, before, amid or after it, or `{"full": N}` for a
 disk that is full at the N-th save. `{"phase": "MODULE:FUNCTION", "after": SECONDS}` kills so long after a function is
-entered; without `after` it runs to the end, and FOLDER.seconds says how long that took. `null` lets it run to the end.
-Prints a json list with what became of each start.
+entered; without `after` it runs to the end, and FOLDER.seconds says how long that took. `{"largest": BYTES}` lets no
+file grow beyond that. `null` lets it run to the end. Prints a json list with what became of each start.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ import importlib
 import io
 import json
 import os
+import resource
 import signal
 import sys
 import threading
@@ -111,6 +112,8 @@ def child(plan: dict | None, arguments: list[str], log: Path) -> None:
         arm(plan["in"], plan["call"], f"{folder}/checkpoints")
     if plan is not None and "full" in plan:
         fill_disk(plan["full"])
+    if plan is not None and "largest" in plan:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (plan["largest"], plan["largest"]))
     entered: list[float] = []
     if plan is not None and "phase" in plan and "after" in plan:
         at_phase(plan["phase"], lambda: die_after(plan["after"]))

@@ -8,23 +8,21 @@ import hashlib
 import json
 import os
 import random
-import re
 import shutil
 import signal
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
-import numpy as np
 import pytest
+import torch
 from captures import picture, pose
 from PIL import Image
 from running import FAST, said, start, start_code
 
-from commands.conftest import Result
-
 QUIET = (
-    "trainer.num_threads=1", "final.evaluate=false", "final.video=false", "callbacks.validation_pictures.every_steps=1000",
-    "callbacks.ray_histograms.every_steps=1000", "logger=none",
+    "trainer.num_threads=1", "final.evaluate=false", "final.video=false", "logger=none",
+    "callbacks.validation_pictures.every_steps=1000", "callbacks.ray_histograms.every_steps=1000",
 )  # fmt: skip
 
 
@@ -81,8 +79,14 @@ PHASES = {
         ("train", "scene=npz", "scene.path={capture}", *FAST, "trainer.num_threads=1", "logger=none", "resume=auto"),
     ),
 }  # fmt: skip
-# Each a kind of its own; the others share their ways of writing.
-QUICK = ("evaluating", "filming", "exporting images", "decoding")
+# Each a kind of its own; the others share their ways of writing. Where a kill hits it amid a file, and a size (bytes)
+# that its files exceed.
+QUICK = {
+    "evaluating": ("PIL.Image:Image.save", 2500),
+    "filming": ("nerf_lightning.export.video:_chain", 1000),
+    "exporting images": ("nerf_lightning.export.images:write_json", 1000),
+    "decoding": ("nerf_lightning.data.pixel_file:_spots", 2500),
+}
 
 
 @pytest.fixture(scope="module")
@@ -128,16 +132,39 @@ def _read(file):
     return None if with_times else hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def assert_the_same_end(phase, kills, places, folder):
-    """Kill a command at random moments of a phase, once for each try, and start it again; return how many were hit."""
-    codes, told = run_as_planned(phase, [{"phase": phase.function}], places, folder / "never")
+def never_killed(phase, places, out):
+    """Return what a command writes that nothing befalls, and the seconds from the beginning of the phase to the end."""
+    codes, told = run_as_planned(phase, [{"phase": phase.function}], places, out)
     assert codes == [0], told
-    wanted, longest = content(phase, folder / "never"), float((folder / "never.seconds").read_text())
-    if "decoding" in phase.arguments or phase.results != "*":
-        longest /= 10  # what follows the phase takes longer
-    killed = 0
-    for number in range(kills):
-        out, after = folder / f"killed_{number}", random.uniform(0, longest)
+    return content(phase, out), float(out.with_name(f"{out.name}.seconds").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", QUICK)
+def test_a_command_that_is_killed_or_cannot_write_ends_the_same_when_it_is_given_again(name, places, tmp_path):
+    phase, out, (amid, largest) = PHASES[name], tmp_path / "out", QUICK[name]
+    wanted, seconds = never_killed(phase, places, tmp_path / "never")
+    kills = [{"phase": amid, "after": 0}, {"phase": phase.function, "after": random.uniform(0, seconds)}]
+    codes, told = run_as_planned(phase, [{"largest": largest}, *kills, None], places, out)
+    assert codes[:2] == [2, -signal.SIGALRM], told
+    assert codes[2] in (0, -signal.SIGALRM), told
+    assert codes[3] == 0, told
+    assert "Traceback" not in told
+    (paragraph,) = [line for line in told.splitlines() if line.startswith("nerf: ")]
+    assert str(out) in paragraph
+    assert "File too large" in paragraph or "ffmpeg failed" in paragraph
+    assert content(phase, out) == wanted, told
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", PHASES)
+def test_a_command_that_is_killed_at_50_moments_ends_the_same(name, places, tmp_path):
+    phase, killed = PHASES[name], 0
+    wanted, seconds = never_killed(phase, places, tmp_path / "never")
+    for number in range(500):
+        # Training follows, where the phase is an early one: more of the moments lie at the beginning.
+        out, after = tmp_path / f"killed_{number}", seconds * random.random() ** 3
         codes, told = run_as_planned(phase, [{"phase": phase.function, "after": after}, None], places, out)
         story = f"{after:.6f} s into the phase\n{told}"
         assert codes[0] in (0, -signal.SIGALRM), story
@@ -145,19 +172,141 @@ def assert_the_same_end(phase, kills, places, folder):
         assert "Traceback" not in told, story
         assert content(phase, out) == wanted, story
         killed += codes[0] != 0
-    return killed
+        if killed == 50:
+            return
+    pytest.fail(f"only {killed} of 500 planned kills came before the end")
+
+
+def train(capture, folder, steps, *more):
+    return start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.num_threads=1", "final.evaluate=false",
+        "final.video=false", "callbacks.validation_pictures.every_steps=7", "resume=auto",
+        f"trainer.max_steps={steps}", f"paths.output_dir={folder}", *more,
+    )  # fmt: skip
+
+
+def ended(process):
+    output, _ = process.communicate(timeout=300)
+    assert "Traceback" not in output, output
+    return process.returncode, output
+
+
+def once_saved(process, folder):
+    """Wait until a run has saved, and a random while more."""
+    while process.poll() is None and not (folder / "checkpoints" / "last.ckpt").exists():
+        time.sleep(0.01)
+    time.sleep(random.uniform(0, 0.2))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
-def test_a_command_that_is_killed_ends_the_same_when_it_is_given_again(name, places, tmp_path):
-    assert_the_same_end(PHASES[name], 1, places, tmp_path)
+@pytest.mark.parametrize("logger", ["tensorboard", "none"])
+def test_a_run_whose_folder_is_renamed_stops_and_goes_on_there(logger, capture, tmp_path):
+    process = train(capture, tmp_path / "run", 2000, f"logger={logger}")
+    once_saved(process, tmp_path / "run")
+    os.rename(tmp_path / "run", tmp_path / "moved")
+    code, output = ended(process)
+    assert code == 2, output
+    (paragraph,) = [line for line in output.splitlines() if line.startswith("nerf: ")]
+    assert f"{tmp_path / 'run'} was deleted, moved or renamed while the run was going on" in paragraph
+    assert not (tmp_path / "run" / "run.json").exists()
+    saved = torch.load(tmp_path / "moved" / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]
+    code, output = ended(train(capture, tmp_path / "moved", saved + 1, f"logger={logger}"))
+    assert code == 0, output
+    assert f"going on from step {saved}" in output
 
 
 @pytest.mark.slow
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("name", PHASES)
-def test_a_command_that_is_killed_at_50_moments_ends_the_same(name, places, tmp_path):
-    killed = assert_the_same_end(PHASES[name], 50, places, tmp_path)
-    print(f"{name}: {killed} kills")
-    assert killed >= 10
+@pytest.mark.parametrize("number", range(10))
+def test_a_run_whose_folder_is_deleted_stops(number, capture, tmp_path):
+    process = train(capture, tmp_path / "run", 2000)
+    once_saved(process, tmp_path / "run")
+    while (tmp_path / "run" / "run.json").exists():  # what is written meanwhile is in the way of the deletion
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+    code, output = ended(process)
+    assert code == 2, output
+    assert len([line for line in output.splitlines() if line.startswith("nerf: ")]) == 1, output
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("number", range(5))
+def test_of_processes_that_resume_one_run_at_once_one_does(number, capture, tmp_path):
+    ended(train(capture, tmp_path / "run", 5))
+    ends = [ended(each) for each in [train(capture, tmp_path / "run", 200) for _ in range(3)]]
+    assert sorted(code for code, _ in ends) == [0, 2, 2]
+    assert sum("is in use by another process that is training there" in output for _, output in ends) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+def test_a_run_that_is_stopped_for_a_while_goes_on(capture, tmp_path):
+    process = train(capture, tmp_path / "run", 10**6, "budget.seconds=3")
+    once_saved(process, tmp_path / "run")
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(10)
+    process.send_signal(signal.SIGCONT)
+    code, output = ended(process)
+    assert code == 0, output
+    used = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)["callbacks"]["TimeBudget"]
+    assert 3.0 <= used["used"] < 10.0
+
+
+BACK = """
+import sys, time
+from nerf_lightning import cli
+
+shift, real, calls = float(sys.argv.pop(1)), time.time, []
+
+def shifted():
+    calls.append(1)
+    return real() + (shift if len(calls) > 20 else 0)
+
+time.time = shifted
+cli.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("days", [-1, 400])
+def test_a_clock_that_is_set_while_a_run_goes_on_changes_nothing(days, capture, tmp_path):
+    weights = []
+    for shift in (0, 86400 * days):
+        folder = tmp_path / str(shift)
+        arguments = (
+            "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.num_threads=1", "trainer.max_steps=20",
+            "final.video=false", f"paths.output_dir={folder}",
+        )  # fmt: skip
+        code, output = ended(start_code(BACK, str(shift), *arguments))
+        assert code == 0, output
+        assert 0 < json.loads((folder / "run.json").read_text())["seconds"] < 1000
+        weights.append(torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"])
+    assert all(torch.equal(weights[1][name], value) for name, value in weights[0].items())
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+def test_runs_from_the_future_and_the_past_are_gone_on_with(capture, nerf, tmp_path):
+    settings = (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, *QUIET, f"paths.root_dir={tmp_path}", "resume=auto",
+    )  # fmt: skip
+    assert nerf(*settings, "trainer.max_steps=5").code == 0
+    (note,) = tmp_path.rglob("run.json")
+    for steps, when in ((6, 2.0**32), (7, -(2.0**30))):
+        for file in tmp_path.rglob("*"):
+            os.utime(file, (when, when))
+        result = nerf(*settings, f"trainer.max_steps={steps}")
+        assert result.code == 0, result.err
+        assert json.loads(note.read_text())["finished_at_step"] == steps
+    assert list(tmp_path.rglob("run.json")) == [note]
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="needs a place where nobody can write")
+def test_a_cache_that_cannot_be_written_is_one_paragraph(nerf, photographs, tmp_path, monkeypatch):
+    settings = ("train", "scene=transforms", f"scene.root={photographs}", *FAST, *QUIET)
+    said(
+        nerf(*settings, "scene.cache_dir=/proc/self/cache", f"paths.output_dir={tmp_path / 'run'}"),
+        "cannot be kept in /proc/self/cache", "scene.cache_dir",
+    )  # fmt: skip
+    assert not (tmp_path / "run").exists()
