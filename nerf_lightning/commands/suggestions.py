@@ -90,7 +90,7 @@ def explain(error: BaseException, command: str, conf_folder: Path) -> str:
 
 def _chain(error: BaseException | None) -> list[BaseException]:
     links: list[BaseException] = []
-    while error is not None:
+    while error is not None and error not in links:  # one that is raised again may follow from itself
         links.append(error)
         error = error.__cause__ or error.__context__
     return links

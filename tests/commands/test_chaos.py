@@ -20,6 +20,9 @@ from captures import picture, pose
 from PIL import Image
 from running import FAST, said, start, start_code
 
+from nerf_lightning.commands.suggestions import paragraph
+from nerf_lightning.errors import InputError
+
 QUIET = (
     "trainer.num_threads=1", "final.evaluate=false", "final.video=false", "logger=none",
     "callbacks.validation_pictures.every_steps=1000", "callbacks.ray_histograms.every_steps=1000",
@@ -307,3 +310,14 @@ def test_a_cache_that_cannot_be_written_is_one_paragraph(nerf, photographs, tmp_
         "cannot be kept in /proc/self/cache", "scene.cache_dir",
     )  # fmt: skip
     assert not (tmp_path / "run").exists()
+
+
+def test_errors_that_follow_each_other_in_a_circle_are_one_paragraph(tmp_path):
+    """The failure that a thread keeps is raised again and again, also while the errors that it caused are handled."""
+    first, second = OSError(28, "No space left on device", str(tmp_path)), RuntimeError("closed")
+    first.__context__, second.__context__ = second, first
+    assert paragraph(first, "train", tmp_path) == (
+        f"{tmp_path}: No space left on device. See that the place exists, can be written, and has space left."
+    )
+    second.__context__ = InputError("The run folder is gone.")
+    assert paragraph(first, "train", tmp_path) == "The run folder is gone."
