@@ -23,7 +23,7 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
     """
     part = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
         with part.open("wb") as file:
             torch.save(checkpoint, file)
             file.flush()
@@ -57,6 +57,8 @@ def _keep(last: Path, previous: Path) -> None:
 
 
 def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
+    if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
+        error = error.__context__  # torch closes what it could not write, and complains of that
     kept = f"The former checkpoint {target} is unharmed. " if target.exists() else ""
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
     cure = "Free some space" if full else f"See that there is space and that {target.parent} can be written"

@@ -1,6 +1,8 @@
 """Train the best that a given time allows: the schedule follows the measured speed, and ends with the time."""
 
+import signal
 import time
+from types import FrameType
 from typing import Any
 
 from lightning.pytorch import Trainer
@@ -14,8 +16,9 @@ from nerf_lightning.files.schema import Number, Record
 class TimeBudget(Callback):
     """Stop after so many seconds of training, and stretch the schedule to just that length.
 
-    The time that a run has used is part of its state, so a resumed run has the rest. Such a run is not repeatable to
-    the bit: how many steps fit depends on the machine.
+    The time that a run has used is part of its state, so a resumed run has the rest. While the process is stopped
+    (SIGSTOP, Ctrl-Z, a scheduler that suspends jobs) no time is used. Such a run is not repeatable to the bit: how many
+    steps fit depends on the machine.
 
     Args:
         seconds: training time in all, validation included.
@@ -30,10 +33,13 @@ class TimeBudget(Callback):
             raise InputError(f"budget.seconds={seconds}: give a positive time, or null for no budget.")
         self.seconds, self.every_steps = seconds, every_steps
         self.used, self.since = 0.0, 0.0
+        self.former: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Start the clock; a resumed run knows how fast it was."""
         self.since = time.perf_counter()
+        if hasattr(signal, "SIGCONT"):
+            self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
             self._fit_schedule(trainer, pl_module)
 
@@ -47,6 +53,12 @@ class TimeBudget(Callback):
         if self.used >= self.seconds:
             trainer.should_stop = True
 
+    def teardown(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
+        """Give the handler back."""
+        if self.former is not None:
+            signal.signal(signal.SIGCONT, self.former)
+            self.former = None
+
     def state_dict(self) -> dict[str, Any]:
         """Remember the time used, across a resume."""
         return {"used": self.used}
@@ -54,6 +66,10 @@ class TimeBudget(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the count up again."""
         self.used = state_dict["used"]
+
+    def _woken(self, number: int, frame: FrameType | None) -> None:
+        # When the stop began is not known: what was done of the step is left out with it.
+        self.since = time.perf_counter()
 
     def _fit_schedule(self, trainer: Trainer, system: Any) -> None:
         step = system.progress.step

@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
+from nerf_lightning.callbacks.folder_guard import require_run
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
@@ -69,11 +70,19 @@ class RunFolder:
         return ResumePoint(path, found.step, found.precision, found.tile_points)
 
     def trained(self) -> None:
-        """Note that training is over, and how long it took."""
+        """Note that training is over, and how long it took.
+
+        Raises:
+            InputError: the folder is gone.
+        """
         self._note(training_seconds=self._note())
 
     def finish(self, step: int, psnr: float | None = None) -> None:
-        """Note that the run is complete."""
+        """Note that the run is complete.
+
+        Raises:
+            InputError: the folder is gone.
+        """
         self._note(finished_at_step=step, psnr=psnr)
 
     def stop(self, restarted: bool) -> None:
@@ -85,6 +94,7 @@ class RunFolder:
         self.lock.release()
 
     def _note(self, **values: Any) -> float:
+        require_run(self.path)
         note = read_note(self.path)
         now = time.monotonic()
         seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)

@@ -1,6 +1,7 @@
 """Hydra's and OmegaConf's errors as one paragraph, with near matches for a mistyped key."""
 
 import difflib
+import os
 import re
 from pathlib import Path
 
@@ -33,7 +34,11 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
             "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."
         )
     if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
+        # What is closed because of bad input may fail for the same cause, and be raised in the place of it.
+        cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
+        if cause is not None:
+            return str(cause)
+        where = f"{os.fsdecode(error.filename)}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
     return None
 
@@ -85,7 +90,7 @@ def explain(error: BaseException, command: str, conf_folder: Path) -> str:
 
 def _chain(error: BaseException | None) -> list[BaseException]:
     links: list[BaseException] = []
-    while error is not None:
+    while error is not None and error not in links:  # one that is raised again may follow from itself
         links.append(error)
         error = error.__cause__ or error.__context__
     return links

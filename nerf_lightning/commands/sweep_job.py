@@ -106,7 +106,8 @@ def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecor
 
 def read_records(sweep_folder: Path) -> list[JobRecord]:
     """Return what the jobs of a sweep have left, in their order."""
-    files = records_folder(sweep_folder).glob("*.json")
+    # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
+    files = records_folder(sweep_folder).glob("[!.]*.json")
     records = [JobRecord(**json.loads(read_text(file, MOST_BYTES))) for file in files]
     return sorted(records, key=lambda record: record.number)
 

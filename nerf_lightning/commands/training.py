@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoints import Checkpoints
+from nerf_lightning.callbacks.folder_guard import FolderGuard, require_run
 from nerf_lightning.callbacks.stop_signals import StopSignals
 from nerf_lightning.callbacks.time_budget import TimeBudget
 from nerf_lightning.callbacks.writers import errors_told_once
@@ -31,6 +32,7 @@ from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import Progress
+from nerf_lightning.errors import InputError
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.scene import Scene
 
@@ -74,6 +76,10 @@ def train(config: DictConfig) -> float | None:
         for folder in held:
             folder.stop(restarted=wants_restart(stop.code))
         raise
+    except (InputError, OSError):
+        for folder in held:
+            require_run(folder.path)  # where it is gone, whatever failed has failed for that
+        raise
     finally:
         for folder in held:
             folder.release()
@@ -106,7 +112,7 @@ def _build_parts(config: DictConfig) -> Parts:
     system.initialize()
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, FolderGuard(), *build(config.callbacks).values()]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.budgets import require_within
 from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL, listed
+from nerf_lightning.data.images import downscaled_size
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import require_printable
@@ -153,8 +154,14 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
         downscale: whole factor between the two; what it leaves over was cropped at the right and the bottom.
 
     Raises:
-        InputError: a picture is not a shrunk copy of what its camera describes.
+        InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are another capture's.
     """
+    sizes = [downscaled_size(width, height, downscale) for width, height in files]
+    if sizes != list(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)):
+        raise InputError(
+            f"The pixels that were kept of {capture.source} have other sizes than its photographs: somebody else wrote "
+            "them. Remove them from scene.cache_dir (else ~/.cache/nerf_lightning), and the photographs are read anew."
+        )
     scales = []
     for view, (width, height) in zip(capture.views, files, strict=True):
         x, y = width / view.size[0], height / view.size[1]

@@ -1,22 +1,69 @@
 """Files that are either whole or not there."""
 
 import os
+import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: what killed processes leave there stays
+    fcntl = None  # type: ignore[assignment]
+
+_PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Lend a temporary path beside `path` that takes its place when the block ends well, else is removed.
 
-    A missing folder is made. The temporary name keeps the suffix, since writers choose a format by it.
+    A missing folder is made. The temporary name keeps the suffix, since writers choose a format by it. What killed
+    processes left in the folder is removed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path.parent)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
-        yield part
-        os.replace(part, path)
+        with _held(part):
+            yield part
+            os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)  # a full disk is not said of any file
+        raise
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _held(part: Path) -> Iterator[None]:
+    """Make the file, and hold it locked: its writer is alive."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
+
+
+@cache
+def _sweep(folder: Path) -> None:
+    """Remove the temporary files that nobody holds, once in a process's life."""
+    if fcntl is None:
+        return
+    for part in folder.iterdir():
+        if _PART.fullmatch(part.name) and part.is_file():
+            with suppress(OSError):  # held by another process, gone meanwhile, or another user's
+                handle = os.open(part, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    part.unlink()
+                finally:
+                    os.close(handle)

@@ -1,5 +1,6 @@
 """Depth, opacity and normals of the views, as pictures and arrays."""
 
+import io
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,8 +56,7 @@ class ImagesExport(Export):
             for number, view in enumerate(views):
                 seen = see(model, record, record.cameras, view, tile_points)
                 depth = self._depth(seen, record, view)
-                with whole_file(folder / "depth" / f"{names[view]}.npy") as part:
-                    np.save(part, depth)
+                _save_array(folder / "depth" / f"{names[view]}.npy", depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
                 _save_opacity(folder / "opacity" / f"{names[view]}.png", seen.opacity)
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
@@ -101,6 +101,14 @@ def _plain(name: str) -> str:
     # A name comes from a file: no folders in it, and no ending of a photograph.
     plain = for_file_name(name)
     return plain[: -len(Path(plain).suffix)] if Path(plain).suffix.lower() in ENDINGS else plain
+
+
+def _save_array(path: Path, array: Float[ndarray, "height width"]) -> None:
+    # Given a file, numpy writes through buffers of C's, and says nothing where the disk is too full for the last one.
+    content = io.BytesIO()
+    np.save(content, array)
+    with whole_file(path) as part:
+        part.write_bytes(content.getbuffer())
 
 
 def _save_opacity(path: Path, opacity: Float[Tensor, "height width"]) -> None:

@@ -80,6 +80,7 @@ def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
+    (tmp_path / "run").mkdir()
     with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
         write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
 
@@ -95,3 +96,9 @@ def test_what_a_killed_process_left_is_swept(tmp_path):
     (tmp_path / "last.ckpt").write_text("whole")
     sweep_leftovers(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_run_folder_that_is_gone_does_not_come_back(tmp_path):
+    with pytest.raises(InputError, match=r"could not be saved: .*No such file"):
+        write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert not (tmp_path / "run").exists()

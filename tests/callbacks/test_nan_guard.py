@@ -53,6 +53,7 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
     loss.step, loss.until, loss.limit, loss.holder = step, until, limit, (system,)
     system.initialize()
     data = RayDataModule(scene, progress, 0, max_steps, batch_rays=16, crop_steps=3, val_rays=16)
+    folder.mkdir(exist_ok=True)
     trainer = Trainer(
         default_root_dir=folder, max_steps=max_steps, max_epochs=-1, accelerator="cpu", logger=False,
         callbacks=[guard, Checkpoints(every_steps=every_steps)], plugins=[AtomicCheckpointIO()],

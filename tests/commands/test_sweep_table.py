@@ -88,3 +88,9 @@ def test_records_come_back_in_the_order_of_jobs(tmp_path):
         record(tmp_path, number, ["seed=0"], "failed", reason="no rays").write(tmp_path)
     assert [found.number for found in read_records(tmp_path)] == [9, 10]
     assert read_records(tmp_path)[0] == record(tmp_path, 9, ["seed=0"], "failed", reason="no rays")
+
+
+def test_a_record_that_is_being_written_is_none_yet(tmp_path):
+    record(tmp_path, 1, ["seed=0"]).write(tmp_path)
+    (tmp_path / ".hydra" / "jobs" / ".2.77.part.json").write_text('{"num')
+    assert [found.number for found in read_records(tmp_path)] == [1]

@@ -272,8 +272,18 @@ def test_one_of_many_readers_renders(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(calls) == 1
     assert len(scenes) == 4
     assert all(torch.equal(scene.pixels.rgba, scenes[0].pixels.rgba) for scene in scenes)
-    assert len(list(tmp_path.glob("*.npz"))) == 1
-    assert not list(tmp_path.glob("*.tmp"))
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".lock"}
+
+
+def test_what_a_killed_process_left_in_the_cache_is_replaced(tmp_path: Path) -> None:
+    small = BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(tmp_path))
+    small.read()
+    (path,) = tmp_path.glob("*.npz")
+    sound = path.read_bytes()
+    path.rename(path.with_suffix(".part"))  # killed just before the renaming
+    small.read()
+    assert path.read_bytes() == sound
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".lock"}
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", None], ids=["empty", "foreign", "cut"])

@@ -4,7 +4,6 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -87,14 +86,15 @@ def _make_and_save(path: Path, make: Callable[[], Rendered]) -> Rendered:
     rendered = make()
     try:
         # A reader must never see half a file: write beside it, then swap names.
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        part = path.with_suffix(".part")
         try:
-            with os.fdopen(handle, "wb") as stream:
+            # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
+            part.unlink(missing_ok=True)
+            with part.open("xb") as stream:
                 np.savez(stream, **vars(rendered))
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         logger.warning("Cannot keep the bricks scene in %s (%s).", path.parent, error)
     return rendered
