@@ -12,6 +12,7 @@ from PIL import Image
 from posed_captures import Known, write_colmap
 from support.budget import budget
 
+from nerf_lightning.data import capture_reader
 from nerf_lightning.data.blender import BlenderReader
 from nerf_lightning.data.images import image_size, read_rgba
 from nerf_lightning.data.json_files import read_json
@@ -129,3 +130,16 @@ def test_names_that_no_frame_has_stay_in_one_line(tmp_path):
     root = WRITERS["transforms"](tmp_path / "capture")
     edit_json(root, lambda content: content | {"test_filenames": ["a\nb"]})
     refused("transforms", root, r"test_filenames lists a\\nb, which no frame has")
+
+
+def test_kept_pixels_of_other_sizes_than_the_photographs(tmp_path, monkeypatch):
+    """As many numbers, in rows of another length: a cache that somebody else wrote."""
+    real = capture_reader.read_photographs
+
+    def turned(*arguments, **options):
+        pixels = real(*arguments, **options)
+        return replace(pixels, width=pixels.height, height=pixels.width)
+
+    root = WRITERS["transforms"](tmp_path / "capture")
+    monkeypatch.setattr(capture_reader, "read_photographs", turned)
+    refused("transforms", root, "pixels that were kept of .* have other sizes than its photographs")
