@@ -17,12 +17,13 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
-from nerf_lightning.commands.run_summary import read_note
+from nerf_lightning.commands.run_summary import number, read_note
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
@@ -87,7 +88,7 @@ class RunFolder:
     def _note(self, **values: Any) -> float:
         note = read_note(self.path)
         now = time.monotonic()
-        seconds: float = round(note.get("seconds", 0.0) + now - self.began, 1)
+        seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)
         self.began = now
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
         return seconds
@@ -202,7 +203,10 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     content = read_plain_yaml(saved)
     if not isinstance(content, dict):
         return "its config is damaged"
-    other = run_identity(OmegaConf.create(content))
+    try:
+        other = run_identity(OmegaConf.create(content))
+    except OmegaConfBaseException:
+        return "its config is damaged"
     keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
     shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
@@ -213,14 +217,15 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
     for file in notes:
         note = read_note(file.parent)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
-        if ours and note.get("finished_at_step", -1) < num_steps:
+        finished = number(note.get("finished_at_step"))
+        if ours and (finished is None or finished < num_steps):
             return file.parent
     return None
 
 
 def _fresh(parent: Path) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    for name in itertools.chain([stamp], (f"{stamp}_{number}" for number in itertools.count(2))):
+    for name in itertools.chain([stamp], (f"{stamp}_{count}" for count in itertools.count(2))):
         with contextlib.suppress(FileExistsError):
             (parent / name).mkdir(parents=True)
             return parent / name
