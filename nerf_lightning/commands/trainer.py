@@ -84,7 +84,7 @@ class TrainerSettings:
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
         self.precision, self.reason = choose_precision(precision, self.device_type)
-        default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
+        default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
         # On XLA each size would be compiled first.
         self.measures_tile = tile_points == "auto" and self.device_type != "xla"
         self.tile_points = default_tile if tile_points == "auto" else tile_points

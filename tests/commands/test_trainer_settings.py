@@ -127,7 +127,7 @@ def test_the_choice_of_the_device_has_its_reason(monkeypatch):
 
 
 def test_a_tile_from_a_file_is_one_that_somebody_could_have_measured():
-    settings = TrainerSettings(accelerator="cpu", tile_points=None)
+    settings = TrainerSettings(accelerator="cpu")
     for found, taken in ((1, 1024), (1 << 31, 1 << 18)):
         settings.keep_tile(found)
         assert settings.tile_points == taken
