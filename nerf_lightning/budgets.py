@@ -26,6 +26,8 @@ class Budgets:
     """Of the name of a photograph or of a scene."""
     samples_per_ray: int = 1 << 12
     """Points that a model asks its field about along one ray, at once."""
+    layer_width: int = 1 << 12
+    """Features that a model holds of one point, in any of its layers."""
     intervals: int = 1 << 17
     """Steps of a march through an occupancy grid, from near to far."""
     json_bytes: int = 1 << 26
@@ -38,6 +40,8 @@ class Budgets:
     """Of a yaml text."""
     yaml_depth: int = 50
     """Brackets within brackets in a yaml text."""
+    override_characters: int = 1 << 16
+    """Of the overrides that are repeated from a folder."""
     object_bytes: int = 1 << 24
     """Of that part of a PyTorch file that is not numbers."""
     tensor_bytes: int = 1 << 36

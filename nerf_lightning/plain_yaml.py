@@ -13,6 +13,8 @@ from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import read_text
 
+MOST_BITS = 1000
+"""Of a whole number: larger ones are no floating-point numbers, and Python writes only some thousand digits."""
 CURE = "It was damaged or made by somebody else: use another run folder or checkpoint."
 
 
@@ -46,7 +48,9 @@ def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
     if len(text) > allowed().yaml_characters:
         raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
     try:
-        return yaml.load(text, Loader=_PlainLoader)
+        content = yaml.load(text, Loader=_PlainLoader)
+        _require_plain(content)
+        return content
     except yaml.YAMLError as error:
         raise InputError(f"{where} is not readable yaml: {' '.join(str(error).split())[:300]}. {cure}") from error
     except Exception as error:  # a date of the 99th month, a number of no digits: PyYAML lets many kinds through
@@ -60,3 +64,20 @@ def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
         InputError: it cannot be read, or `plain_yaml` refuses it.
     """
     return plain_yaml(read_text(path, 4 * allowed().yaml_characters, cure), str(path), cure)
+
+
+def _require_plain(content: Any) -> None:
+    """Refuse what yaml knows and json does not: what reads a config sorts its keys, and writes its values down."""
+    waiting = [content]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, dict):
+            if len({type(key) for key in node}) > 1 or not all(isinstance(key, (str, int, float)) for key in node):
+                raise ValueError("keys of other kinds than text, or of several")
+            waiting += [*node, *node.values()]
+        elif isinstance(node, list):
+            waiting += node
+        elif isinstance(node, int) and node.bit_length() > MOST_BITS:
+            raise ValueError("a number that is too large")
+        elif not (node is None or isinstance(node, (str, int, float))):
+            raise ValueError("neither text nor a number")

@@ -242,7 +242,7 @@ class RadianceFieldSystem(LightningModule):
         record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place, tile and thread count decide the last bits of every sum.
+        """Take up the state again: place and thread count decide the last bits of every sum, and so does the tile (`keep_tile`).
 
         Raises:
             InputError: the checkpoint is not one of this run; nothing was taken from it.
@@ -251,7 +251,6 @@ class RadianceFieldSystem(LightningModule):
         state = checkpoint[KEY]
         self.progress.take_up(Progress(**state["progress"]))
         self.guard.restore(state["bad_steps"], self.device)
-        self.tile_points = state["tile_points"]
         if state["world_size"] == ranks.world_size():
             _use_threads(state["num_threads"])
 

@@ -62,7 +62,9 @@ def scene() -> Record:
             "near": Numbers(("views",), low=0.0, high=FARTHEST),
             "far": Numbers(("views",), low=0.0, high=FARTHEST),
             "aabb": Numbers((2, 3), low=-FARTHEST, high=FARTHEST),
-            "splits": Record({}, {"train": numbers, "val": numbers, "test": numbers}),
+            "splits": Record(
+                {"train": Many(Whole(0, views), views, tuple, least=1)}, {"val": numbers, "test": numbers}
+            ),
             "background": Choice(get_args(Background)),
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),

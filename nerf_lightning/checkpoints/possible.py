@@ -37,6 +37,8 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
     for split, numbers in scene["splits"].items():
         if any(number >= views for number in numbers):
             raise Unfit(f"scene.splits.{split}", f"names views that are not among the {views}")
+        if len(set(numbers)) < len(numbers):
+            raise Unfit(f"scene.splits.{split}", "names a view twice")
     for name in (scene["name"], *scene["view_names"]):
         require_printable(name, f"{where}: scene.view_names")
 

@@ -27,6 +27,7 @@ from nerf_lightning.types.scene import Scene
 CONTRACTS = (Encoder, Field, AnySampler, AnyLevel, RadianceModel)
 SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
+LARGEST_NUMBER = 1 << 53
 ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
 
 
@@ -99,11 +100,20 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     model = _built(config, checkpoint)
     load_weights(model, checkpoint)
     _require_few_samples(model, f"The model of {checkpoint.path}")
+    require_within("layer_width", _widest(model), f"The model of {checkpoint.path}", "features of one point in a layer")
     return model.eval()
 
 
 def _require_few_samples(model: RadianceModel, where: str) -> None:
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
+
+
+def _widest(model: RadianceModel) -> int:
+    """Return the longest side of all matrices that features are multiplied with; an encoder's are tables."""
+    encoders = [part for part in model.modules() if isinstance(part, Encoder)]
+    tables = {id(table) for encoder in encoders for table in encoder.parameters()}
+    sides = [max(each.shape) for each in model.parameters() if each.dim() == 2 and id(each) not in tables]
+    return max([*sides, *(encoder.out_dim for encoder in encoders)], default=0)
 
 
 def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
@@ -157,6 +167,8 @@ def _require_our_own(node: Any, source: str) -> None:
     if isinstance(node, list):
         for child in node:
             _require_our_own(child, source)
+    elif isinstance(node, (int, float)) and not abs(node) <= LARGEST_NUMBER:
+        raise InputError(f"{source}: its model part holds the number {node:.3g}, which no model has. Use another one.")
     elif isinstance(node, str):
         if "${" in node:
             raise InputError(f"{source}: its model part holds an interpolation ({node}), which is not read from files.")

@@ -4,6 +4,7 @@ They come out of a file in the folder, and the folder may come from anybody: wha
 up (an interpolation), or says where to write or how far to trust is taken from the command line alone.
 """
 
+import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
@@ -14,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.commands.sweep_record import read_sweep, sweep_record
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
@@ -76,6 +78,7 @@ def to_give_again(overrides: Sequence[str], of_sweep: bool = False) -> list[str]
 
 
 def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sweep: bool) -> Iterator[str]:
+    require_within("override_characters", sum(map(len, lines)), str(saved), "characters of overrides")
     given = {argument.lstrip("+~").partition("=")[0] for argument in arguments}
     for line in lines:
         override = _parsed(line)
@@ -102,7 +105,7 @@ def _parsed(line: str) -> Override | None:
     try:
         # Options of Hydra's own command line, such as --config-dir, are none.
         return None if line.startswith("-") else OverridesParser.create().parse_override(line)
-    except HydraException:
+    except (HydraException, RecursionError, ValueError):  # brackets in brackets, a number of thousands of digits
         return None
 
 
@@ -161,7 +164,9 @@ def _is_plain(key: str, value: Any) -> bool:
     for path, leaf in _leaves(key, value):
         if _belongs(path, OF_THE_USER) or any(word.startswith("_") for word in path.split(".")):
             return False
-        if isinstance(leaf, str) and ("${" in leaf or (path == DOWNLOADED and not Path(leaf).expanduser().exists())):
+        if isinstance(leaf, str) and (
+            "${" in leaf or (path == DOWNLOADED and not os.path.exists(os.path.expanduser(leaf)))
+        ):
             return False
         if not (leaf is None or isinstance(leaf, (str, int, float, bool))):
             return False

@@ -69,7 +69,7 @@ def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
 
 def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPage], list[ViewOnPage], list[str]]:
     """Return the worst views, those of the even spread, and what could not be read."""
-    rows = {row.get("name"): row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)}
+    rows = {str(row.get("name")): row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)}
     worst = [str(name) for name in _sequence(metrics.get("worst_views"))][:MOST_VIEWS]
     named = [(f"worst_{place}", name) for place, name in enumerate(worst, start=1)]
     split = str(_mapping(metrics.get("protocol")).get("split"))
@@ -81,7 +81,7 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
         for folder, name in folders:
             try:
                 pages[-1].append(_view(images / "views" / _plain(folder), name, rows.get(name, {})))
-            except InputError as error:
+            except (InputError, OSError) as error:
                 missing.append(f"View {name[:80]}: {error}")
     if metrics and not worst and not spread:
         missing.append("Views: none were kept when this was measured; nerf eval keeps some (then measured=eval).")

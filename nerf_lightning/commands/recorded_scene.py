@@ -1,5 +1,6 @@
 """The scene that a checkpoint was trained on, as overrides for our own conf/."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def scene_overrides(path: str) -> list[str]:
     ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
     values = dict(_plain_values(recorded, ours))
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
-    if ours.get("download") and not Path(str(values.get("path"))).exists():
+    if ours.get("download") and not os.path.exists(str(values.get("path"))):
         values.pop("path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
     return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
 

@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.callbacks.checkpoint_file import sweep_leftovers
 from nerf_lightning.callbacks.folder_guard import require_run
@@ -212,7 +213,10 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     content = read_plain_yaml(saved)
     if not isinstance(content, dict):
         return "its config is damaged"
-    other = run_identity(OmegaConf.create(content))
+    try:
+        other = run_identity(OmegaConf.create(content))
+    except OmegaConfBaseException:
+        return "its config is damaged"
     keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
     shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
@@ -223,7 +227,8 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
     for file in notes:
         note = read_note(file.parent)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
-        if ours and (number(note.get("finished_at_step")) or -1) < num_steps:
+        finished = number(note.get("finished_at_step"))
+        if ours and (finished is None or finished < num_steps):
             return file.parent
     return None
 

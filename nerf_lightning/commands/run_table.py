@@ -27,6 +27,9 @@ HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
 # What tells whose numbers they are, and may move them a little: named below a table where it differs.
 NOTED = ("version", "commit", "device", "precision")
 
+MOST_SETTINGS = 32
+"""Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
+
 Group = list[RunResult]
 
 
@@ -84,7 +87,7 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
 
 def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
     """Return a row per group, by scene and then the best first; settings that all share are left out."""
-    shown = differing_keys([group[0].settings for group in groups])
+    shown = differing_keys([group[0].settings for group in groups])[:MOST_SETTINGS]
     return [_row(group, shown) for group in sorted(groups, key=lambda group: _rank(group, order))]
 
 

@@ -31,6 +31,8 @@ PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mix
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
 MOST_CPU_TILE_POINTS = 1 << 18
+MOST_GPU_TILE_POINTS = 1 << 22
+LEAST_TILE_POINTS = 1 << 10
 
 
 class TrainerSettings:
@@ -140,7 +142,9 @@ class TrainerSettings:
     def keep_tile(self, measured: int | None) -> None:
         """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
         if self.measures_tile and measured is not None:
-            self.tile_points = min(measured, MOST_CPU_TILE_POINTS) if self.device_type == "cpu" else measured
+            # The number comes out of a file: ever smaller tiles take hours, ever larger ones the memory.
+            most = MOST_CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
+            self.tile_points = min(max(measured, LEAST_TILE_POINTS), most)
 
     @property
     def device(self) -> torch.device:

@@ -127,6 +127,7 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | N
         log.info("going on from step %d of %s", former.step, folder)
         parts.settings.keep_precision(former.precision)
         parts.settings.keep_tile(former.tile_points)
+        parts.system.tile_points = parts.settings.tile_points
     parts.settings.prepare(parts.system.model)
     parts.system.record["precision"] = parts.settings.precision
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:

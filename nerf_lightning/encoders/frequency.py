@@ -7,6 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.ranges import require_ranges
+
+MOST_FREQUENCIES = 64
+"""Of higher ones float32 has no digits, and at last no numbers."""
 
 
 class FrequencyEncoder(Encoder):
@@ -25,6 +29,7 @@ class FrequencyEncoder(Encoder):
 
     def __init__(self, num_frequencies: int = 10, include_input: bool = True, with_pi: bool = False):
         super().__init__()
+        require_ranges({"num_frequencies": num_frequencies}, {"num_frequencies": (0, MOST_FREQUENCIES)})
         self.include_input = include_input
         scale = math.pi if with_pi else 1.0
         self.register_buffer("frequencies", scale * 2.0 ** torch.arange(num_frequencies), persistent=False)

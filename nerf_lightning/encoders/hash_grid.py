@@ -8,11 +8,14 @@ from torch import Tensor, nn
 from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
+from nerf_lightning.ranges import require_ranges
 
 INITIAL_RANGE = 1e-4
 # Weights, gradients and Adam's two moments, in float32.
 BYTES_PER_PARAMETER = 16
 MOST_LEVELS = 64
+FINEST = 1 << 24
+"""Cells that float32 tells apart."""
 
 
 class HashGridEncoder(Encoder):
@@ -47,8 +50,7 @@ class HashGridEncoder(Encoder):
             raise ValueError("1 <= min_resolution <= max_resolution, and at least one level and feature are needed")
         if num_levels > MOST_LEVELS:
             raise ValueError(f"num_levels={num_levels}: give {MOST_LEVELS} at most")
-        if not 1 <= log2_table_size <= 30:
-            raise ValueError(f"log2_table_size={log2_table_size}: give 1 to 30")
+        require_ranges(locals(), {"log2_table_size": (1, 30), "max_resolution": (1, FINEST)})
         self.layout = hash_grid_layout(num_levels, log2_table_size, min_resolution, max_resolution)
         self.features_per_level = features_per_level
         _require_memory(self.layout.offsets[-1] * features_per_level)

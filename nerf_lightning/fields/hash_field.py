@@ -13,6 +13,7 @@ from nerf_lightning.geometry.boxes import center_and_half, contract, in_unit_bal
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.kernels.mlp import mlp
 from nerf_lightning.randomness import RayRandom
+from nerf_lightning.ranges import require_ranges
 from nerf_lightning.types.renderings import FieldOutput
 from nerf_lightning.types.scene import Scene
 
@@ -52,6 +53,7 @@ class HashField(Field):
         contraction: bool | None = None,
     ):
         super().__init__()
+        require_ranges(locals(), {"width": (1, 1 << 20), "feature_dim": (1, 1 << 20)})
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder

@@ -13,6 +13,7 @@ from nerf_lightning.geometry.boxes import contract, in_unit_ball, require_box
 from nerf_lightning.geometry.contracted import Contracted
 from nerf_lightning.products import Linear, linear
 from nerf_lightning.randomness import RayRandom
+from nerf_lightning.ranges import require_ranges
 from nerf_lightning.types.renderings import FieldOutput
 from nerf_lightning.types.scene import Scene
 
@@ -59,6 +60,7 @@ class NerfMLP(Field):
         super().__init__()
         if not 1 <= depth <= MOST_LAYERS:
             raise ValueError(f"depth={depth}: give 1 to {MOST_LAYERS} layers")
+        require_ranges({"width": width}, {"width": (2, 1 << 20)})
         if skip is not None and not 0 < skip < depth:
             raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
         if position_encoder.needs_unit_cube:

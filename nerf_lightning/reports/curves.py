@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from nerf_lightning.export.figures import new_figure
 from nerf_lightning.reports.embedding import data_address
@@ -12,6 +13,8 @@ from nerf_lightning.reports.embedding import data_address
 Curve = tuple[Sequence[int], Sequence[float]]
 """Steps and values."""
 WIDTH, HEIGHT = 560, 320
+MOST_CURVES = 12
+"""In one chart; more are not told apart, and a stranger's file may have thousands."""
 COLORS = ("#2f6db3", "#e07b39", "#3c9d6b", "#8b5fbf", "#c8372d", "#6a7280")
 
 
@@ -39,7 +42,7 @@ def curve_drawings(curves: Mapping[str, Curve]) -> list[tuple[str, str]]:
     drawings = []
     for chart in CHARTS:
         drawn = {tag: _finite(curve, chart) for tag, curve in sorted(curves.items()) if chart.tags.fullmatch(tag)}
-        drawn = {tag: curve for tag, curve in drawn.items() if curve[0]}
+        drawn = dict(islice(((tag, curve) for tag, curve in drawn.items() if curve[0]), MOST_CURVES))
         if drawn:
             drawings.append((chart.label, data_address("image/svg+xml", _draw(chart, drawn))))
     return drawings

@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 
 from nerf_lightning.randomness import RayRandom
+from nerf_lightning.ranges import require_ranges
 from nerf_lightning.rendering.histograms import sample_histogram
 from nerf_lightning.samplers.base import Sampler
 from nerf_lightning.types.rays import RayBundle, RaySamples
@@ -24,6 +25,7 @@ class ImportanceSampler(Sampler):
 
     def __init__(self, num_samples: int = 128):
         super().__init__()
+        require_ranges({"num_samples": num_samples}, {"num_samples": (1, 1 << 53)})
         self.num_samples = num_samples
 
     def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:

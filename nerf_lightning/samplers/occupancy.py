@@ -18,6 +18,7 @@ from nerf_lightning.kernels.march import BLOCK, March, OccupancyCells, march
 from nerf_lightning.kernels.march_torch import floor_of_cells
 from nerf_lightning.kernels.packed import num_visible
 from nerf_lightning.randomness import RayRandom, batch_random, fold
+from nerf_lightning.ranges import require_ranges
 from nerf_lightning.rendering.packed import first_of_each_ray, positions_of
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.samplers.occupancy_grid import OccupancyGrid
@@ -31,6 +32,18 @@ CELLS_AT_ONCE = 1 << 18
 CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
 # Devices on which a number may be read on the host between two kernels while rendering.
 HOSTS = ("cpu", "cuda")
+RANGES = {
+    "num_cascades": (1, 32),
+    "num_steps": (1, 1 << 20),
+    "cone_angle": (0.0, 1.0),
+    "update_every": (1, 1 << 30),
+    "warmup_steps": (0, 1 << 40),
+    "prune_after": (0, 1 << 40),
+    "decay": (0.0, 1.0),
+    "min_alpha": (0.0, 1.0),
+    "opaque_below": (0.0, 1.0),
+    "capacity": (1, 1 << 31),
+}
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
 
@@ -77,6 +90,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         super().__init__()
         if resolution % BLOCK or resolution < BLOCK:
             raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
+        require_ranges(locals(), RANGES)
         self.wanted = (resolution, num_cascades, cone_angle)
         self.num_steps = num_steps
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
@@ -192,6 +206,8 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             self._require_few((far - near) / step if not self.cone_angle else 0.0)
             while edges[-1] <= far:
                 edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
+                if len(edges) > allowed().intervals:  # of a narrow cone, whose intervals hardly grow
+                    self._require_few(max((far - near) / step, len(edges)))
             edges.append(2 * edges[-1] - edges[-2])
             self._lattice = torch.tensor(edges)
         self._lattice = self._lattice.to(self.aabb.device)

@@ -6,12 +6,13 @@ import sys
 import pytest
 import torch
 import yaml
+from omegaconf import OmegaConf
 from planted import Payload, compress, in_config, many_bytes, peak_of, replace_pickle, write_checkpoint
 from running import refused, said
 from support.budget import budget
 
 from nerf_lightning.checkpoints import read_checkpoint
-from nerf_lightning.commands.build import load_model
+from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.recorded_scene import scene_overrides
 
 MEGABYTE = 2**20
@@ -218,6 +219,9 @@ def state(**changed):
         (recorded(view_names=tuple("abc")), "view_names has 3 entries"),
         (recorded(splits={"train": (0, 99)}), "splits"),
         (recorded(splits=[1]), "splits"),
+        (recorded(splits={"test": (0,)}), "splits lacks train"),
+        (recorded(splits={"train": (), "test": (0,)}), "splits.train has 0 entries"),
+        (recorded(splits={"train": (0, 1, 0)}), "splits.train names a view twice"),
         (state(precision="transformer-engine"), "precision"),
         (state(tile_points=-1), "tile_points"),
         (state(choices=["scene"]), "choices"),
@@ -331,3 +335,87 @@ def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
     refused(loaded, file, parts=("a.ckpt", "samples along a ray", "add budgets.samples_per_ray=1000"))
     with budget(samples_per_ray=10**8):
         loaded(file)
+
+
+SAMPLER = "nerf_lightning.samplers.occupancy.OccupancySampler"
+FREQUENCY = "nerf_lightning.encoders.frequency.FrequencyEncoder"
+GRID = "nerf_lightning.encoders.hash_grid.HashGridEncoder"
+FIELD = "nerf_lightning.fields.hash_field.HashField"
+IMPOSSIBLE = [
+    *({"sampler": {"_target_": SAMPLER, key: value}} for key, value in (
+        ("num_steps", 0), ("num_steps", -1), ("num_cascades", 0), ("num_cascades", 60), ("cone_angle", -1e-3),
+        ("cone_angle", 1e9), ("update_every", 0), ("warmup_steps", -1), ("prune_after", -1), ("decay", 2.0),
+        ("decay", -1.0), ("min_alpha", -1.0), ("opaque_below", -1.0), ("opaque_below", 2.0), ("capacity", 0),
+    )),
+    {"sampler": {"_target_": "nerf_lightning.samplers.importance.ImportanceSampler", "num_samples": -1}},
+    {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": 10_000}}},
+    {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": -1}}},
+    {"field": {"position_encoder": {"_target_": GRID, "max_resolution": 1 << 40}}},
+    {"field": {"_target_": FIELD, "feature_dim": 0}},
+    {"field": {"_target_": FIELD, "width": 0}},
+    {"field": {"width": 1}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("part", IMPOSSIBLE, ids=lambda part: str(part)[-60:])
+def test_settings_that_no_model_has_are_named(tmp_path, part):
+    def change(config):
+        level = config["model"]["levels"]["fine"]
+        level["sampler"] |= {"num_samples": 3}
+        for name, settings in part.items():
+            if "_target_" in settings:
+                encoders = {key: value for key, value in level[name].items() if key.endswith("_encoder")}
+                level[name] = encoders | settings
+            else:
+                level[name] |= settings
+
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(change))
+    refused(loaded, file, parts=("a.ckpt: its model part cannot be built", ": give "))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, -(10**30)], ids=lambda value: str(value)[:9])
+@pytest.mark.parametrize("key", ["density_bias", "note"])
+def test_numbers_that_no_model_has_are_named(tmp_path, key, value):
+    change = in_config(lambda c: c["model"]["levels"]["fine"]["field"].update({key: value}))
+    file = write_checkpoint(tmp_path / "a.ckpt", change)
+    refused(loaded, file, parts=("a.ckpt", "its model part holds the number"))
+
+
+def test_wider_layers_than_agreed_are_not_taken(tmp_path):
+    def wide(content):
+        change = in_config(lambda c: c["model"]["levels"]["fine"]["field"].update(width=300))
+        change(content)
+        parts = build(OmegaConf.create(yaml.safe_load(content["nerf_lightning"]["config"])).model)
+        content["state_dict"] = {f"model.{name}": tensor for name, tensor in parts.state_dict().items()}
+
+    file = write_checkpoint(tmp_path / "a.ckpt", wide)
+    loaded(file)
+    with budget(layer_width=256):
+        refused(loaded, file, parts=("a.ckpt", "features of one point", "add budgets.layer_width=3"))
+
+
+YAML_NUMBER = {"hex": "0x" + "f" * 5000, "clock": ":".join(["1"] * 3000)}
+YAML_PLAIN = {
+    "a day": "[2001-01-01]",
+    "a set": "!!set {a, b}",
+    "keys of two kinds": "{1: 1, b: 2}",
+    "a day as key": "{2001-01-01: 1}",
+    "bytes": "!!binary aGk=",
+}
+
+
+@pytest.mark.parametrize("value", [*YAML_NUMBER.values(), *YAML_PLAIN.values()], ids=[*YAML_NUMBER, *YAML_PLAIN])
+def test_values_that_no_config_of_ours_holds_are_refused(tmp_path, value):
+    """They would be found out only where they are written: in the hash of a measurement's settings."""
+
+    def change(content):
+        content["nerf_lightning"]["config"] += f"\nmore: [{value}]\n"
+
+    file = write_checkpoint(tmp_path / "a.ckpt", change)
+    refused(loaded, file, parts=("The config in", "a.ckpt", "holds a value that cannot be read"))
+
+
+@pytest.mark.parametrize("path", ["x" * 5000, "a\0b"], ids=["long", "nul"])
+def test_a_recorded_place_that_no_file_can_have_is_not_taken(tmp_path, path):
+    file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "lego_tiny"}), scene={"path": path})
+    assert not [line for line in scene_of(str(file)) if line.startswith("scene.path=")]

@@ -4,12 +4,15 @@ import json
 import sys
 
 import pytest
+from filelock import FileLock
 from omegaconf import OmegaConf
 from running import FAST, said
+from support.budget import budget
 
 from nerf_lightning.commands.former_overrides import former_overrides, to_give_again
 from nerf_lightning.commands.links import require_no_way_out
-from nerf_lightning.commands.run_folder import open_run
+from nerf_lightning.commands.run_folder import RunFolder, _difference, _newest_unfinished, open_run
+from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.errors import InputError
 
 
@@ -232,3 +235,42 @@ def test_pictures_in_a_run_folder_start_no_program(tmp_path):
         path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n(ran) (w) file closefile\nshowpage\n")
     with pytest.raises(InputError, match=r"step_1.png is not an image that can be read"):
         _film_progress(tmp_path)
+
+
+OVERRIDES = {
+    "a path that is too long": "scene.path=" + "x" * 5000,
+    "deep": "a=" + "[" * 900 + "]" * 900,
+    "deep dictionaries": "a=" + "{a:" * 500 + "1" + "}" * 500,
+    "a number of many digits": "seed=" + "9" * 5000,
+}
+
+
+@pytest.mark.parametrize("line", OVERRIDES.values(), ids=OVERRIDES)
+def test_an_override_that_cannot_be_read_is_not_repeated(run, line):
+    write_overrides(run, line)
+    with pytest.raises(InputError, match="which is not repeated from a file"):
+        former_overrides(run, [])
+
+
+def test_more_overrides_than_agreed_are_not_read(run):
+    write_overrides(run, "a=[" + "1," * 1000 + "1]")
+    assert len(former_overrides(run, [])) == 1
+    with budget(override_characters=1000), pytest.raises(InputError, match=r"add budgets\.override_characters=2005"):
+        former_overrides(run, [])
+
+
+@pytest.mark.parametrize("value", ["x", [], {}, None, 10**400, float("inf"), float("nan"), True])
+def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
+    """The note is anybody's; a training that goes on in its folder writes its own numbers there at the end."""
+    note = {"fingerprint": "0", "seconds": value, "finished_at_step": value}
+    (run / "run.json").write_text(json.dumps(note))
+    assert _newest_unfinished(run.parent, "0", 10, None) == run
+    RunFolder(run, FileLock(run / "lock"), None).finish(12)
+    found = read_note(run)
+    assert found["finished_at_step"] == 12
+    assert 0 <= found["seconds"] < 60
+
+
+def test_a_config_with_half_an_interpolation_is_called_damaged(run):
+    (run / ".hydra" / "config.yaml").write_text('a: "${"')
+    assert _difference(run, {"a": 1}) == "its config is damaged"

@@ -124,3 +124,10 @@ def test_the_choice_of_the_device_has_its_reason(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "(no GPU found)" in TrainerSettings().describe()
     assert "(as asked)" in TrainerSettings(accelerator="cpu").describe()
+
+
+def test_a_tile_from_a_file_is_one_that_somebody_could_have_measured():
+    settings = TrainerSettings(accelerator="cpu")
+    for found, taken in ((1, 1024), (1 << 31, 1 << 18)):
+        settings.keep_tile(found)
+        assert settings.tile_points == taken

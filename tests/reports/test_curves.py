@@ -20,3 +20,9 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
     assert kind == "data:image/svg+xml;base64"
     assert base64.b64decode(content).startswith(b"<?xml")
     assert curve_drawings({}) == []
+
+
+def test_a_few_curves_are_drawn_of_thousands():
+    curves = {f"train/loss_{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
+    ((_, address),) = curve_drawings(curves)
+    assert len(address) < 200_000
