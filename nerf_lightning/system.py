@@ -242,7 +242,9 @@ class RadianceFieldSystem(LightningModule):
         record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place and thread count decide the last bits of every sum, and so does the tile (`keep_tile`).
+        """Take up the state again: place and thread count decide the last bits of every sum.
+
+        So does the tile, which whoever builds the system chooses (`TrainerSettings.keep_tile`).
 
         Raises:
             InputError: the checkpoint is not one of this run; nothing was taken from it.

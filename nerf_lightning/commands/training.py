@@ -158,7 +158,7 @@ def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
 
 def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
     parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
-    tile = parts.system.tile_points if former is None else former.tile_points
+    tile = parts.system.tile_points
     log.info(
         "run folder %s: %d steps of %d rays, %s parameters, %s, %s",
         folder,
