@@ -125,11 +125,10 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
             f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
             "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
         )
-    written = record.get("format")
+    written, version = record.get("format"), shown(record.get("version")).strip("'")
     if type(written) is not int or written != FORMAT:
         raise InputError(
-            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning "
-            f"{shown(record.get('version'))}), "
+            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )
     try:

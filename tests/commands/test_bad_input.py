@@ -51,7 +51,7 @@ def refused_when_planted(nerf, last, tmp_path, plant, *words, by_command):
 
 def test_a_checkpoint_of_another_format(nerf, last, tmp_path):
     path = changed(last, tmp_path, lambda content: content["nerf_lightning"].__setitem__("format", 99))
-    said(nerf("render", path), "has checkpoint format 99", "reads format 1", "Use the version that wrote it")
+    said(nerf("render", path), "has checkpoint format 99", "reads format 2", "Use the version that wrote it")
 
 
 def test_a_file_of_torch_that_is_no_checkpoint_of_ours(nerf, tmp_path):

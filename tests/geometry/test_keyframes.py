@@ -57,10 +57,10 @@ MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 18, focal: 9}}", "both fov and focal"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "keyframe 2: position is"),
+        (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a value that cannot be read"),
         (
             f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}",
-            "holds a number that cannot be read",
+            "holds a value that cannot be read",
         ),
         (
             f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}",

@@ -90,7 +90,7 @@ def _make_and_save(path: Path, make: Callable[[], Rendered]) -> Rendered:
         try:
             # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
             part.unlink(missing_ok=True)
-            with part.open("xb") as stream:
+            with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as stream:
                 np.savez(stream, **vars(rendered))
             os.replace(part, path)
         finally:
