@@ -6,10 +6,12 @@ from itertools import pairwise
 
 import pytest
 import torch
+from scenes import ball_scene
 from test_chosen_paths import MIDDLE, UP, frame, keyframe_file, keys
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.cameras import project
+from nerf_lightning.geometry.paths.base import frame_of
 from nerf_lightning.geometry.paths.keyframe_path import KeyframePath
 from nerf_lightning.geometry.paths.keyframes import Keyframe, read_keyframes, write_keyframes
 from nerf_lightning.geometry.paths.spline import hermite, rotations_along
@@ -203,3 +205,15 @@ def test_a_quaternion_is_its_rotations():
     given = torch.cat([quaternions, half_turns])
     found = quaternion_from_rotation(rotation_from_quaternion(given))
     torch.testing.assert_close((found * given).sum(dim=-1).abs(), torch.ones(68, dtype=torch.float64))
+
+
+def test_times_so_uneven_that_the_field_of_view_swings_beyond_all_cameras(tmp_path):
+    keys = [
+        "{position: [4, 0, 1], look_at: [0, 0, 0.5], fov: 40, time: -809}",
+        "{position: [0, 4, 2], direction: [0, -4, -1.5], up: [0, 0, 1], time: 0.5}",
+        "{position: [-4, 0, 1], look_at: [0, 0, 0.5], focal: 30, time: 1}",
+    ]
+    (tmp_path / "keys.yaml").write_text("".join(f"- {key}\n" for key in keys))
+    scene = ball_scene()
+    with pytest.raises(InputError, match="swings beyond all cameras"):
+        KeyframePath(str(tmp_path / "keys.yaml")).cameras(frame_of(scene.cameras, scene.aabb))

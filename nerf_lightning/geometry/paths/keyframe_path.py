@@ -102,6 +102,11 @@ class KeyframePath(CameraPath):
         logs = torch.tensor([[math.log(_focal(each, around))] for each in self.keyframes], dtype=knots.dtype)
         scale = cameras.width[0] / around.width
         focal = (scale * along(knots, logs, at).exp()).expand(-1, 2).to(cameras.focal)
+        if not bool(((focal > 0) & torch.isfinite(focal)).all()):
+            raise InputError(
+                "path.file: the curve through the keyframes' fields of view swings beyond all cameras, since their "
+                "times are very uneven. Give times that are more alike, or leave them out."
+            )
         return replace(cameras, focal=focal.contiguous())
 
 
