@@ -256,16 +256,6 @@ class RadianceFieldSystem(LightningModule):
         if state["world_size"] == ranks.world_size():
             _use_threads(state["num_threads"])
 
-    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Take the weights, and look at what they are, before anything is computed with them.
-
-        Raises:
-            InputError: a part of the model holds what it cannot.
-        """
-        result = super().load_state_dict(*args, **kwargs)
-        self.model.require_sound_state()
-        return result
-
     def _require_own(self, checkpoint: dict[str, Any]) -> None:
         trainer = self.trainer
         require_resumable(checkpoint, self.model, self.build_optimizer, self.progress, self.configure_optimizers())

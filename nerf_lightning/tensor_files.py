@@ -64,6 +64,10 @@ def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
                 f"{path} has {size:,} bytes and unpacks to {announced:,}: PyTorch saves without compression, so this "
                 "file was made to fill the memory, or packed by another program. Use the file as it was saved."
             )
+        # torch.load compares no checksums: a block of zeros in the middle of the weights would be believed.
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
         objects = [entry for entry in entries if entry.filename.endswith("data.pkl")]
         if len(objects) != 1:
             raise zipfile.BadZipFile("no data.pkl")

@@ -128,7 +128,8 @@ def test_weights_that_are_not_finite_are_not_saved():
 
 def test_a_run_that_starts_from_weights_restarts_from_them():
     system = make_system(None)
-    system.start_weights = {name: torch.full_like(value, 0.25) for name, value in system.model.state_dict().items()}
+    weights = {name: torch.full_like(value, 0.25) for name, value in system.model.named_parameters()}
+    system.start_weights = system.model.state_dict() | weights
     system.initialize()
     assert all(bool((parameter == 0.25).all()) for parameter in system.model.parameters())
 

@@ -5,6 +5,7 @@ from typing import get_args
 import torch
 
 from nerf_lightning.budgets import allowed
+from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL
 from nerf_lightning.files.schema import (
     Choice,
     Description,
@@ -22,8 +23,6 @@ from nerf_lightning.types.scene import Background, LensModel, Space
 FORMAT = 2
 KEY = "nerf_lightning"
 PRECISIONS = ("32-true", "tf32", "bf16-mixed")
-FARTHEST = 1e9
-"""Scene units: coordinates beyond have lost every digit that a picture could show."""
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
 """Types of what a model holds. Numbers of other types would be cast without a word."""
 MOST_THREADS = 4096
@@ -38,7 +37,7 @@ def cameras() -> Record:
     return Record(
         {
             "c2w": Numbers(("views", 3, 4), low=-FARTHEST, high=FARTHEST),
-            "focal": Numbers(("views", 2), low=1e-3, high=FARTHEST),
+            "focal": Numbers(("views", 2), low=LEAST_FOCAL, high=FARTHEST),
             "center": Numbers(("views", 2), low=-FARTHEST, high=FARTHEST),
             "lens": Numbers(("views", 6), low=-FARTHEST, high=FARTHEST),
             "lens_model": Choice(get_args(LensModel)),

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.budgets import require_within
 from nerf_lightning.escaping import require_printable
 from nerf_lightning.files.schema import Unfit
-from nerf_lightning.geometry.frames import LARGEST_UNIT, LEAST_UNIT
+from nerf_lightning.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.geometry.poses import is_rigid
 
 
@@ -44,9 +44,9 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
 
 
 def _require_similarity(to_user: Tensor) -> None:
-    last, linear = to_user[3], to_user[:3, :3].double()
-    unit = float(torch.linalg.det(linear).abs().pow(1 / 3))
-    if not LEAST_UNIT <= unit <= LARGEST_UNIT or last.tolist() != [0.0, 0.0, 0.0, 1.0]:
+    to_user = to_user.double()
+    unit = unit_of(to_user)
+    if not LEAST_UNIT <= unit <= LARGEST_UNIT or to_user[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise Unfit("scene.to_user", "is singular, or its last row is not 0 0 0 1")
-    if not bool(is_rigid(torch.cat([linear / unit, to_user[:3, 3:].double()], dim=1))):
+    if not bool(is_rigid(torch.cat([to_user[:3, :3] / unit, to_user[:3, 3:]], dim=1))):
         raise Unfit("scene.to_user", "is not a rotation, a scale and a shift")

@@ -15,7 +15,7 @@ from nerf_lightning.commands import xla
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress
-from nerf_lightning.encoders.base import Encoder
+from nerf_lightning.encoders.base import Encoder, matrices_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import AnyLevel, RadianceModel
@@ -109,11 +109,10 @@ def _require_few_samples(model: RadianceModel, where: str) -> None:
 
 
 def _widest(model: RadianceModel) -> int:
-    """Return the longest side of all matrices that features are multiplied with; an encoder's are tables."""
-    encoders = [part for part in model.modules() if isinstance(part, Encoder)]
-    tables = {id(table) for encoder in encoders for table in encoder.parameters()}
-    sides = [max(each.shape) for each in model.parameters() if each.dim() == 2 and id(each) not in tables]
-    return max([*sides, *(encoder.out_dim for encoder in encoders)], default=0)
+    """Return how many features of a point there are at most, in any layer or at the end of any encoder."""
+    sides = [max(matrix.shape) for matrix in matrices_of(model)]
+    encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
+    return max([*sides, *encoded], default=0)
 
 
 def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
@@ -154,7 +153,6 @@ def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
         )
     try:
         model.load_state_dict(checkpoint.weights)
-        model.require_sound_state()
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:400]
         raise InputError(

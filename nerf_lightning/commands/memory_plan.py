@@ -8,7 +8,7 @@ from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixel_file import MappedPixelStore
 from nerf_lightning.data.residence import GIGABYTE, num_bytes
-from nerf_lightning.encoders.base import tables_of
+from nerf_lightning.encoders.base import matrices_of
 from nerf_lightning.free_memory import free_memory
 from nerf_lightning.products import cpu_multiplies_bfloat16
 from nerf_lightning.system import RadianceFieldSystem
@@ -112,9 +112,7 @@ def _compiles_products(settings: TrainerSettings) -> bool:
 
 
 def _compiled(system: RadianceFieldSystem) -> int:
-    tables = set(map(id, tables_of(system.model)))
-    matrices = [weight for weight in system.model.parameters() if weight.ndim == 2 and id(weight) not in tables]
-    return COMPILED_PER_MATRIX * len(matrices)
+    return COMPILED_PER_MATRIX * len(matrices_of(system.model))
 
 
 def announce_memory(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> None:

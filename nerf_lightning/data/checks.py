@@ -16,7 +16,8 @@ from nerf_lightning.geometry.poses import is_rigid
 from nerf_lightning.types.scene import Background
 
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
-"""What a camera can have: a focal length in pixels, and coordinates in the capture's own units."""
+"""What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
+have not lost every digit that a picture could show."""
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:

@@ -117,7 +117,7 @@ def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Cap
             f"{capture.source}: all of the content lies in one plane or at one distance, so there is no room for a "
             "scene. Add scene.space=contracted, or remove what describes the content (sparse points, aabb_scale)."
         )
-    unit = float(torch.linalg.det(to_user[:3, :3].double()).abs().pow(1 / 3))
+    unit = unit_of(to_user.double())
     if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
         raise InputError(
             f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "

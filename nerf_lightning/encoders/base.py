@@ -47,3 +47,9 @@ def tables_of(model: nn.Module) -> list[nn.Parameter]:
     """Return the parameters of the encoders within a model, each once: tables, where the others are matrices."""
     encoders = [module for module in model.modules() if isinstance(module, Encoder)]
     return list({id(table): table for encoder in encoders for table in encoder.parameters()}.values())
+
+
+def matrices_of(model: nn.Module) -> list[nn.Parameter]:
+    """Return the matrices that features are multiplied with: a model's parameters with two sides that are no tables."""
+    tables = set(map(id, tables_of(model)))
+    return [weight for weight in model.parameters() if weight.ndim == 2 and id(weight) not in tables]

@@ -133,4 +133,4 @@ def directions_to_user(
 
 def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
     """Return how many of the user's units make one of the scene's."""
-    return float(torch.linalg.det(to_user[:3, :3])) ** (1 / 3)
+    return float(torch.linalg.det(to_user[:3, :3]).abs()) ** (1 / 3)

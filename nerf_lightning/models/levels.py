@@ -138,6 +138,7 @@ class RadianceModel(nn.Module):
         self.most_rays: int | None = None
         """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
         self.points_per_ray(training=False)  # levels that do not fit each other are refused here
+        self.register_load_state_dict_post_hook(_look_at_what_was_loaded)
 
     @property
     def level_names(self) -> tuple[str, ...]:
@@ -254,3 +255,7 @@ class RadianceModel(nn.Module):
 
     def _in_order(self) -> list[AnyLevel]:
         return cast(list[AnyLevel], list(self.levels.values()))
+
+
+def _look_at_what_was_loaded(model: RadianceModel, _: object) -> None:
+    model.require_sound_state()

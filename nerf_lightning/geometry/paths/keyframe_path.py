@@ -21,7 +21,6 @@ from nerf_lightning.geometry.poses import look_at
 from nerf_lightning.types.scene import Cameras
 
 FRAMES_WITHOUT_TIMES = 120
-"""An hour at 24 frames per second is less."""
 
 
 @final

@@ -11,6 +11,7 @@ from nerf_lightning.geometry.boxes import distances_in_box
 from nerf_lightning.kernels import backends
 from nerf_lightning.kernels.adam import adam_step, adam_step_torch
 from nerf_lightning.kernels.carving import possible_cells
+from nerf_lightning.kernels.compile import CPU_TWINS
 from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
 from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
 from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
@@ -111,8 +112,7 @@ def _twins(place: Place) -> list[Check]:
     if place.is_cuda:
         return [_loads("hash_grid_triton", "triton")]
     if place.device.type == "cpu":
-        names = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba", "carving_numba")
-        found = [_loads(name, "numba") for name in names]
+        found = [_loads(name, "numba") for name in CPU_TWINS]
         return [*found, _absent("hash_grid (triton)", "it is for GPUs, and the device here is the CPU")]
     return []
 

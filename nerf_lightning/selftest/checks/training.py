@@ -9,6 +9,7 @@ from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import on_device
 from nerf_lightning.encoders.base import tables_of
 from nerf_lightning.kernels.backends import can_compile, without
+from nerf_lightning.kernels.compile import CPU_TWINS
 from nerf_lightning.products import Products
 from nerf_lightning.schedules.exponential import ExponentialDecay
 from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart, relative
@@ -25,7 +26,7 @@ PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 
 LEARNT = 1e4
 """Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
 CPU = torch.device("cpu")
-TORCH_ALONE = ("hash_grid_numba", "march_numba", "packed_numba", "adam_numba", "carving_numba", "mlp_tiles")
+TORCH_ALONE = (*CPU_TWINS, "mlp_tiles")
 
 
 class Training:
