@@ -16,6 +16,8 @@ from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.closed_pipe import ends_quietly
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.escaping import for_terminal
+from nerf_lightning.loading import quick_imports
+from nerf_lightning.preparing import prepared
 from nerf_lightning.sweep_arguments import is_sweep, sweep_arguments
 
 if TYPE_CHECKING:
@@ -87,9 +89,10 @@ def _run(command: str, arguments: list[str]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    module = importlib.import_module(f"nerf_lightning.commands.{command}")
-
     def task(config: "DictConfig") -> Any:
+        # torch and Lightning take seconds, and --help needs neither.
+        with quick_imports():
+            module = importlib.import_module(f"nerf_lightning.commands.{command}")
         # A job of a sweep may be in another process than the command line was read in.
         allow(Budgets(**config.budgets))
         if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -105,8 +108,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
         arguments = options_first(arguments)
         allow_as_typed(arguments)
-        prepare = getattr(module, "prepare", list)
-        sys.argv = [f"nerf {command}", *options_first(prepare(sweep_arguments(arguments)))]
+        sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.commands.sweep import watched

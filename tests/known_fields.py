@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 
 from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.samplers.stratified import StratifiedSampler
 from nerf_lightning.types.renderings import FieldOutput
 
@@ -43,7 +43,7 @@ class SolidField(Field):
 
 def solid(distance: Distance, samples: int = 192, **settings) -> RadianceModel:
     """A model of one level."""
-    return RadianceModel({"fine": Level(StratifiedSampler(samples), SolidField(distance, **settings))}).eval()
+    return RadianceModel({"fine": DenseLevel(StratifiedSampler(samples), SolidField(distance, **settings))}).eval()
 
 
 def ball(radius: float = 0.8, center=(0.0, 0.0, 0.0)) -> Distance:

@@ -8,7 +8,7 @@ from nerf_lightning.encoders.frequency import FrequencyEncoder
 from nerf_lightning.fields.nerf_mlp import NerfMLP
 from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.samplers.importance import ImportanceSampler
 from nerf_lightning.samplers.stratified import StratifiedSampler
 from nerf_lightning.types.rays import RayBundle
@@ -72,8 +72,8 @@ def tiny_model(**changes) -> RadianceModel:
     torch.manual_seed(1)
     return RadianceModel(
         {
-            "coarse": Level(StratifiedSampler(8), tiny_field(**changes)),
-            "fine": Level(ImportanceSampler(8), tiny_field(**changes)),
+            "coarse": DenseLevel(StratifiedSampler(8), tiny_field(**changes)),
+            "fine": DenseLevel(ImportanceSampler(8), tiny_field(**changes)),
         }
     )
 

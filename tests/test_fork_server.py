@@ -22,7 +22,7 @@ def test_it_has_imported_everything_and_computed_nothing():
     code = """
 import sys, threading
 print(len(threading.enumerate()), open("/proc/self/status").read().split("Threads:")[1].split()[0])
-print({"nerf_lightning.commands.training", "numba", "lightning.pytorch", "hydra.main"} <= sys.modules.keys())
+print({"nerf_lightning.commands.train", "numba", "lightning.pytorch", "hydra.main"} <= sys.modules.keys())
 print({"pytest", "_pytest", "conftest"} & sys.modules.keys())
 import logging
 print(logging.getLogger().handlers, logging.getLogger("nerf_lightning").handlers)
@@ -31,7 +31,7 @@ print(logging.getLogger().handlers, logging.getLogger("nerf_lightning").handlers
 
 
 def test_warnings_are_filtered_as_in_a_process_of_its_own():
-    code = "import nerf_lightning.commands.training, warnings; print(*warnings.filters[-5:], sep='\\n')"
+    code = "import nerf_lightning.commands.train, warnings; print(*warnings.filters[-5:], sep='\\n')"
     alone = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert told(code) == (0, alone.stdout)
 

@@ -11,7 +11,7 @@ import gc
 from nerf_lightning.loading import quick_imports
 with quick_imports():
     print(gc.isenabled())
-    import nerf_lightning.commands.training
+    import nerf_lightning.commands.train
 print(gc.isenabled(), gc.get_freeze_count() > 100_000)
 """
 

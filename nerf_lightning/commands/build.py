@@ -18,13 +18,13 @@ from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.encoders.base import Encoder, matrices_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import AnyLevel, RadianceModel
+from nerf_lightning.models.levels import Level, RadianceModel
 from nerf_lightning.plain_yaml import plain_yaml
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.scene import Scene
 
-CONTRACTS = (Encoder, Field, AnySampler, AnyLevel, RadianceModel)
+CONTRACTS = (Encoder, Field, AnySampler, Level, RadianceModel)
 SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
 LARGEST_NUMBER = 1 << 53

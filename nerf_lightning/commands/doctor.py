@@ -1,10 +1,62 @@
 """Examine a capture before training: poses, lenses, photographs, near and far, with the cure for what is wrong."""
 
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+
 from omegaconf import DictConfig
+from rich.text import Text
+
+from nerf_lightning.commands.build import build
+from nerf_lightning.commands.console import StdoutConsole, say
+from nerf_lightning.commands.output_folder import output_folder
+from nerf_lightning.data.doctor.check import Check
+from nerf_lightning.data.doctor.examine import examine
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.doctor_picture import doctor_picture
+from nerf_lightning.export.json_file import write_json
+from nerf_lightning.export.pictures import save_png
+
+STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
 
 
 def run(config: DictConfig) -> int:
-    """Print and write the verdicts; return how many checks found something wrong."""
-    from nerf_lightning.commands.diagnosing import diagnose
+    """Do what the config says; return the number of checks whose verdict is `wrong`."""
+    started = time.monotonic()
+    scene = build(config.scene).read()
+    default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    folder = output_folder(config.paths.output_dir, default)
+    evidence, checks = examine(scene)
+    write_json(folder / "doctor.json", {"scene": scene.name, "checks": [asdict(check) for check in checks]})
+    save_png(folder / "doctor.png", doctor_picture(evidence, checks))
+    print_checks(checks)
+    seconds = time.monotonic() - started
+    say(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
+    say(f"written to  {folder / 'doctor.json'} and {folder / 'doctor.png'}")
+    return sum(check.verdict == "wrong" for check in checks)
 
-    return diagnose(config)
+
+def summary(checks: Sequence[Check]) -> str:
+    """Return one line.
+
+    >>> summary([Check("lens", "ok", "none"), Check("blur", "look", "2 of 50", "Remove them.")])
+    '1 ok, 1 to look at, 0 wrong'
+    """
+    counts = Counter(check.verdict for check in checks)
+    return f"{counts['ok']} ok, {counts['look']} to look at, {counts['wrong']} wrong"
+
+
+def print_checks(checks: Sequence[Check]) -> None:
+    """Print a line per check, what is wrong with its cure below."""
+    console = StdoutConsole(highlight=False, soft_wrap=True)
+    width = max(len(check.name) for check in checks)
+    for check in checks:
+        line = Text.assemble(
+            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {for_terminal(check.message)}"
+        )
+        console.print(line)
+        if check.cure:
+            console.print(Text(f"{'':<{width + 9}}cure: {for_terminal(check.cure)}"))

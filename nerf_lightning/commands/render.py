@@ -1,14 +1,70 @@
 """Make a video of a checkpoint along a camera path."""
 
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.loading import quick_imports
+from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
+from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
+from nerf_lightning.commands.film_settings import film_settings, listed
+from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.commands.processes import on_all_processes
+from nerf_lightning.commands.shots import Subject
+from nerf_lightning.data.checks import known_background
+from nerf_lightning.errors import InputError
 
 
 def run(config: DictConfig) -> None:
     """Render colour and depth."""
-    with quick_imports():
-        from nerf_lightning.commands.processes import on_all_processes
-        from nerf_lightning.commands.rendering import render
-
     on_all_processes("render", config, render)
+
+
+def render(config: DictConfig) -> None:
+    """Film one checkpoint, or several side by side; they are all that is needed."""
+    shown = film_settings(config)
+    settings = build(config.trainer)
+    settings.prepare_machine()
+    checkpoints = [read_checkpoint(path) for path in listed(config.ckpt)]
+    labels = labels_of(checkpoints, config.labels)
+    settings.keep_tile(checkpoints[0].tile_points)
+    path = build(config.path)
+    subjects = [
+        Subject(
+            settings.prepare(load_model(checkpoint)),
+            checkpoint.scene,
+            known_background(config.background or checkpoint.scene.background),
+            label,
+        )
+        for checkpoint, label in zip(checkpoints, labels, strict=True)
+    ]
+    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoints[0].path, "render"))
+    with torch.no_grad():
+        shown = replace(shown, precision=settings.precision)
+        written = film(subjects, path, settings.inference_tile_points, folder, shown)
+    say(*map(str, written))
+
+
+def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
+    """Return what checkpoints are called beside each other: as given, else after their run folders.
+
+    Raises:
+        InputError: there are more or fewer names than checkpoints.
+    """
+    if given is None:
+        names = [_run_name(checkpoint.path) for checkpoint in checkpoints]
+        twice = len(set(names)) < len(names)
+        return [f"{name} {each.path.stem}" if twice else name for name, each in zip(names, checkpoints, strict=True)]
+    labels = list(map(str, listed(given)))
+    if len(labels) != len(checkpoints):
+        raise InputError(f"labels={labels}: give one for each of the {len(checkpoints)} checkpoints, or null.")
+    return labels
+
+
+def _run_name(path: Path) -> str:
+    parent = path.absolute().parent
+    return parent.parent.name if parent.name == "checkpoints" else path.stem

@@ -1,50 +1,192 @@
 """Learn a radiance field from photographs with known cameras."""
 
+import logging
+from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.commands.slurm import was_requeued
+from nerf_lightning import ranks
+from nerf_lightning.callbacks.checkpoints import Checkpoints
+from nerf_lightning.callbacks.folder_guard import FolderGuard, require_run
+from nerf_lightning.callbacks.stop_signals import StopSignals
+from nerf_lightning.callbacks.time_budget import TimeBudget
+from nerf_lightning.callbacks.writers import errors_told_once
+from nerf_lightning.checkpoints import make_record, read_checkpoint
+from nerf_lightning.commands.build import build, build_system, load_weights
+from nerf_lightning.commands.finish import Finish
+from nerf_lightning.commands.former_overrides import to_give_again
+from nerf_lightning.commands.log_file import log_file
+from nerf_lightning.commands.memory_plan import announce_memory
+from nerf_lightning.commands.overrides import to_type
+from nerf_lightning.commands.preemption import preemptible, wants_restart
+from nerf_lightning.commands.processes import on_all_processes
+from nerf_lightning.commands.run_folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.commands.tensorboard import describe_run
+from nerf_lightning.commands.tile_choice import measured_tile
+from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.errors import InputError
-from nerf_lightning.loading import quick_imports
+from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.types.scene import Scene
+
+log = logging.getLogger(__name__)
 
 
-def prepare(arguments: list[str]) -> list[str]:
-    """Repeat the overrides that a run was started with where it is resumed by name; the user's own come after them.
+@dataclass
+class Parts:
+    """Everything that a run is made of, but for its place on the disk."""
 
-    Raises:
-        InputError: a sweep would begin where one has been.
-    """
-    _refuse_second_sweep(arguments)
-    resumed = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
-    if not resumed or resumed[-1] in ("auto", "null"):
-        return arguments
-    path = Path(resumed[-1].strip("'\""))
-    folder = path.parent.parent if path.suffix == ".ckpt" else path
-    # Imported late: --help needs no parser of overrides.
-    from nerf_lightning.commands.former_overrides import former_overrides
-
-    return [*former_overrides(folder, arguments), *arguments]
-
-
-def _refuse_second_sweep(arguments: list[str]) -> None:
-    values = dict(argument.partition("=")[::2] for argument in arguments)
-    folder = Path(values.get("hydra.sweep.dir", "").strip("'\""))
-    goes_on = values.get("sweep.resume", "").lower() == "true" or was_requeued()
-    if "hydra.sweep.dir" in values and not goes_on and next(folder.glob("*/run.json"), None) is not None:
-        raise InputError(
-            f"{folder} already holds runs of a sweep. Add sweep.resume=true to go on with it or to add to it, or give "
-            "another folder with paths.output_dir=DIR."
-        )
+    settings: TrainerSettings
+    scene: Scene
+    num_steps: int
+    data: RayDataModule
+    system: RadianceFieldSystem
+    signals: StopSignals
+    callbacks: list[Callback]
+    finish: Finish
 
 
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
-    # Imported late: torch and Lightning take seconds, and --help needs neither.
-    with quick_imports():
-        from nerf_lightning.commands.preemption import preemptible
-        from nerf_lightning.commands.processes import on_all_processes
-        from nerf_lightning.commands.training import train
-
     with preemptible():
         return on_all_processes("train", config, train)
+
+
+def train(config: DictConfig) -> float | None:
+    """Train as the config says; return the PSNR.
+
+    Raises:
+        SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
+    """
+    # Whatever is wrong with the input shows here, before a folder is taken.
+    parts = _build_parts(config)
+    held: list[RunFolder] = []
+    try:
+        path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
+        with errors_told_once(), log_file(path) if ranks.is_first() else nullcontext():
+            trainer = _fit(config, parts, path, former)
+            for folder in held:
+                folder.trained()
+            psnr, last_step = _finish(parts, path, trainer), trainer.global_step
+        for folder in held:
+            folder.finish(last_step, psnr)
+        return psnr
+    except SystemExit as stop:
+        for folder in held:
+            folder.stop(restarted=wants_restart(stop.code))
+        raise
+    except (InputError, OSError):
+        for folder in held:
+            require_run(folder.path)  # where it is gone, whatever failed has failed for that
+        raise
+    finally:
+        for folder in held:
+            folder.release()
+
+
+def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> tuple[Path, ResumePoint | None]:
+    """Let one process choose and hold the folder for all; return it, and where training goes on."""
+    folder = open_run(config, num_steps, job_folder())
+    held.append(folder)
+    write_config(folder.path, config, HydraConfig.get())
+    return folder.path, folder.resume_point()
+
+
+def _build_parts(config: DictConfig) -> Parts:
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    finish = Finish.from_config(config)
+    scene: Scene = build(config.scene).read()
+    finish.require_film(scene)
+    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
+    num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
+    choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
+    progress = Progress()
+    system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
+    if config.init_from is not None:
+        start = read_checkpoint(config.init_from)
+        load_weights(system.model, start)
+        system.start_weights = start.weights
+    system.initialize()
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    signals = StopSignals()
+    callbacks: list[Callback] = [signals, FolderGuard(), *build(config.callbacks).values()]
+    if "live_view" in config.viewer:
+        callbacks.append(build(config.viewer.live_view))
+    if config.budget.seconds is not None:
+        callbacks.append(TimeBudget(float(config.budget.seconds)))
+    # Checkpoints come last, so that they save what the others left.
+    callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
+    return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
+
+
+def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:
+    if former is not None:
+        log.info("going on from step %d of %s", former.step, folder)
+        parts.settings.keep_precision(former.precision)
+        parts.settings.keep_tile(former.tile_points)
+        parts.system.tile_points = parts.settings.tile_points
+    parts.settings.prepare(parts.system.model)
+    parts.system.record["precision"] = parts.settings.precision
+    if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
+        tile = ranks.from_first(lambda: measured_tile(parts.settings, parts.system, parts.data.batches))
+        parts.system.tile_points = parts.settings.tile_points = tile
+    if ranks.is_first():
+        announce_memory(parts.settings, parts.system, parts.data)
+    if parts.settings.compile:
+        log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
+    trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
+    _announce(parts, folder, former)
+    if former is None:
+        describe_run(trainer.loggers, config)
+    checkpoint = None if former is None else former.checkpoint
+    trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
+    if parts.signals.received is not None:
+        log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
+        raise SystemExit(128 + parts.signals.received)
+    return trainer
+
+
+def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
+    psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder)
+    for logger in trainer.loggers:
+        logger.finalize("success")
+    return psnr
+
+
+def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
+    parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
+    tile = parts.system.tile_points
+    log.info(
+        "run folder %s: %d steps of %d rays, %s parameters, %s, %s",
+        folder,
+        parts.num_steps,
+        parts.data.batches.batch_rays,
+        f"{parameters:,}",
+        parts.settings.describe(),
+        "whole batches" if tile is None else f"tiles of {tile} points",
+    )
+
+
+def _loggers(config: DictConfig, folder: Path, former: ResumePoint | None) -> list[Logger]:
+    if not ranks.is_first():
+        return []
+    purge: dict[str, Any] = {}
+    if (folder / "tensorboard").exists():
+        # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
+        purge = {"purge_step": 0 if former is None else former.step + 1}
+    return [partial(save_dir=folder, **purge) for partial in build(config.logger).values()]
+
+
+def _resume_command(folder: Path) -> str:
+    again = to_give_again(HydraConfig.get().overrides.task)
+    return " ".join(["nerf train", to_type("resume", str(folder)), *again])

@@ -1,39 +1,106 @@
 """Look around in a checkpoint, in the browser."""
 
 import logging
+import signal
+import webbrowser
+from types import FrameType
+from urllib.parse import urlsplit
 
 from omegaconf import DictConfig
 
-from nerf_lightning.loading import quick_imports
+from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
+from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.commands.console import say
+from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
+from nerf_lightning.commands.recorded_frame import in_recorded_frame
+from nerf_lightning.data.checks import known_background
+from nerf_lightning.errors import InputError
+from nerf_lightning.types.scene import Scene
+from nerf_lightning.viewer.admission import named_places
+from nerf_lightning.viewer.look import Look
+from nerf_lightning.viewer.page import Page, require_viser
+from nerf_lightning.viewer.photographs import Photographs
+from nerf_lightning.viewer.slices import SlicedRenderer
+from nerf_lightning.viewer.studio import Studio
+
+WARM_UP_HEIGHT = 64
+IDLE_SECONDS = 0.2
 
 log = logging.getLogger(__name__)
 
 
-def prepare(arguments: list[str]) -> list[str]:
-    """Name the run's own scene where the user names none: its photographs are shown where they can be read.
-
-    Raises:
-        InputError: the checkpoint cannot be read, or photographs are wished for and nobody knows which.
-    """
-    from nerf_lightning.commands import eval as evaluation
-    from nerf_lightning.errors import InputError
-
-    try:
-        return evaluation.prepare(arguments)
-    except InputError as error:
-        from nerf_lightning.commands.recorded_scene import UnknownScene
-
-        wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
-        if not isinstance(error, UnknownScene) or "true" in map(str.lower, wished[-1:]):
-            raise
-        if not wished:
-            log.warning("The cameras are shown without their photographs: %s", error)
-        return ["photographs=false", *arguments]
-
-
 def run(config: DictConfig) -> None:
-    """Show the page until Ctrl-C."""
-    with quick_imports():
-        from nerf_lightning.commands.viewing import view
+    """Serve the page until Ctrl-C or SIGTERM."""
+    require_viser()
+    named_places(config.viewer.hosts)
+    settings = build(config.trainer)
+    settings.prepare_machine()
+    checkpoint = read_checkpoint(config.ckpt)
+    settings.keep_tile(checkpoint.tile_points)
+    model = settings.prepare(load_model(checkpoint))
+    record = checkpoint.scene
+    background = known_background(config.background or record.background)
+    scene = _scene(config, record) if config.photographs else None
+    # Made when somebody saves something: a checkpoint may lie where nothing can be written.
+    folder = chosen_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
+    renderer = SlicedRenderer(model, record, background, settings.inference_tile_points)
+    warm_up(renderer)
+    studio = Studio(renderer)
+    where = config.host, config.port, config.max_height, config.viewer.hosts
+    page = Page(studio, Photographs(record, scene, background), folder, *where)
+    stopped = _stop_signals()
+    say(f"The page is at {page.address} (Ctrl-C ends it)")
+    if config.open_browser:
+        open_browser(page.address)
+    try:
+        while not stopped:
+            if not studio.work():
+                studio.wait(IDLE_SECONDS)
+    finally:
+        page.close()
 
-    view(config)
+
+def warm_up(renderer: SlicedRenderer) -> None:
+    """Render a small picture from the first photograph's place: kernels are loaded, the speed is known."""
+    c2w = renderer.scene.cameras.c2w[0]
+    for _ in range(2):
+        for _ in renderer.slices(Look(c2w, 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT), WARM_UP_HEIGHT):
+            pass
+
+
+def open_browser(address: str) -> None:
+    """Open the page in the user's browser, or say why not."""
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        log.warning(
+            "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
+            "ssh -L %s:%s THIS_MACHINE.",
+            address,
+            urlsplit(address).port,
+            urlsplit(address).netloc,
+        )
+
+
+def _scene(config: DictConfig, record: SceneRecord) -> Scene | None:
+    try:
+        return in_recorded_frame(build(config.scene).read(), record)
+    except InputError as error:
+        log.warning("The cameras are shown without their photographs: %s", error)
+    except OSError as error:
+        log.warning("The cameras are shown without their photographs, which cannot be read: %s", error)
+    return None
+
+
+def _stop_signals() -> list[int]:
+    """Return a list that a SIGINT or SIGTERM is put into: the slice that is being rendered ends first."""
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
+    return received

@@ -4,11 +4,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import AnyLevel
+from nerf_lightning.models.levels import Level
 from nerf_lightning.samplers.occupancy import OccupancySampler
 
 
-class GridLevel(AnyLevel):
+class GridLevel(Level):
     """The contract of a level that computes only what an occupancy grid does not rule out."""
 
     sampler: OccupancySampler

@@ -18,7 +18,7 @@ from nerf_lightning.types.renderings import DenseRendering, FieldOutput, Renderi
 from nerf_lightning.types.scene import Scene
 
 
-class AnyLevel(nn.Module):
+class Level(nn.Module):
     """The contract of a level: one round of sampling and rendering."""
 
     sampler: AnySampler
@@ -84,7 +84,7 @@ class AnyLevel(nn.Module):
         self.field.reset_parameters()
 
 
-class Level(AnyLevel):
+class DenseLevel(Level):
     """A level in which every ray has the same number of samples."""
 
     sampler: Sampler
@@ -132,7 +132,7 @@ class RadianceModel(nn.Module):
         levels: name -> level, in order.
     """
 
-    def __init__(self, levels: dict[str, AnyLevel]):
+    def __init__(self, levels: dict[str, Level]):
         super().__init__()
         self.levels = nn.ModuleDict(levels)
         self.most_rays: int | None = None
@@ -169,7 +169,7 @@ class RadianceModel(nn.Module):
         return max(counts)
 
     @property
-    def last(self) -> AnyLevel:
+    def last(self) -> Level:
         """The level whose picture counts."""
         return self._in_order()[-1]
 
@@ -253,8 +253,8 @@ class RadianceModel(nn.Module):
         for level in self._in_order():
             level.reset_parameters()
 
-    def _in_order(self) -> list[AnyLevel]:
-        return cast(list[AnyLevel], list(self.levels.values()))
+    def _in_order(self) -> list[Level]:
+        return cast(list[Level], list(self.levels.values()))
 
 
 def _look_at_what_was_loaded(model: RadianceModel, _: object) -> None:

@@ -3,12 +3,12 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.models.levels import Level
+from nerf_lightning.models.levels import DenseLevel
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.types.renderings import FieldOutput
 
 
-class ProposalLevel(Level):
+class ProposalLevel(DenseLevel):
     """Sample, ask the field for density alone, and hand the weights on; its picture is black."""
 
     has_color = False

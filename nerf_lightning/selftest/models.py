@@ -15,7 +15,7 @@ from nerf_lightning.fields.nerf_mlp import NerfMLP
 from nerf_lightning.losses.base import Loss
 from nerf_lightning.losses.mse import MeanSquaredError
 from nerf_lightning.losses.proposal import ProposalLoss
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.models.masked_level import MaskedLevel
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.proposal_level import ProposalLevel
@@ -63,7 +63,7 @@ def hash_field(levels: int, features: int, width: int) -> HashField:
 
 def coarse_and_fine() -> RadianceModel:
     """Return the original method: two MLPs, stratified and importance samples."""
-    coarse, fine = Level(StratifiedSampler(16), mlp_field()), Level(ImportanceSampler(16), mlp_field())
+    coarse, fine = DenseLevel(StratifiedSampler(16), mlp_field()), DenseLevel(ImportanceSampler(16), mlp_field())
     return RadianceModel({"coarse": coarse, "fine": fine})
 
 
@@ -79,7 +79,7 @@ def behind_a_grid(level: type[PackedLevel] | type[MaskedLevel], sampler: type[Oc
 def with_proposals() -> RadianceModel:
     """Return two hash grids, the first of which proposes where to look."""
     proposal = ProposalLevel(StratifiedSampler(32), hash_field(3, 2, 16))
-    return RadianceModel({"proposal": proposal, "fine": Level(ProposalSampler(16), hash_field(4, 4, 32))})
+    return RadianceModel({"proposal": proposal, "fine": DenseLevel(ProposalSampler(16), hash_field(4, 4, 32))})
 
 
 def _adam(groups: Iterable[Any]) -> Optimizer:

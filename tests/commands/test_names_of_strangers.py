@@ -23,7 +23,7 @@ from scenes import ball_scene
 
 from nerf_lightning.checkpoints import scene_record
 from nerf_lightning.commands.console import say
-from nerf_lightning.commands.evaluating import metric_lines
+from nerf_lightning.commands.finish import metric_lines
 from nerf_lightning.commands.kept_views import picture_name
 from nerf_lightning.commands.metrics_files import METRICS, summary, write_metrics
 from nerf_lightning.commands.protocol import split_hash

@@ -25,7 +25,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
 from nerf_lightning.geometry.paths.look_at import LookAt
 from nerf_lightning.geometry.paths.orbit import Orbit
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.samplers.stratified import StratifiedSampler
 
 # Takes x to y, y to z and z to x: boxes stay boxes.
@@ -115,7 +115,7 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path, arguments, words):
 
 
 def test_a_model_of_one_level_has_no_difference_of_levels(tmp_path):
-    model = RadianceModel({"fine": Level(StratifiedSampler(8), tiny_field())})
+    model = RadianceModel({"fine": DenseLevel(StratifiedSampler(8), tiny_field())})
     subject, settings = Subject(model, scene_record(ball_scene()), "white"), FilmSettings(outputs=("levels",))
     with pytest.raises(InputError, match=r"this model has one level that makes pictures.*model=nerf"):
         film([subject], Orbit(2), 1000, tmp_path, settings)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from measured_runs import leave_measured_run
 
-from nerf_lightning.commands.tabulating import folder_for
+from nerf_lightning.commands.table import folder_for
 from nerf_lightning.export.atomic import whole_file
 
 

@@ -15,8 +15,9 @@ from running import said, start
 from support.ports import unused_port
 from viser_client import ViserClient
 
-from nerf_lightning.commands import view, viewing
+from nerf_lightning.commands import view
 from nerf_lightning.errors import InputError
+from nerf_lightning.preparing import prepared
 from nerf_lightning.viewer import page as page_module
 
 
@@ -147,7 +148,7 @@ def folder_of_page(monkeypatch):
         folders.append(folder)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(viewing, "Page", opened)
+    monkeypatch.setattr(view, "Page", opened)
     return folders
 
 
@@ -176,20 +177,20 @@ def of_unknown_scene(tmp_path):
 
 def test_why_there_are_no_photographs_is_said(of_unknown_scene, caplog):
     given = [f"ckpt={of_unknown_scene}", "port=9000"]
-    assert view.prepare(given) == ["photographs=false", *given]
+    assert prepared("view", given) == ["photographs=false", *given]
     assert "shown without their photographs" in caplog.text
     assert "was trained on the scene 'x', which conf/scene/ lacks. Name the scene: add scene=" in caplog.text
 
 
 def test_photographs_that_nobody_knows_are_not_guessed(of_unknown_scene, caplog):
     with pytest.raises(InputError, match="was trained on the scene 'x'"):
-        view.prepare([f"ckpt={of_unknown_scene}", "photographs=true"])
-    assert view.prepare([f"ckpt={of_unknown_scene}", "photographs=false"])[0] == "photographs=false"
+        prepared("view", [f"ckpt={of_unknown_scene}", "photographs=true"])
+    assert prepared("view", [f"ckpt={of_unknown_scene}", "photographs=false"])[0] == "photographs=false"
     assert not caplog.text
 
 
 def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):
-    monkeypatch.setattr(viewing.webbrowser, "open", lambda address: False)
-    viewing.open_browser("http://127.0.0.1:8080/?token=x")
+    monkeypatch.setattr(view.webbrowser, "open", lambda address: False)
+    view.open_browser("http://127.0.0.1:8080/?token=x")
     assert "There is no browser here to open. Open http://127.0.0.1:8080/?token=x in one yourself" in caplog.text
     assert "ssh -L 8080:127.0.0.1:8080 THIS" in caplog.text

@@ -13,12 +13,11 @@ from measured_runs import leave_measured_run
 from support.fuzzing import fuzzed, harmless
 from support.mutations import damaged, damaged_text, mutated
 
+from nerf_lightning.commands import report, table
 from nerf_lightning.commands.former_overrides import former_overrides, former_sweep
-from nerf_lightning.commands.reporting import report
 from nerf_lightning.commands.run_folder import open_run
 from nerf_lightning.commands.run_identity import fingerprint, run_identity
 from nerf_lightning.commands.sweep_record import SweepRecord
-from nerf_lightning.commands.tabulating import tabulate
 from nerf_lightning.escaping import FORMULAS
 
 OVERRIDES = ("scene=blender", "model=fast", "optimizer.lr=2e-3", "scene.root='my data'")
@@ -96,7 +95,7 @@ def replaced(folder):
 def test_table(folder, run, replaced, data):
     path = run / data.draw(st.sampled_from(FILES[:4]))
     settings = (f"runs={folder / 'runs'}", f"paths.output_dir={folder / 'out'}")
-    replaced(path, data.draw(damage(path)), tabulate, composed("table", *settings, "force=true"))
+    replaced(path, data.draw(damage(path)), table.run, composed("table", *settings, "force=true"))
     text = (folder / "out" / "table.csv").read_text()
     for row in csv.reader(text.splitlines()):
         assert not [
@@ -112,7 +111,7 @@ def test_table(folder, run, replaced, data):
 def test_report(folder, run, replaced, data):
     path = run / data.draw(st.sampled_from(FILES))
     settings = (f"run={run}", f"paths.output_dir={folder / 'page'}", "doctor=false")
-    if replaced(path, data.draw(damage(path)), report, composed("report", *settings)) is not None:
+    if replaced(path, data.draw(damage(path)), report.run, composed("report", *settings)) is not None:
         assert "<script>alert" not in (folder / "page" / "report.html").read_text()
 
 

@@ -13,7 +13,7 @@ from nerf_lightning.fields.hash_field import HashField
 from nerf_lightning.fields.nerf_mlp import NerfMLP
 from nerf_lightning.losses.mse import MeanSquaredError
 from nerf_lightning.losses.proposal import ProposalLoss
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.proposal_level import ProposalLevel
 from nerf_lightning.optimizers.table_adam import TableAdam
@@ -36,8 +36,8 @@ FIELDS = {
 }
 MODELS = {
     "coarse and fine": lambda field: {
-        "coarse": Level(StratifiedSampler(12), field()),
-        "fine": Level(ImportanceSampler(12), field()),
+        "coarse": DenseLevel(StratifiedSampler(12), field()),
+        "fine": DenseLevel(ImportanceSampler(12), field()),
     },
     "occupancy": lambda field: {"fine": PackedLevel(OccupancySampler(resolution=16, num_steps=48), field())},
     "cascades": lambda field: {
@@ -45,7 +45,7 @@ MODELS = {
     },
     "proposal": lambda field: {
         "proposal": ProposalLevel(StratifiedSampler(24), field()),
-        "fine": Level(ProposalSampler(16), field()),
+        "fine": DenseLevel(ProposalSampler(16), field()),
     },
 }
 PAIRS = [("frequency", "frequency"), ("gaussian_fourier", "spherical_harmonics"), ("hash_grid", "spherical_harmonics")]

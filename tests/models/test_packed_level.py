@@ -4,7 +4,7 @@ import pytest
 import torch
 from scenes import ball_scene, some_rays, tiny_field
 
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.models.masked_level import MaskedLevel
 from nerf_lightning.models.packed_level import PackedLevel
 from nerf_lightning.models.pictures import render_picture
@@ -28,7 +28,7 @@ def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
     inside = level.sampler.start(rays, None)
     hit = inside.enter < inside.leave
     near, far = inside.enter, torch.maximum(inside.leave, inside.enter + 1e-3)
-    dense = Level(StratifiedSampler(400), level.field)
+    dense = DenseLevel(StratifiedSampler(400), level.field)
     boxed = replace(rays, near=near, far=far)
     expected = dense(boxed, background, [], None)
     with torch.no_grad():

@@ -8,7 +8,7 @@ import torch
 from nerf_lightning.fields.base import Field
 from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.geometry.clipping import Clip, CropBox
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import DenseLevel, RadianceModel
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.models.proposal_level import ProposalLevel
 from nerf_lightning.samplers.stratified import StratifiedSampler
@@ -39,7 +39,7 @@ def test_depth_in_normalised_device_coordinates_is_distance_in_the_world(depth):
     c2w[0, :, 3] = torch.tensor([0.2, -0.1, 0.3])
     straight = pinhole_cameras(c2w, 10.0, 12, 9)
     bent = replace(straight, ndc=torch.tensor([[10 / 6, 10 / 4.5]]))
-    model = RadianceModel({"only": Level(StratifiedSampler(4000), Wall(1 - 2 / depth))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(1 - 2 / depth))})
     near, far = torch.zeros(1), torch.ones(1)
     picture = render_picture(model, bent, 0, near, far, "black", tile_points=100_000)
     rays = rays_through_pixels(straight, all_pixels(straight, 0), near, far)
@@ -50,7 +50,7 @@ def test_depth_in_normalised_device_coordinates_is_distance_in_the_world(depth):
 
 def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stays():
     bent = replace(pinhole_cameras(torch.eye(4)[:3][None], 10.0, 12, 9), ndc=torch.tensor([[10 / 6, 10 / 4.5]]))
-    model = RadianceModel({"only": Level(StratifiedSampler(4000), Wall(1 - 2 / 3.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(1 - 2 / 3.0))})
     near, far = torch.zeros(1), torch.ones(1)
     for box, seen in (((-2.5, -3.5), 1.0), ((-1.5, -2.5), 0.0)):
         clip = Clip(box=CropBox.from_user((-9.0, -9.0, box[1]), (9.0, 9.0, box[0]), torch.eye(4)))
@@ -63,7 +63,7 @@ def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stay
 
 def test_where_nothing_is_the_depth_is_far_and_finite():
     bent = replace(pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4), ndc=torch.tensor([[5.0, 5.0]]))
-    model = RadianceModel({"only": Level(StratifiedSampler(8), Wall(2.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(8), Wall(2.0))})
     picture = render_picture(model, bent, 0, torch.zeros(1), torch.ones(1), "black", tile_points=1000)
     assert bool((torch.isfinite(picture.depth) & (picture.depth > 100)).all())
     assert float(picture.opacity.max()) == 0.0
@@ -71,7 +71,7 @@ def test_where_nothing_is_the_depth_is_far_and_finite():
 
 def test_elsewhere_depth_is_the_distance_along_the_ray():
     cameras = pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4)
-    model = RadianceModel({"only": Level(StratifiedSampler(4000), Wall(-3.0, behind=-1.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(-3.0, behind=-1.0))})
     picture = render_picture(model, cameras, 0, torch.full((1,), 1.0), torch.full((1,), 6.0), "black", 100_000)
     rays = rays_through_pixels(cameras, all_pixels(cameras, 0), torch.zeros(1), torch.ones(1))
     torch.testing.assert_close(picture.depth, 3.0 / -rays.directions[..., 2], rtol=0.01, atol=0)
@@ -95,7 +95,7 @@ def ball_picture(model, clip=None, seen_from=None):
 
 
 def test_outside_of_the_box_nothing_is_shown():
-    model = RadianceModel({"only": Level(StratifiedSampler(2000), Ball(1.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(2000), Ball(1.0))})
     left = Clip(box=CropBox.from_user((-2.0, -2.0, -4.5), (0.0, 2.0, -3.5), torch.eye(4)))
     picture = ball_picture(model, left)
     assert float(picture.opacity[4, 2]) == pytest.approx(1.0)
@@ -107,7 +107,7 @@ def test_outside_of_the_box_nothing_is_shown():
 
 
 def test_rays_that_miss_the_box_are_not_rendered(monkeypatch):
-    model = RadianceModel({"only": Level(StratifiedSampler(10), Ball(1.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(10), Ball(1.0))})
     asked = []
     monkeypatch.setattr(Ball, "density", lambda self, positions: asked.append(positions) or positions[..., 0])
     ball_picture(model, Clip(box=CropBox.from_user((-2.0, -2.0, -4.5), (0.0, 2.0, -3.5), torch.eye(4))))
@@ -116,13 +116,13 @@ def test_rays_that_miss_the_box_are_not_rendered(monkeypatch):
 
 
 def test_a_later_near_looks_into_things():
-    model = RadianceModel({"only": Level(StratifiedSampler(2000), Ball(1.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(2000), Ball(1.0))})
     assert float(ball_picture(model).depth[4, 4]) == pytest.approx(3.0, abs=0.01)
     assert float(ball_picture(model, Clip(near=4.0)).depth[4, 4]) == pytest.approx(4.0, abs=0.01)
 
 
 def test_colour_can_be_looked_up_from_elsewhere():
-    model = RadianceModel({"only": Level(StratifiedSampler(100), Ball(1.0))})
+    model = RadianceModel({"only": DenseLevel(StratifiedSampler(100), Ball(1.0))})
     aside = torch.tensor([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]])
     plain, seen = ball_picture(model), ball_picture(model, seen_from=pinhole_cameras(aside[None], 20.0, 9, 9))
     torch.testing.assert_close(plain.depth, seen.depth)
@@ -131,7 +131,7 @@ def test_colour_can_be_looked_up_from_elsewhere():
 
 
 def test_the_first_picture_of_several_levels_is_kept():
-    small, large = Level(StratifiedSampler(400), Ball(0.5)), Level(StratifiedSampler(400), Ball(1.0))
+    small, large = DenseLevel(StratifiedSampler(400), Ball(0.5)), DenseLevel(StratifiedSampler(400), Ball(1.0))
     picture = ball_picture(RadianceModel({"coarse": small, "fine": large}), Clip(near=2.5))
     torch.testing.assert_close(picture.first_rgb[4, 4], picture.rgb[4, 4])
     assert float(picture.first_rgb[4, 1].max()) == 0.0

@@ -16,7 +16,7 @@ from running import FAST, start
 from support.altered import Altered
 
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
-from nerf_lightning.commands.training import _build_parts
+from nerf_lightning.commands.train import _build_parts
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.system import RadianceFieldSystem
 
