@@ -25,10 +25,10 @@ class PeakBytes(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run the operation, and look at what went in and what came out."""
         kwargs = kwargs or {}
-        for tensor in _tensors((args, kwargs)):
+        for tensor in _tensors_in((args, kwargs)):
             self._watch(tensor, is_new=False)
         out = func(*args, **kwargs)
-        for tensor in _tensors(out):
+        for tensor in _tensors_in(out):
             self._watch(tensor, is_new=True)
         return out
 
@@ -55,12 +55,12 @@ def peak_bytes(work: Callable[[], Any], device: torch.device) -> int:
     return counter.most
 
 
-def _tensors(tree: Any) -> Iterator[Tensor]:
+def _tensors_in(tree: Any) -> Iterator[Tensor]:
     # What operations take and return is nested no deeper than lists; torch's own flattening takes as long as they do.
     if isinstance(tree, Tensor):
         yield tree
     elif isinstance(tree, (tuple, list)):
         for part in tree:
-            yield from _tensors(part)
+            yield from _tensors_in(part)
     elif isinstance(tree, dict):
-        yield from _tensors(list(tree.values()))
+        yield from _tensors_in(list(tree.values()))
