@@ -9,7 +9,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from nerf_lightning.budgets import require_within
+from nerf_lightning.budgets import allowed, require_within
 from nerf_lightning.checkpoints import Checkpoint
 from nerf_lightning.commands import xla
 from nerf_lightning.commands.schema import require_fitting_values
@@ -61,7 +61,7 @@ def build_system(
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
-    _require_few_samples(model, "The model")
+    hold_to_budgets(model, "The model")
     model.place(scene)
     return RadianceFieldSystem(
         model=model,
@@ -99,12 +99,24 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     _require_fitting(shapes, checkpoint)
     model = _built(config, checkpoint)
     load_weights(model, checkpoint)
-    _require_few_samples(model, f"The model of {checkpoint.path}")
+    hold_to_budgets(model, f"The model of {checkpoint.path}")
     require_within("layer_width", _widest(model), f"The model of {checkpoint.path}", "features of one point in a layer")
     return model.eval()
 
 
-def _require_few_samples(model: RadianceModel, where: str) -> None:
+def hold_to_budgets(model: RadianceModel, where: str) -> None:
+    """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
+
+    Args:
+        model: the model.
+        where: it comes from, for the message.
+
+    Raises:
+        InputError: see `budgets.samples_per_ray`.
+    """
+    for part in model.modules():
+        if isinstance(part, AnySampler):
+            part.max_intervals = allowed().intervals
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 

@@ -5,16 +5,13 @@ import importlib
 import logging
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 
 import torch
-
-from nerf_lightning.errors import InputError
-from nerf_lightning.files.own import make_own_folder
 
 log = logging.getLogger(__name__)
 
@@ -133,13 +130,18 @@ def _configure_numba() -> None:
 
 def _require_own_cache(folder: str) -> None:
     """Let numba read nothing of a folder that others can write to: what it keeps there are programs, and pickles."""
-    if folder:
-        try:
-            make_own_folder(Path(folder), "NUMBA_CACHE_DIR")
-        except InputError as error:
-            _cache_elsewhere(str(error))
-        except OSError:
-            pass  # numba itself notices
+    if not folder:
+        return
+    try:
+        os.makedirs(folder, mode=0o700, exist_ok=True)
+        about = os.stat(folder)
+    except OSError:
+        return  # numba itself notices
+    if hasattr(os, "geteuid") and (about.st_uid != os.geteuid() or stat.S_IMODE(about.st_mode) & 0o022):
+        _cache_elsewhere(
+            f"NUMBA_CACHE_DIR is {folder}, which belongs to somebody else or can be written by others "
+            f"(mode {stat.S_IMODE(about.st_mode):04o}). Name a folder of your own with NUMBA_CACHE_DIR."
+        )
 
 
 @functools.cache

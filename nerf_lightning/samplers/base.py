@@ -13,6 +13,9 @@ from nerf_lightning.types.scene import Scene
 class AnySampler(nn.Module):
     """What chooses where along rays to ask the field, in whatever layout."""
 
+    max_intervals: int = 1 << 17
+    """So many steps at most are taken along a ray: near and far may come out of a file."""
+
     def place(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.geometry.contracted import Contracted
@@ -206,7 +205,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             self._require_few((far - near) / step if not self.cone_angle else 0.0)
             while edges[-1] <= far:
                 edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
-                if len(edges) > allowed().intervals:  # of a narrow cone, whose intervals hardly grow
+                if len(edges) > self.max_intervals:  # of a narrow cone, whose intervals hardly grow
                     self._require_few(max((far - near) / step, len(edges)))
             edges.append(2 * edges[-1] - edges[-2])
             self._lattice = torch.tensor(edges)
@@ -234,10 +233,10 @@ class OccupancySampler(OccupancyGrid, AnySampler):
 
     def _require_few(self, intervals: float) -> None:
         """Refuse a march that would not end: near, far and the box may come out of a file."""
-        if not intervals <= allowed().intervals:
+        if not intervals <= self.max_intervals:
             raise InputError(
                 f"A ray from near to far would be cut into {intervals:.3g} intervals of {self.step_size:.3g} scene "
-                f"units, and more than {allowed().intervals:,} are not taken. Give a smaller sampler.num_steps, or a "
+                f"units, and more than {self.max_intervals:,} are not taken. Give a smaller sampler.num_steps, or a "
                 "larger box; or add budgets.intervals=N."
             )
 

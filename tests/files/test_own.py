@@ -2,6 +2,7 @@
 
 import logging
 import os
+from pathlib import Path
 
 import numba
 import pytest
@@ -139,7 +140,7 @@ def test_numba_reads_no_programs_from_a_folder_of_others(tmp_path, monkeypatch, 
     with caplog.at_level(logging.WARNING):
         backends._configure_numba()
     assert str(tmp_path / "own") != numba.config.CACHE_DIR
-    assert mode(backends.Path(numba.config.CACHE_DIR)) == 0o700
+    assert mode(Path(numba.config.CACHE_DIR)) == 0o700
     assert "can be written by others (mode 0777)" in caplog.text
     assert "own with NUMBA_CACHE_DIR." in caplog.text
     backends._cache_elsewhere.cache_clear()
