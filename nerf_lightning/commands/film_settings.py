@@ -1,10 +1,9 @@
 """What `nerf render` films, as its config says it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
-
-from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.panels import FILMS
@@ -34,8 +33,8 @@ class FilmSettings:
     """What the models compute in, as the caller has seen to; frames of another precision belong to another film."""
 
 
-def film_settings(config: DictConfig) -> FilmSettings:
-    """Return what is to be filmed.
+def film_settings(config: Mapping[str, Any]) -> FilmSettings:
+    """Return what is to be filmed, by settings that are plain values.
 
     Raises:
         InputError: an output, a form, a box or a distance that makes no film.
@@ -43,24 +42,24 @@ def film_settings(config: DictConfig) -> FilmSettings:
     for name in SWITCHES:
         if not isinstance(config[name], bool):
             raise InputError(f"{name}={config[name]} does not fit: it must be true or false.")
-    outputs = tuple(map(str, listed(config.outputs)))
+    outputs = tuple(map(str, listed(config["outputs"])))
     if not outputs or len(set(outputs)) < len(outputs) or not set(outputs) <= set(FILMS):
         raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
-    if config.format not in ("video", "frames"):
-        raise InputError(f"format={config.format}: choose video (mp4) or frames (PNG files).")
+    if config["format"] not in ("video", "frames"):
+        raise InputError(f"format={config['format']}: choose video (mp4) or frames (PNG files).")
     return FilmSettings(
         outputs=outputs,
-        mosaic=config.mosaic,
-        form=config.format,
-        near=_near(config.near),
-        crop=_crop(config.crop),
-        hold_camera=config.hold_camera,
+        mosaic=config["mosaic"],
+        form=config["format"],
+        near=_near(config["near"]),
+        crop=_crop(config["crop"]),
+        hold_camera=config["hold_camera"],
     )
 
 
 def listed(value: Any) -> list[Any]:
     """Return one value or a list of them as a list."""
-    return list(value) if OmegaConf.is_list(value) else [value]
+    return list(value) if isinstance(value, list) else [value]
 
 
 def _near(value: Any) -> float | None:
@@ -71,10 +70,9 @@ def _near(value: Any) -> float | None:
     return float(value)
 
 
-def _crop(value: Any) -> tuple[Corner, Corner] | None:
-    if value is None:
+def _crop(corners: Any) -> tuple[Corner, Corner] | None:
+    if corners is None:
         return None
-    corners = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
     if not isinstance(corners, list) or len(corners) != 2 or not all(map(is_point, corners)):
         raise InputError(
             f"crop={corners}: give the lower and the upper corner of a box in the capture's own frame, "

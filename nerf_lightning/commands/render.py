@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
 from nerf_lightning.commands.build import build, load_model
@@ -26,11 +26,12 @@ def run(config: DictConfig) -> None:
 
 def render(config: DictConfig) -> None:
     """Film one checkpoint, or several side by side; they are all that is needed."""
-    shown = film_settings(config)
+    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    shown = film_settings(plain)
     settings = build(config.trainer)
     settings.prepare_machine()
-    checkpoints = [read_checkpoint(path) for path in listed(config.ckpt)]
-    labels = labels_of(checkpoints, config.labels)
+    checkpoints = [read_checkpoint(path) for path in listed(plain["ckpt"])]
+    labels = labels_of(checkpoints, plain["labels"])
     settings.keep_tile(checkpoints[0].tile_points)
     path = build(config.path)
     subjects = [
