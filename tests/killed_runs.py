@@ -26,7 +26,7 @@ from pathlib import Path
 import torch
 
 from nerf_lightning import cli
-from nerf_lightning.commands import training  # noqa: F401 - what a fork need not import again
+from nerf_lightning.commands import train  # noqa: F401 - what a fork need not import again
 
 PLACES = ("before torch.save", "amid torch.save", "after torch.save", "before fsync", "before unlink", "after unlink",
           "before link", "after link", "before replace", "after replace")  # fmt: skip
