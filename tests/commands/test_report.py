@@ -105,12 +105,12 @@ def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
 
 
 def test_photographs_on_a_disk_that_fails_are_left_out(nerf, finished_run, tmp_path, monkeypatch):
-    from nerf_lightning.commands import reporting
+    from nerf_lightning.commands import report
 
     def fail(*_):
         raise OSError(5, "Input/output error", "photographs/IMG_7.jpg")
 
-    monkeypatch.setattr(reporting, "examine", fail)
+    monkeypatch.setattr(report, "examine", fail)
     result = nerf("report", finished_run, f"paths.output_dir={tmp_path}")
     assert result.code == 0, result.err
     assert "left out     The doctor: photographs/IMG_7.jpg: Input/output error" in result.out

@@ -5,7 +5,7 @@ import json
 import pytest
 from self_tested import Finished
 
-from nerf_lightning.commands import selftesting
+from nerf_lightning.commands import selftest
 from nerf_lightning.kernels import hash_grid_numba
 from nerf_lightning.selftest.checks import kernels
 
@@ -13,8 +13,8 @@ from nerf_lightning.selftest.checks import kernels
 @pytest.fixture
 def kernels_alone(monkeypatch):
     """Without the trainings and the command line, which take most of the time."""
-    monkeypatch.setattr(selftesting, "Runs", lambda folder, overrides: Finished(folder))
-    monkeypatch.setattr(selftesting, "find_checks", kernels.checks)
+    monkeypatch.setattr(selftest, "Runs", lambda folder, overrides: Finished(folder))
+    monkeypatch.setattr(selftest, "find_checks", kernels.checks)
 
 
 def test_a_machine_that_computes_right(nerf, kernels_alone, tmp_path):
@@ -53,7 +53,7 @@ def test_a_kernel_that_raises_is_wrong_and_the_rest_goes_on(nerf, kernels_alone,
 
 
 def test_other_devices_are_refused_in_one_paragraph(nerf, monkeypatch):
-    monkeypatch.setattr(selftesting, "TRAINERS", {})
+    monkeypatch.setattr(selftest, "TRAINERS", {})
     result = nerf("selftest", "trainer=cpu")
     assert result.code == 2
     assert "nerf selftest knows CPUs and NVIDIA GPUs" in result.err
