@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from scenes import ball_scene, tiny_model
-from test_system import gradients, make_system
+from systems import gradients, make_system
 
 from nerf_lightning.callbacks.collapse_guard import is_constant
 from nerf_lightning.commands.protocol import split_hash

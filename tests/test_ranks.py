@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import ball_scene
-from test_system import gradients, make_system
+from systems import gradients, make_system
 
 from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import RayBatches
