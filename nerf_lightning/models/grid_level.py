@@ -3,7 +3,6 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.fields.base import Field
 from nerf_lightning.models.levels import Level
 from nerf_lightning.samplers.occupancy import OccupancySampler
 
@@ -12,9 +11,7 @@ class GridLevel(Level):
     """The contract of a level that computes only what an occupancy grid does not rule out."""
 
     sampler: OccupancySampler
-
-    def __init__(self, sampler: OccupancySampler, field: Field):
-        super().__init__(sampler, field)
+    sampler_kind = OccupancySampler
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density in the cells where rays look for it."""

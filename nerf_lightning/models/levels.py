@@ -26,11 +26,19 @@ class Level(nn.Module):
     has_color = True
     """Whether its rendering is a picture."""
 
+    sampler_kind: type[AnySampler] = AnySampler
+    """What it can sample with."""
+
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
 
     def __init__(self, sampler: AnySampler, field: Field):
         super().__init__()
+        if not isinstance(sampler, self.sampler_kind):
+            raise ValueError(
+                f"{type(self).__name__} samples with {self.sampler_kind.__name__} or what follows it, and "
+                f"{type(sampler).__name__} does not: choose another sampler, or a model with another level"
+            )
         self.sampler = sampler
         self.field = field
 
@@ -88,9 +96,7 @@ class DenseLevel(Level):
     """A level in which every ray has the same number of samples."""
 
     sampler: Sampler
-
-    def __init__(self, sampler: Sampler, field: Field):
-        super().__init__(sampler, field)
+    sampler_kind = Sampler
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""

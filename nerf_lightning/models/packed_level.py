@@ -12,7 +12,7 @@ from nerf_lightning.kernels.march import march
 from nerf_lightning.models.grid_level import GridLevel
 from nerf_lightning.randomness import RayRandom
 from nerf_lightning.rendering.packed import composite_packed, positions_of
-from nerf_lightning.samplers.occupancy import OccupancySampler
+from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.types.rays import PackedSamples, RayBundle
 from nerf_lightning.types.renderings import FieldOutput, PackedRendering, Rendering
 
@@ -31,7 +31,7 @@ class PackedLevel(GridLevel):
     tally: Tensor
     measured: Tensor
 
-    def __init__(self, sampler: OccupancySampler, field: Field):
+    def __init__(self, sampler: AnySampler, field: Field):
         super().__init__(sampler, field)
         # Samples and rays since the last update of the grid, and samples that exceeded the capacity, ever.
         self.register_buffer("tally", torch.zeros(3, dtype=torch.int64))

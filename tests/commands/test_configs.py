@@ -4,6 +4,7 @@ import inspect
 
 import pytest
 from configs import composed, loaded, options
+from hydra.errors import HydraException
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
 
@@ -41,6 +42,78 @@ def test_every_experiment_composes_and_its_model_builds(option):
         config.scene.root = "somewhere"
     assert build(config.model).points_per_ray(training=True) > 0
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+PARTS = ("encoder", "encoder@direction_encoder", "field")
+SAMPLED = {"nerf": ("coarse", "fine"), "fast_proposal": ("proposal", "fine")}
+
+
+def builds_or_is_refused_in_words(*overrides):
+    """Build a model, or be told by one of its parts, in a sentence, what does not fit."""
+    config = composed("train", *overrides)
+    try:
+        reason = None if build(config.model).points_per_ray(training=True) > 0 else "no points"
+    except HydraException as error:
+        reason = error.__cause__
+    assert reason is None or (isinstance(reason, ValueError) and " " in str(reason)), overrides
+
+
+def choices(group):
+    return options(group.partition("@")[0])
+
+
+@pytest.mark.parametrize("model", options("model"))
+def test_a_model_writes_no_size_into_the_parts_that_it_chose(model):
+    """Else whoever chooses another part is told of a setting that it does not have."""
+    yaml = OmegaConf.to_container(loaded("model", model))
+    assert not {"encoder", "direction_encoder", "field"} & yaml.keys()
+    for level in yaml.get("model", {}).get("levels", {}).values():
+        assert level.keys() <= {"_target_", "field"}
+        assert level.get("field", "${field}") == "${field}"
+
+
+@pytest.mark.parametrize("model", options("model"))
+@pytest.mark.parametrize("part", ["encoder=gaussian_fourier", "encoder@direction_encoder=gaussian_fourier"])
+def test_every_model_takes_another_encoder(model, part):
+    assert build(composed("train", f"model={model}", part).model).points_per_ray(training=True) > 0
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [
+        ("nerf", ["field=hash", "encoder=hash_grid"]),
+        ("nerf_tiny", ["field=hash", "encoder=hash_grid_small"]),
+        ("nerf_occupancy", ["field=hash"]),
+        ("fast", ["field=nerf_mlp_small", "encoder=frequency"]),
+        ("fast_proposal", ["field=nerf_mlp_tiny", "encoder=frequency_small"]),
+    ],
+)
+def test_models_take_another_field(model, parts):
+    assert build(composed("train", f"model={model}", *parts).model).points_per_ray(training=True) > 0
+
+
+@pytest.mark.parametrize(
+    ("model", "level", "sampler"),
+    [("nerf", "coarse", "occupancy"), ("fast", "fine", "stratified"), ("fast_dense", "fine", "importance")],
+)
+def test_a_level_refuses_a_sampler_of_another_kind_in_words(model, level, sampler):
+    config = composed("train", f"model={model}", f"sampler@model.levels.{level}.sampler={sampler}")
+    with pytest.raises(HydraException) as refused:
+        build(config.model)
+    assert "choose another sampler, or a model with another level" in str(refused.value.__cause__)
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("model", options("model"))
+def test_every_part_of_every_model_builds_or_is_refused_in_words(model):
+    for group in PARTS:
+        for option in choices(group):
+            builds_or_is_refused_in_words(f"model={model}", f"{group}={option}")
+    for level in SAMPLED.get(model.partition("_")[0] if model not in SAMPLED else model, ("fine",)):
+        if level in composed("train", f"model={model}").model.levels:
+            for option in options("sampler"):
+                builds_or_is_refused_in_words(f"model={model}", f"sampler@model.levels.{level}.sampler={option}")
 
 
 @pytest.mark.parametrize("option", options("scene"))
@@ -87,6 +160,9 @@ def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
             signature = inspect.signature(get_class(target))
         except ValueError:
             signature = inspect.signature(get_method(target))
-        assert set(config) - {"_target_", "_partial_", "defaults"} == set(signature.parameters) - {"args", "kwargs"}, (
-            f"{group}/{option}"
-        )
+        # What its own defaults list chooses, by the key that it goes to.
+        chosen = {key.partition("@")[2] for each in config.get("defaults", []) if each != "_self_" for key in each}
+        assert (set(config) | chosen) - {"_target_", "_partial_", "defaults"} == set(signature.parameters) - {
+            "args",
+            "kwargs",
+        }, f"{group}/{option}"
