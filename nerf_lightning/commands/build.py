@@ -1,6 +1,5 @@
 """Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
 
-import importlib
 import math
 from typing import Any
 
@@ -11,24 +10,21 @@ from omegaconf import DictConfig
 
 from nerf_lightning.budgets import allowed, require_within
 from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.commands import xla
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.encoders.base import Encoder, matrices_of
 from nerf_lightning.errors import InputError
-from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import Level, RadianceModel
+from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.plain_yaml import plain_yaml
 from nerf_lightning.samplers.base import AnySampler
 from nerf_lightning.system import RadianceFieldSystem
 from nerf_lightning.types.scene import Scene
 
-CONTRACTS = (Encoder, Field, AnySampler, Level, RadianceModel)
 SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
-LARGEST_NUMBER = 1 << 53
-ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
 
 
 def build(node: DictConfig) -> Any:
@@ -92,7 +88,7 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part. Use another one.")
     config = config["model"]
-    _require_our_own(config, str(checkpoint.path))
+    require_trusted(config, str(checkpoint.path))
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
         shapes = _built(config, checkpoint)
@@ -171,38 +167,3 @@ def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
             f"The weights of {checkpoint.path} do not fit this model: {reason}. Give the model, field and encoder "
             "settings that they were trained with (.hydra/overrides.yaml of that run)."
         ) from error
-
-
-def _require_our_own(node: Any, source: str) -> None:
-    if isinstance(node, list):
-        for child in node:
-            _require_our_own(child, source)
-    elif isinstance(node, (int, float)) and not abs(node) <= LARGEST_NUMBER:
-        raise InputError(f"{source}: its model part holds the number {node:.3g}, which no model has. Use another one.")
-    elif isinstance(node, str):
-        if "${" in node:
-            raise InputError(f"{source}: its model part holds an interpolation ({node}), which is not read from files.")
-    elif isinstance(node, dict):
-        for key, child in node.items():
-            if key == "_target_":
-                _require_contract(child, source)
-            elif str(key).startswith("_"):
-                raise InputError(f"{source}: its model part holds the key {key}, which is not read from files.")
-            else:
-                _require_our_own(child, source)
-
-
-def _require_contract(target: Any, source: str) -> None:
-    module_name, _, class_name = str(target).rpartition(".")
-    found = None
-    if module_name.startswith(ROOMS):
-        try:
-            found = getattr(importlib.import_module(module_name), class_name, None)
-        except ImportError:
-            found = None
-    ours = isinstance(found, type) and issubclass(found, CONTRACTS) and found.__module__ == module_name
-    if not ours:
-        raise InputError(
-            f"{source} asks for {target}, which is not a model part of this program, so it is not built. Use a "
-            "checkpoint from a source that you trust, or install the version that has this class."
-        )
