@@ -1,4 +1,4 @@
-"""Which classes a stranger's checkpoint may name: parts of models, from our own rooms, that follow one of the contracts."""
+"""Which classes a stranger's checkpoint may name: parts of models, from our own rooms, that follow a contract."""
 
 import importlib
 from typing import Any
