@@ -29,6 +29,7 @@ from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.json_file import write_json
+from nerf_lightning.files.walk import walk
 from nerf_lightning.plain_yaml import read_plain_yaml
 
 
@@ -223,7 +224,7 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
 
 
 def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
-    notes = sorted(root.rglob("run.json"), key=lambda file: file.stat().st_mtime, reverse=True)
+    notes = sorted(_notes_below(root), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in notes:
         note = read_note(file.parent)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
@@ -231,6 +232,10 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
         if ours and (finished is None or finished < num_steps):
             return file.parent
     return None
+
+
+def _notes_below(root: Path) -> list[Path]:
+    return [base / "run.json" for base, _, names in walk(root) if "run.json" in names]
 
 
 def _fresh(parent: Path) -> Path:
