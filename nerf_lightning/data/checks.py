@@ -31,9 +31,23 @@ def listed(items: Iterable[object], cap: int = 10) -> str:
     return shown if len(names) <= cap else f"{shown} and {len(names) - cap} more"
 
 
+def require_different(names: Iterable[str], where: str) -> None:
+    """Refuse views that bear one name: files and tables are written by it.
+
+    Raises:
+        InputError: with the names, and where they stand.
+    """
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise InputError(f"{where} lists {listed(twice)} more than once. Remove all but one of each.")
+
+
 def contents(folder: Path) -> str:
     """Return what a folder holds, in a few words."""
-    return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+    try:
+        return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+    except OSError as error:  # it is not there either
+        return f"nothing that can be read ({error.strerror})"
 
 
 def check_step(name: str, value: int) -> None:
@@ -141,6 +155,14 @@ def is_there(path: Path) -> bool:
     """Tell whether a file can be found; one whose name no file system takes cannot."""
     try:
         return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Tell whether a folder can be found; one whose name no file system takes cannot."""
+    try:
+        return path.is_dir()
     except OSError:
         return False
 

@@ -3,6 +3,7 @@
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from nerf_lightning.data.checks import (
     check_bounds,
     check_divisible,
     check_step,
+    is_there,
     known_background,
     listed,
     pose_from_matrix,
@@ -144,7 +146,7 @@ class NpzReader(Reader):
 
 def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
     """Return the three arrays; nothing in the file is executed (no pickles)."""
-    if not path.is_file():
+    if not is_there(path):
         raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
     try:
         # What is taken of it is bounded by its headers.
@@ -159,7 +161,7 @@ def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
 
 
 def _damaged(path: Path, error: Exception) -> str:
-    with open_regular(path, None) as file:
+    with suppress(OSError), open_regular(path, None) as file:
         if file.read(6) == b"\x93NUMPY":
             return f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}"
     return f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."

@@ -17,6 +17,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 FEWEST = 3
 SMALLEST_SIDE = 64
 JPEG_QUALITY = 95
+LENS_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
+LONGEST_TAG = 200
 
 
 @dataclass(frozen=True)
@@ -115,22 +117,23 @@ def _photograph(path: Path) -> FoundPhotograph:
             f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
             f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
-    exif = _exif(path)
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    turned = exif.get(ORIENTATION, 1)
-    tags = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
-    lens = (str(exif.get(ExifTags.Base.Model, "")), *(str(details.get(tag, "")) for tag in tags))
+    turned, lens = _exif(path)
     # Orientations 5 to 8 are quarter turns.
     return FoundPhotograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
 
 
-def _exif(path: Path) -> Image.Exif:
+def _exif(path: Path) -> tuple[object, tuple[str, ...]]:
+    """Return how a photograph is turned, and what tells its lens apart from others."""
     with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
-            return image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
+            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
+            # Of a TIFF, this reads the file.
+            details = exif.get_ifd(ExifTags.IFD.Exif)
         except DECODER_ERRORS:
-            return Image.Exif()  # damage is named once the pixels are decoded
+            exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
+    lens = (exif.get(ExifTags.Base.Model, ""), *(details.get(tag, "") for tag in LENS_TAGS))
+    return exif.get(ORIENTATION, 1), tuple(str(value)[:LONGEST_TAG] for value in lens)
 
 
 def _write_turned(path: Path, target: Path) -> None:

@@ -222,6 +222,7 @@ def state(**changed):
         (recorded(splits={"test": (0,)}), "splits lacks train"),
         (recorded(splits={"train": (), "test": (0,)}), "splits.train has 0 entries"),
         (recorded(splits={"train": (0, 1, 0)}), "splits.train names a view twice"),
+        (recorded(view_names=("a",) * 6), "view_names names two views alike"),
         (state(precision="transformer-engine"), "precision"),
         (state(tile_points=-1), "tile_points"),
         (state(choices=["scene"]), "choices"),
