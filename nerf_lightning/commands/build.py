@@ -105,6 +105,8 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
 
 
 def _require_few_samples(model: RadianceModel, where: str) -> None:
+    if not model.levels:
+        raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 

@@ -12,6 +12,7 @@ from nerf_lightning.data.base import Reader
 from nerf_lightning.data.blender_frames import Frame, read_frames
 from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.checks import (
+    box_around_origin,
     check_bounds,
     check_divisible,
     check_step,
@@ -95,7 +96,7 @@ class BlenderReader(Reader):
             pixels=pixels,
             near=torch.full((len(views),), float(self.near)),
             far=torch.full((len(views),), float(self.far)),
-            aabb=torch.tensor([[-self.aabb_half] * 3, [self.aabb_half] * 3]),
+            aabb=box_around_origin(self.aabb_half),
             splits=splits,
             view_names=_names(frames),
             background=known_background(self.background),
@@ -113,8 +114,7 @@ class BlenderReader(Reader):
             check_step(f"skip.{split}", step)
         check_bounds(self.near, self.far)
         known_background(self.background)
-        if not self.aabb_half > 0:
-            raise InputError(f"scene.aabb_half is {self.aabb_half}, but half the side of a box must be above 0.")
+        box_around_origin(self.aabb_half)
 
     def _frames(self) -> dict[str, list[Frame]]:
         """Return the frames of each split; a split without a file, or without frames, is an empty list."""

@@ -45,13 +45,13 @@ class LlffReader(CaptureReader):
         pictures = self._pictures(root)
         self.require_inside(pictures, self.images)
         names = picture_files(pictures)
-        for name in names:
-            self.require_inside(pictures / name, self.images)
         if len(names) != len(rows):
             raise InputError(
                 f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
                 "in order of names. Remove the photographs that were not registered, or add those that are missing."
             )
+        for name in names:
+            self.require_inside(pictures / name, self.images)
         bounds = torch.from_numpy(rows[:, 15:])
         return Capture(
             views=tuple(self._view(pictures / name, name, row) for name, row in zip(names, rows, strict=True)),

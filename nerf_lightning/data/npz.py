@@ -17,6 +17,7 @@ from nerf_lightning.data.base import Reader
 from nerf_lightning.data.checks import (
     FARTHEST,
     LEAST_FOCAL,
+    box_around_origin,
     check_bounds,
     check_divisible,
     check_step,
@@ -109,7 +110,7 @@ class NpzReader(Reader):
             pixels=_pixels(images, self.downscale, self.path),
             near=torch.full((len(images),), float(self.near)),
             far=torch.full((len(images),), float(self.far)),
-            aabb=torch.tensor([[-self.aabb_half] * 3, [self.aabb_half] * 3]),
+            aabb=box_around_origin(self.aabb_half),
             splits={"train": train, "val": held, "test": held},
             view_names=tuple(str(view) for view in range(len(images))),
             background=known_background(self.background),
@@ -125,8 +126,7 @@ class NpzReader(Reader):
         known_background(self.background)
         if self.hold_every < 0:
             raise InputError(f"scene.hold_every is {self.hold_every}, but it must be 0 (in order) or more.")
-        if not self.aabb_half > 0:
-            raise InputError(f"scene.aabb_half is {self.aabb_half}, but half the side of a box must be above 0.")
+        box_around_origin(self.aabb_half)
 
     def _split(self, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the views to learn from and the ones held out."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, open_picture, read_rgba
 from nerf_lightning.errors import InputError
@@ -47,7 +48,8 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
         allow_outside: follow links that lead out of it.
 
     Raises:
-        InputError: no such folder, fewer than three pictures in it, or one that cannot be read or is tiny.
+        InputError: no such folder, fewer than three pictures in it, more than a person has agreed to, or one
+            that cannot be read or is tiny.
     """
     try:
         files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
@@ -59,6 +61,7 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
+    require_within("views", len(pictures), f"images={folder}", "photographs")
     outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
     if outside and not allow_outside:
         raise InputError(

@@ -8,15 +8,17 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 from captures import write_blender, write_npz
 from malformed import WRITERS, edit_json
 from PIL import Image
-from posed_captures import read
+from posed_captures import Known, read, write_colmap
 from running import refused
+from support.budget import budget
 
 from nerf_lightning.data.blender import BlenderReader
 from nerf_lightning.data.capture_reader import picture_files
-from nerf_lightning.data.checks import require_different
+from nerf_lightning.data.checks import box_around_origin, check_step, require_different
 from nerf_lightning.data.images import MOST_SCANS, image_size, jpeg_scans
 from nerf_lightning.data.npz import NpzReader
 from nerf_lightning.data.photograph_folder import find_photographs
@@ -130,6 +132,37 @@ def test_a_focal_length_that_is_possible_for_another_picture_alone(tmp_path, tim
     size = {key: times * value for key, value in {"w": 16, "h": 12, "cx": 8, "cy": 6}.items()}
     edit_json(root, lambda content: content | size | {"fl_x": focal, "fl_y": focal})
     refused(read, "transforms", root, parts=("the view images/p_0.png has a focal length of", "which no lens has"))
+
+
+def test_sparse_points_beyond_everything(tmp_path):
+    root = write_colmap(tmp_path / "capture", Known(points=np.full((60, 3), 1e300)))
+    refused(lambda: read("colmap", root, space="bounded"), parts=("which is a mistake of the reconstruction",))
+
+
+def test_points_of_a_text_are_counted_too(tmp_path):
+    root = WRITERS["text"](tmp_path / "capture")
+    with budget(points=50):
+        refused(read, "colmap", root, parts=("points3D.txt has more than 50 points", "add budgets.points=N"))
+    with budget(points=60):
+        assert len(read("colmap", root).points) == 60
+
+
+def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
+    root = WRITERS["llff"](tmp_path / "capture")
+    (tmp_path / "elsewhere.png").touch()
+    (root / "images" / "more.png").symlink_to(tmp_path / "elsewhere.png")
+    refused(read, "llff", root, parts=("has 9 poses, but", "has 10 photographs"))
+    with budget(views=9):
+        refused(find_photographs, root / "images", parts=("has 10 photographs, and more than 9 are not taken",))
+
+
+def test_half_the_side_of_a_box_may_be_a_whole_number():
+    assert torch.equal(box_around_origin(2), torch.tensor([[-2.0] * 3, [2.0] * 3]))
+
+
+@pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
+def test_a_step_that_is_none(step):
+    refused(check_step, "skip.train", step, parts=(f"scene.skip.train is {step}, but it must be 1",))
 
 
 def test_a_key_that_stands_twice_in_a_json(tmp_path):
