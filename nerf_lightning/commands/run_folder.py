@@ -25,6 +25,7 @@ from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoin
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import number, read_note
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
@@ -167,7 +168,7 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
-        return _to_resume(Path(resume), identity)
+        return _to_resume(Path(required_path("resume", resume)), identity)
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()

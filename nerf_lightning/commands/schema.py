@@ -63,9 +63,9 @@ def require_sections(config: DictConfig, primary: DictConfig) -> None:
             )
 
 
-def _parameters(target: str | None) -> dict[str, inspect.Parameter]:
+def _parameters(target: object) -> dict[str, inspect.Parameter]:
     # Only our own: other people's annotations promise less.
-    if target is None or not target.startswith(OURS):
+    if not isinstance(target, str) or not target.startswith(OURS):
         return {}
     return dict(inspect.signature(get_object(target)).parameters)
 
