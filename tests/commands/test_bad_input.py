@@ -278,3 +278,9 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
     assert process.returncode == 130, output
     assert "Traceback" not in output
     assert not list(tmp_path.glob("*.mp4"))
+
+
+@pytest.mark.parametrize("command", ["render", "export what=cameras"])
+@pytest.mark.parametrize("ckpt", ["5", "[1]"])
+def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command, ckpt):
+    said(nerf(*command.split(), f"ckpt={ckpt}", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
