@@ -16,7 +16,7 @@ class Budgets:
 
     views: int = 200_000
     """Photographs of a capture."""
-    points: int = 20_000_000
+    points: int = 10_000_000
     """Sparse points of a capture."""
     view_pixels: int = 1 << 28
     """Pixels of one camera's picture."""

@@ -101,6 +101,7 @@ def _run(command: str, arguments: list[str]) -> None:
             return run_job(ends_quietly()(module.run), config, command)
         # Caught inside the job as well: Hydra would print the overrides first.
         with explained(command):
+            _require_sections(config, command)
             return module.run(config)
 
     with explained(command):
@@ -116,6 +117,14 @@ def _run(command: str, arguments: list[str]) -> None:
             watched(run)
         else:
             run()
+
+
+def _require_sections(config: "DictConfig", command: str) -> None:
+    from omegaconf import OmegaConf
+
+    from nerf_lightning.commands.schema import require_sections
+
+    require_sections(config, OmegaConf.load(conf_folder() / f"{command}.yaml"))  # type: ignore[arg-type]
 
 
 @contextmanager

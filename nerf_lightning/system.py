@@ -110,13 +110,22 @@ class RadianceFieldSystem(LightningModule):
         optimizer.state.clear()
 
     def configure_optimizers(self) -> Optimizer:
-        """Complete the optimizer; the parameters of encoders are tables, which do not decay."""
+        """Complete the optimizer; the parameters of encoders are tables, which do not decay.
+
+        Raises:
+            InputError: a setting of the optimizer that it refuses.
+        """
         tables = tables_of(self.model)
         known = set(map(id, tables))
         groups: list[dict[str, Any]] = [{"params": [p for p in self.model.parameters() if id(p) not in known]}]
         if tables:
             groups.append({"params": tables, "weight_decay": 0.0})
-        return self.build_optimizer(groups)
+        try:
+            return self.build_optimizer(groups)
+        except (ValueError, TypeError) as error:  # torch looks at its settings here
+            raise InputError(
+                f"The optimizer refuses its settings: {error}. Mend optimizer.*, or leave it out."
+            ) from error
 
     def training_step(self, batch: Batch, batch_index: int) -> None:
         """Take one step: tiles forward and backward, clip, update."""

@@ -1,9 +1,11 @@
 import logging
 import zipfile
+from dataclasses import replace
 
 import pytest
 import torch
 from scenes import ball_scene
+from support.budget import budget
 
 from nerf_lightning.checkpoints import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
 from nerf_lightning.errors import InputError
@@ -17,6 +19,17 @@ def saved(path, change=lambda cameras: None):
     state = {"precision": "32-true", "tile_points": None}
     torch.save({"state_dict": {}, "global_step": 0, "nerf_lightning": record | state}, path / "last.ckpt")
     return path / "last.ckpt"
+
+
+def test_a_scene_that_no_checkpoint_could_keep_is_refused_before_training():
+    scene = ball_scene()
+    with (
+        budget(views=2),
+        pytest.raises(InputError, match=r"cannot be kept in a checkpoint: scene\.\w+.* has 3 entries, not 1 to 2"),
+    ):
+        make_record(scene, config="", choices={})
+    with pytest.raises(InputError, match=r"cannot be kept in a checkpoint: scene.view_names names two views alike"):
+        make_record(replace(scene, view_names=("a",) * 6), config="", choices={})
 
 
 def test_the_lens_is_kept(tmp_path):

@@ -19,8 +19,10 @@ from torch import Tensor
 
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
+from nerf_lightning.checkpoints.format import scene as scene_format
 from nerf_lightning.checkpoints.possible import require_possible_scene
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.schema import Unfit, shown
 from nerf_lightning.geometry.reach import near_and_far
 from nerf_lightning.tensor_files import load_tensors
@@ -79,9 +81,21 @@ def scene_record(scene: Scene) -> SceneRecord:
 
 
 def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str, Any]:
-    """Return the part of a checkpoint that does not change during a run."""
+    """Return the part of a checkpoint that does not change during a run.
+
+    Raises:
+        InputError: the scene is one that no checkpoint could keep, which is better said before training than after.
+    """
     kept = dict(vars(scene_record(scene)))
     kept["cameras"] = dict(vars(scene.cameras))
+    try:
+        scene_format().require(kept, "scene", {})
+        require_possible_scene(kept, "The scene")
+    except Unfit as error:
+        raise InputError(
+            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Mend the capture, or "
+            "the settings (scene.*, budgets.*)."
+        ) from error
     return {"format": FORMAT, "version": __version__, "config": config, "choices": choices, "scene": kept}
 
 

@@ -39,6 +39,8 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
             raise Unfit(f"scene.splits.{split}", f"names views that are not among the {views}")
         if len(set(numbers)) < len(numbers):
             raise Unfit(f"scene.splits.{split}", "names a view twice")
+    if len(set(scene["view_names"])) < views:  # files and tables are written by it
+        raise Unfit("scene.view_names", "names two views alike")
     for name in (scene["name"], *scene["view_names"]):
         require_printable(name, f"{where}: scene.view_names")
 

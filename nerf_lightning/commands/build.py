@@ -108,11 +108,13 @@ def hold_to_budgets(model: RadianceModel, where: str) -> None:
         where: it comes from, for the message.
 
     Raises:
-        InputError: see `budgets.samples_per_ray`.
+        InputError: it has no level, or more samples than `budgets.samples_per_ray`.
     """
     for part in model.modules():
         if isinstance(part, AnySampler):
             part.max_intervals = allowed().intervals
+    if not model.levels:
+        raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 

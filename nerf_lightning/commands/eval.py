@@ -11,6 +11,7 @@ from nerf_lightning.commands.output_folder import beside_checkpoint, output_fold
 from nerf_lightning.commands.processes import on_all_processes
 from nerf_lightning.commands.protocol import measured_of
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
+from nerf_lightning.commands.schema import required_path
 
 
 def run(config: DictConfig) -> float:
@@ -22,7 +23,7 @@ def evaluate(config: DictConfig) -> float:
     """Measure a checkpoint on a split of a scene; return the PSNR."""
     settings = build(config.trainer)
     settings.prepare_machine()
-    checkpoint = read_checkpoint(config.ckpt)
+    checkpoint = read_checkpoint(required_path("ckpt", config.ckpt))
     settings.keep_tile(checkpoint.tile_points)
     model = settings.prepare(load_model(checkpoint))
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))

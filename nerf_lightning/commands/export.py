@@ -9,6 +9,7 @@ from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.console import say
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.processes import on_all_processes
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.export.base import Export
 
 
@@ -22,7 +23,7 @@ def export(config: DictConfig) -> None:
     settings = build(config.trainer)
     settings.prepare_machine()
     what: Export = build(config.what)
-    checkpoint = read_checkpoint(config.ckpt)
+    checkpoint = read_checkpoint(required_path("ckpt", config.ckpt))
     settings.keep_tile(checkpoint.tile_points)
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "export"))
     if not ranks.is_first():

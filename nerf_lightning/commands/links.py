@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.walk import walk
 
 
 def require_no_way_out(folder: Path) -> None:
@@ -35,7 +36,7 @@ def require_nothing_from_outside(folder: Path) -> None:
 
 def _ways_out(folder: Path) -> Iterator[Path]:
     root = os.path.realpath(folder)
-    for base, folders, names in os.walk(root):
-        for path in (Path(base) / name for name in (*folders, *names)):
+    for base, folders, names in walk(Path(root)):
+        for path in (base / name for name in (*folders, *names)):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
                 yield path

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.commands.console import say
 from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.run_folder import job_folder
-from nerf_lightning.commands.schema import require_fitting_values
+from nerf_lightning.commands.schema import require_fitting_values, required_path
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.image_pairs import chosen_matching
 from nerf_lightning.data.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
@@ -52,6 +52,9 @@ def run(config: DictConfig) -> int:
 def _settings(config: DictConfig) -> SfmSettings:
     if (config.images is None) == (config.video is None):
         raise InputError("Give either images=DIR (a folder of photographs) or video=FILE, one of the two.")
+    for key in ("images", "video"):
+        if config[key] is not None:
+            required_path(key, config[key])
     values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
     target = f"{SfmSettings.__module__}.{SfmSettings.__name__}"

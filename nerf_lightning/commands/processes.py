@@ -28,6 +28,7 @@ from nerf_lightning import ranks
 from nerf_lightning.commands.devices import choose_device
 from nerf_lightning.commands.schema import require_fitting_values
 from nerf_lightning.commands.strategy import Launcher, cluster_environment
+from nerf_lightning.commands.trainer import MOST_PROCESSES
 from nerf_lightning.errors import InputError
 
 # What of Hydra's own config a worker may ask for.
@@ -71,8 +72,8 @@ def num_processes(devices: int | str, device_type: str) -> int:
             "(trainer.devices=2), or use trainer=cpu, whose one process has all its cores."
         )
     count = there if devices == "auto" else int(devices)
-    if count < 1:
-        raise InputError(f"trainer.devices={devices}: give a positive number, or auto for every GPU.")
+    if not 1 <= count <= MOST_PROCESSES:
+        raise InputError(f"trainer.devices={devices}: give a number from 1 to {MOST_PROCESSES}, or auto for every GPU.")
     if device_type != "cpu" and count > there:
         raise InputError(f"trainer.devices={devices}: there are {there} devices here. Give at most so many, or auto.")
     return count

@@ -14,6 +14,7 @@ from nerf_lightning.commands.film_settings import film_settings, listed
 from nerf_lightning.commands.filming import film
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.processes import on_all_processes
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.commands.shots import Subject
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
@@ -30,7 +31,7 @@ def render(config: DictConfig) -> None:
     shown = film_settings(plain)
     settings = build(config.trainer)
     settings.prepare_machine()
-    checkpoints = [read_checkpoint(path) for path in listed(plain["ckpt"])]
+    checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in listed(plain["ckpt"])]
     labels = labels_of(checkpoints, plain["labels"])
     settings.keep_tile(checkpoints[0].tile_points)
     path = build(config.path)

@@ -25,10 +25,12 @@ from nerf_lightning.checkpoints import DAMAGED, LAST, PREVIOUS, newest_checkpoin
 from nerf_lightning.commands.links import require_no_way_out
 from nerf_lightning.commands.run_identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.commands.run_summary import number, read_note
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.commands.slurm import slurm_job, was_requeued
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.json_file import write_json
+from nerf_lightning.files.walk import walk
 from nerf_lightning.plain_yaml import read_plain_yaml
 
 
@@ -166,7 +168,7 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
 def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
-        return _to_resume(Path(resume), identity)
+        return _to_resume(Path(required_path("resume", resume)), identity)
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()
@@ -223,7 +225,7 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
 
 
 def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
-    notes = sorted(root.rglob("run.json"), key=lambda file: file.stat().st_mtime, reverse=True)
+    notes = sorted(_notes_below(root), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in notes:
         note = read_note(file.parent)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
@@ -231,6 +233,10 @@ def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | No
         if ours and (finished is None or finished < num_steps):
             return file.parent
     return None
+
+
+def _notes_below(root: Path) -> list[Path]:
+    return [base / "run.json" for base, _, names in walk(root) if "run.json" in names]
 
 
 def _fresh(parent: Path) -> Path:

@@ -1,6 +1,5 @@
 """Results as they lie in run folders: what was reached, by which model, on which scene, and how it was measured."""
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from nerf_lightning.budgets import allowed
 from nerf_lightning.commands.metrics_files import METRICS
 from nerf_lightning.commands.run_summary import RunSummary, number, read_json_object, read_note, read_run
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.walk import walk
 from nerf_lightning.plain_yaml import read_plain_yaml
 
 Measured = Literal["run", "eval"]
@@ -64,7 +64,7 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 
 def _runs_below(folder: Path) -> Iterator[Path]:
-    for count, (base, below, names) in enumerate(os.walk(folder)):
+    for count, (base, below, names) in enumerate(walk(folder)):
         if count > allowed().folders:
             raise InputError(
                 f"{folder} holds more than {allowed().folders:,} folders. Name the runs more closely, or add "
@@ -73,7 +73,7 @@ def _runs_below(folder: Path) -> Iterator[Path]:
         below.sort()
         if "run.json" in names or "metrics.json" in names:
             below.clear()
-            yield Path(base)
+            yield base
 
 
 def read_result(folder: Path, measured: Measured) -> RunResult | None:

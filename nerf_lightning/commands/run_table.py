@@ -7,6 +7,7 @@ from nerf_lightning.commands.protocol import differences
 from nerf_lightning.commands.run_results import RunResult
 from nerf_lightning.commands.run_summary import differing_keys
 from nerf_lightning.commands.table_files import Row
+from nerf_lightning.data.checks import listed
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 
@@ -87,8 +88,18 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
 
 def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
     """Return a row per group, by scene and then the best first; settings that all share are left out."""
-    shown = differing_keys([group[0].settings for group in groups])[:MOST_SETTINGS]
+    shown = _differing(groups)[:MOST_SETTINGS]
     return [_row(group, shown) for group in sorted(groups, key=lambda group: _rank(group, order))]
+
+
+def noted_settings(groups: Sequence[Group]) -> list[str]:
+    """Return what is to be said of settings that differ and have no column."""
+    hidden = _differing(groups)[MOST_SETTINGS:]
+    return [f"{len(hidden)} more settings differ and have no column: {listed(hidden, cap=5)}."] if hidden else []
+
+
+def _differing(groups: Sequence[Group]) -> list[str]:
+    return differing_keys([group[0].settings for group in groups])
 
 
 def without_empty(rows: list[Row]) -> list[Row]:

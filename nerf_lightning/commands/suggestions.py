@@ -4,6 +4,7 @@ import difflib
 import os
 import re
 from pathlib import Path
+from traceback import extract_tb
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
@@ -27,6 +28,11 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         return _missing_plugin(str(error)) or explain(error, command, conf_folder)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
+    if isinstance(error, (ValueError, TypeError)) and _while_choosing(error):
+        return (
+            f"A group was given something else than the name of one of its options: {error}. nerf {command} --help "
+            "lists the groups and what they offer."
+        )
     if isinstance(error, RuntimeError) and _is_out_of_memory(error):
         reason = " ".join(str(error).split()).partition(". ")[0]
         return (
@@ -41,6 +47,11 @@ def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | No
         where = f"{os.fsdecode(error.filename)}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
     return None
+
+
+def _while_choosing(error: BaseException) -> bool:
+    # Hydra looks at what groups are given without asking first whether it is text.
+    return any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:

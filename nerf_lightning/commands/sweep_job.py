@@ -23,6 +23,7 @@ from nerf_lightning.commands.suggestions import paragraph
 from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.export.json_file import write_json
 from nerf_lightning.files.regular import read_text
+from nerf_lightning.files.walk import walk
 
 MOST_BYTES = 1 << 20
 """Of a record."""
@@ -125,7 +126,7 @@ def stop_file(sweep_folder: Path) -> Path:
 def _former_run(sweep_folder: Path, own: Path, config: DictConfig) -> Path | None:
     if "sweep" not in config or not (config.sweep.resume or was_requeued()):
         return None
-    others = sorted(note.parent for note in sweep_folder.rglob("run.json") if note.parent != own)
+    others = sorted(base for base, _, names in walk(sweep_folder) if "run.json" in names and base != own)
     return finished_run([own, *others], config)
 
 

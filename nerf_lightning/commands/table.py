@@ -16,6 +16,7 @@ from nerf_lightning.commands.run_table import (
     group_rows,
     group_seeds,
     noted_origins,
+    noted_settings,
     one_protocol,
     without_empty,
 )
@@ -46,7 +47,7 @@ def run(config: DictConfig) -> int:
     if config.published:
         rows = _with_published(rows, gathered.results)
     rows = without_empty(rows)
-    notes += noted_origins(gathered.results)
+    notes += [*noted_settings(groups), *noted_origins(gathered.results)]
     if left_out:
         notes.append(f"Left out, since newer runs of the same settings and seed are there: {_names(left_out)}.")
     if gathered.unmeasured:

@@ -28,6 +28,7 @@ from nerf_lightning.commands.overrides import to_type
 from nerf_lightning.commands.preemption import preemptible, wants_restart
 from nerf_lightning.commands.processes import on_all_processes
 from nerf_lightning.commands.run_folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.commands.tensorboard import describe_run
 from nerf_lightning.commands.tile_choice import measured_tile
 from nerf_lightning.commands.trainer import TrainerSettings
@@ -113,13 +114,14 @@ def _build_parts(config: DictConfig) -> Parts:
     progress = Progress()
     system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
     if config.init_from is not None:
-        start = read_checkpoint(config.init_from)
+        start = read_checkpoint(required_path("init_from", config.init_from))
         load_weights(system.model, start)
         system.start_weights = start.weights
     system.initialize()
+    system.configure_optimizers()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
-    callbacks: list[Callback] = [signals, FolderGuard(), *build(config.callbacks).values()]
+    callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
@@ -127,6 +129,14 @@ def _build_parts(config: DictConfig) -> Parts:
     # Checkpoints come last, so that they save what the others left.
     callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
     return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
+
+
+def _chosen_callbacks(config: DictConfig) -> list[Callback]:
+    chosen = build(config.callbacks)
+    for name, callback in chosen.items():
+        if not isinstance(callback, Callback):
+            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
+    return list(chosen.values())
 
 
 def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:

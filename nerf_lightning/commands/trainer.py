@@ -12,6 +12,7 @@ from torch import distributed
 
 from nerf_lightning import ranks
 from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.checkpoints.format import MOST_THREADS
 from nerf_lightning.commands import xla
 from nerf_lightning.commands.devices import (
     LIGHTNING_NAMES,
@@ -28,6 +29,9 @@ from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.products import Products
 
 PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
+MOST_EPOCHS = 1 << 31
+MOST_PROCESSES = 1024
+"""Of one machine; each takes half a gigabyte and more."""
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
 MOST_CPU_TILE_POINTS = 1 << 18
@@ -75,8 +79,12 @@ class TrainerSettings:
         for name, value in (("max_steps", max_steps), ("val_every_steps", val_every_steps)):
             if value < 1:
                 raise InputError(f"trainer.{name}={value}: give a positive number of steps.")
-        if max_epochs is not None and max_epochs <= 0:
-            raise InputError(f"trainer.max_epochs={max_epochs}: give a positive number, or null for no bound.")
+        if max_epochs is not None and not 0 < max_epochs <= MOST_EPOCHS:
+            raise InputError(
+                f"trainer.max_epochs={max_epochs}: give a positive number up to {MOST_EPOCHS}, or null for no bound."
+            )
+        if num_threads is not None and not 1 <= num_threads <= MOST_THREADS:
+            raise InputError(f"trainer.num_threads={num_threads}: give a number from 1 to {MOST_THREADS}, or null.")
         if isinstance(tile_points, int) and tile_points < 1:
             raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
         self.max_steps, self.max_epochs = max_steps, max_epochs

@@ -13,6 +13,7 @@ from nerf_lightning.commands.build import build, load_model
 from nerf_lightning.commands.console import say
 from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
+from nerf_lightning.commands.schema import required_path
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
 from nerf_lightning.types.scene import Scene
@@ -35,7 +36,7 @@ def run(config: DictConfig) -> None:
     named_places(config.viewer.hosts)
     settings = build(config.trainer)
     settings.prepare_machine()
-    checkpoint = read_checkpoint(config.ckpt)
+    checkpoint = read_checkpoint(required_path("ckpt", config.ckpt))
     settings.keep_tile(checkpoint.tile_points)
     model = settings.prepare(load_model(checkpoint))
     record = checkpoint.scene

@@ -12,13 +12,16 @@ from nerf_lightning.data.base import Reader
 from nerf_lightning.data.blender_frames import Frame, read_frames
 from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.checks import (
+    box_around_origin,
     check_bounds,
     check_divisible,
     check_step,
     contents,
+    is_folder,
     known_background,
     listed,
     one_size,
+    require_different,
 )
 from nerf_lightning.data.images import image_size
 from nerf_lightning.data.pixel_store import read_pixels
@@ -93,7 +96,7 @@ class BlenderReader(Reader):
             pixels=pixels,
             near=torch.full((len(views),), float(self.near)),
             far=torch.full((len(views),), float(self.far)),
-            aabb=torch.tensor([[-self.aabb_half] * 3, [self.aabb_half] * 3]),
+            aabb=box_around_origin(self.aabb_half),
             splits=splits,
             view_names=_names(frames),
             background=known_background(self.background),
@@ -111,12 +114,11 @@ class BlenderReader(Reader):
             check_step(f"skip.{split}", step)
         check_bounds(self.near, self.far)
         known_background(self.background)
-        if not self.aabb_half > 0:
-            raise InputError(f"scene.aabb_half is {self.aabb_half}, but half the side of a box must be above 0.")
+        box_around_origin(self.aabb_half)
 
     def _frames(self) -> dict[str, list[Frame]]:
         """Return the frames of each split; a split without a file, or without frames, is an empty list."""
-        if not self.root.is_dir():
+        if not is_folder(self.root):
             raise InputError(f"The folder {self.root} does not exist. Set scene.root to the capture's folder.")
         files = {split: self.root / f"transforms_{split}.json" for split in SPLITS}
         if not files["train"].is_file():
@@ -130,6 +132,8 @@ class BlenderReader(Reader):
         if not self.allow_outside:
             for path in (*files.values(), *(frame.image for split in frames.values() for frame in split)):
                 require_inside(path, self.root)
+        for split, named in frames.items():
+            require_different((frame.label for frame in named), str(files[split]))
         if not frames["train"]:
             raise InputError(f"{files['train']} has no frames, so there is nothing to learn from. Export it again.")
         return frames
@@ -166,11 +170,13 @@ def _splits(counts: Mapping[str, int], root: Path) -> dict[str, tuple[int, ...]]
 
 
 def _names(frames: Mapping[str, list[Frame]]) -> tuple[str, ...]:
-    """Return the shortest names that tell the views apart: stem, split/stem, or the path in the json."""
+    """Return the shortest names that tell the views apart: stem, split/stem, the path in the json, or split/path."""
     views = [(split, frame.label) for split in SPLITS for frame in frames[split]]
     stems = [Path(label).name for _, label in views]
     prefixed = [f"{split}/{Path(label).name}" for split, label in views]
     for names in (stems, prefixed):
         if len(set(names)) == len(names):
             return tuple(names)
-    return tuple(label for _, label in views)
+    labels = tuple(label for _, label in views)
+    # One picture may serve in two splits.
+    return labels if len(set(labels)) == len(labels) else tuple(f"{split}/{label}" for split, label in views)

@@ -39,7 +39,7 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
     """
     content = read_json(path)
     fov, entries = keys_of(content, KEYS, str(path), FORMAT)
-    if not isinstance(fov, int | float) or not LEAST_ANGLE <= fov < math.pi:
+    if isinstance(fov, bool) or not isinstance(fov, int | float) or not LEAST_ANGLE <= fov < math.pi:
         raise InputError(
             f"{path}: camera_angle_x is {fov!r}, but it must be an angle between 0 and pi radians "
             "(the horizontal angle of view)."

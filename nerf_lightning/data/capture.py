@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.budgets import require_within
-from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL, listed
+from nerf_lightning.data.checks import FARTHEST, LEAST_FOCAL, listed, require_different
 from nerf_lightning.data.images import downscaled_size
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
@@ -107,9 +107,7 @@ def check_capture(capture: Capture) -> None:
     require_within("name_characters", max(map(len, names)), str(capture.source), "characters in a name")
     for name in (*names, *capture.left_out):
         require_printable(name, f"A photograph of {capture.source}")
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
-    if twice:
-        raise InputError(f"{capture.source} lists {listed(twice)} more than once. Remove all but one of each.")
+    require_different(names, str(capture.source))
     for view in capture.views:
         _check_view(view, f"{capture.source}: the view {view.name}")
 
@@ -162,6 +160,10 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
             f"The pixels that were kept of {capture.source} have other sizes than its photographs: somebody else wrote "
             "them. Remove them from scene.cache_dir (else ~/.cache/nerf_lightning), and the photographs are read anew."
         )
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
+
     scales = []
     for view, (width, height) in zip(capture.views, files, strict=True):
         x, y = width / view.size[0], height / view.size[1]
@@ -175,13 +177,18 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
             )
         scales.append((x / downscale, y / downscale))
     scale = torch.tensor(scales, dtype=torch.float64)
-
-    def column(name: str) -> Tensor:
-        return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
+    focal = column("focal") * scale
+    if not bool(((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all()):
+        view = capture.views[int(((focal < LEAST_FOCAL) | (focal > FARTHEST)).any(dim=-1).int().argmax())]
+        raise InputError(
+            f"{capture.source}: the view {view.name} has a focal length of {view.focal[0]:g}, {view.focal[1]:g} pixels "
+            f"of {view.size[0]:g} x {view.size[1]:g}, which no lens has on the picture that is there. Export the "
+            "intrinsics again."
+        )
 
     return Cameras(
         c2w=torch.stack([view.c2w for view in capture.views]),
-        focal=(column("focal") * scale).float(),
+        focal=focal.float(),
         center=(column("center") * scale).float(),
         lens=column("lens").float(),
         lens_model=capture.lens_model,

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,13 +10,14 @@ from typing import Literal, get_args
 from nerf_lightning.data.base import Reader
 from nerf_lightning.data.boundary import require_inside
 from nerf_lightning.data.capture import Capture, cameras_of, check_capture, filtered
-from nerf_lightning.data.checks import check_step, is_there, known_background, listed
+from nerf_lightning.data.checks import check_step, is_folder, is_there, known_background, listed
 from nerf_lightning.data.extents import extent_of, require_possible
 from nerf_lightning.data.images import ENDINGS, image_size
 from nerf_lightning.data.photographs import read_photographs
 from nerf_lightning.data.spaces import choose_space
 from nerf_lightning.data.splits import every_kth
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.walk import walk
 from nerf_lightning.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.geometry.lens_checks import require_invertible
 from nerf_lightning.types.scene import Background, Scene
@@ -129,7 +129,7 @@ class CaptureReader(Reader):
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
             raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
-        if not folder.is_dir():
+        if not is_folder(folder):
             where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
             raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder
@@ -200,9 +200,6 @@ class CaptureReader(Reader):
 def picture_files(folder: Path) -> list[str]:
     """Return the names of the pictures in a folder and its subfolders, sorted as text."""
     found = []
-    # os.walk does not follow links to folders, so that a loop of links ends.
-    for base, _, names in os.walk(folder):
-        found += [
-            (Path(base) / name).relative_to(folder).as_posix() for name in names if Path(name).suffix.lower() in ENDINGS
-        ]
+    for base, _, names in walk(folder):
+        found += [(base / name).relative_to(folder).as_posix() for name in names if name.lower().endswith(ENDINGS)]
     return sorted(name for name in found if not Path(name).name.startswith("."))

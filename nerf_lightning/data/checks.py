@@ -31,33 +31,60 @@ def listed(items: Iterable[object], cap: int = 10) -> str:
     return shown if len(names) <= cap else f"{shown} and {len(names) - cap} more"
 
 
+def require_different(names: Iterable[str], where: str) -> None:
+    """Refuse views that bear one name: files and tables are written by it.
+
+    Raises:
+        InputError: with the names, and where they stand.
+    """
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise InputError(f"{where} lists {listed(twice)} more than once. Remove all but one of each.")
+
+
 def contents(folder: Path) -> str:
     """Return what a folder holds, in a few words."""
-    return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+    try:
+        return listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+    except OSError as error:  # it is not there either
+        return f"nothing that can be read ({error.strerror})"
 
 
-def check_step(name: str, value: int) -> None:
+def check_step(name: str, value: object) -> None:
     """Refuse a factor or stride below 1.
 
     Raises:
-        InputError: `value` is not at least 1; `name` is the setting's name in the scene's configuration.
+        InputError: `value` is no whole number of at least 1; `name` is the setting's in the scene's configuration.
     """
-    if value < 1:
+    if type(value) is not int or value < 1:
         raise InputError(f"scene.{name} is {value}, but it must be 1 (take everything as it is) or more.")
 
 
 def check_bounds(near: float, far: float) -> None:
-    """Refuse distances (scene units) that do not satisfy 0 <= near < far < inf.
+    """Refuse distances (scene units) that do not satisfy 0 <= near < far, or that are beyond all digits.
 
     Raises:
         InputError: they do not.
     """
-    if not 0.0 <= near < far < math.inf:
+    if not 0.0 <= near < far <= FARTHEST:
         raise InputError(
-            f"scene.near is {near} and scene.far is {far}, but rays need 0 <= near < far. Set them to the "
-            "distances from the cameras at which the content begins and ends, for example "
+            f"scene.near is {near} and scene.far is {far}, but rays need 0 <= near < far <= {FARTHEST:g}. Set "
+            "them to the distances from the cameras at which the content begins and ends, for example "
             "scene.near=2.0 scene.far=6.0."
         )
+
+
+def box_around_origin(half: int | float) -> Float[Tensor, "2 3"]:
+    """Return lower and upper corner of the cube whose sides lie `scene.aabb_half` (scene units) from the origin.
+
+    Raises:
+        InputError: it has no inside, or reaches beyond all digits.
+    """
+    if not 0 < half <= FARTHEST:
+        raise InputError(
+            f"scene.aabb_half is {half}, but half the side of a box must be above 0, and {FARTHEST:g} at most."
+        )
+    return torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float32)
 
 
 def known_background(name: str) -> Background:
@@ -141,6 +168,14 @@ def is_there(path: Path) -> bool:
     """Tell whether a file can be found; one whose name no file system takes cannot."""
     try:
         return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Tell whether a folder can be found; one whose name no file system takes cannot."""
+    try:
+        return path.is_dir()
     except OSError:
         return False
 

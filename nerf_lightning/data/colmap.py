@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.data.capture import Capture, View, common_lens_model
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
-from nerf_lightning.data.checks import is_absolute, is_there, listed
+from nerf_lightning.data.checks import is_absolute, is_folder, is_there, listed
 from nerf_lightning.data.colmap_model import find_model, model_files, read_model
 from nerf_lightning.data.colmap_records import ColmapCamera, ColmapImage
 from nerf_lightning.data.photographs import Photograph
@@ -49,7 +49,7 @@ class ColmapReader(CaptureReader):
             self.require_inside(path)
         model = read_model(folder)
         pictures = root / self.images
-        if not pictures.is_dir():
+        if not is_folder(pictures):
             raise InputError(
                 f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
                 f"their folder below {root}."

@@ -56,7 +56,7 @@ class BinaryFiles:
             data.skip(8 * data.take("<Q")[0])
             found.extend(values[1:4])
         data.end()
-        return np.array(found, np.float64).reshape(-1, 3)
+        return np.frombuffer(found, np.float64).reshape(-1, 3)
 
 
 class _Bytes:

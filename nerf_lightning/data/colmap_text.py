@@ -1,6 +1,7 @@
 """The text files of a COLMAP model: lines of words; comments begin with #."""
 
 import io
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.data.colmap_records import CURE, CURE_MODEL, MODELS, MOST_BYTES, ColmapCamera, ColmapImage
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
@@ -47,8 +49,15 @@ class TextFiles:
 
     def points(self, path: Path) -> Float[ndarray, "points 3"]:
         """Return the sparse points."""
-        found = [_numbers(line.split()[1:4], f"{path}, line {number}", 3) for number, line in _lines(path)]
-        return np.array(found, np.float64).reshape(-1, 3)
+        found, most = array("d"), allowed().points
+        for number, line in _lines(path):
+            found.extend(_numbers(line.split(maxsplit=4)[1:4], f"{path}, line {number}", 3))
+            if len(found) > 3 * most:  # a text does not say how many there are
+                raise InputError(
+                    f"{path} has more than {most:,} points, which are not taken from a file unasked. If you trust it, "
+                    "add budgets.points=N; else use another file."
+                )
+        return np.frombuffer(found, np.float64).reshape(-1, 3)
 
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:

@@ -10,8 +10,11 @@ from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
 from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
 from nerf_lightning.errors import InputError
-from nerf_lightning.free_memory import free_memory
+from nerf_lightning.free_memory import free_memory, require_memory
 from nerf_lightning.types.scene import Scene
+
+# Of a batch, at least: where its pixels lie, its rays, and what they should look like.
+RAY_BYTES = 120
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +60,7 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
+            _require_room(name, value)
         least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
         if min(least, val_rays) < ranks.world_size():
             raise InputError(
@@ -108,6 +112,10 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> FixedRays:
         """Return the fixed validation rays."""
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
+
+
+def _require_room(name: str, rays: int) -> None:
+    require_memory(f"data.{name}={rays}", rays, lambda count: RAY_BYTES * count, lambda count: f"data.{name}={count}")
 
 
 def _check_background(scene: Scene) -> None:

@@ -86,7 +86,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
         farthest = torch.full_like(farthest, far / unit)
     # What was found yields to what the user says.
     nearest = nearest if near is not None else torch.minimum(nearest, 0.5 * farthest)
-    if not bool((nearest < farthest).all()):
+    if near is not None and not bool((nearest < farthest).all()):
         raise InputError(
             f"scene.near={near:g} lies behind all content of {capture.source}, which ends at "
             f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."

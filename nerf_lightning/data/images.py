@@ -1,6 +1,8 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
+import mmap
 import os
+import re
 import struct
 import threading
 import warnings
@@ -27,6 +29,11 @@ ORIENTATION = 0x0112
 KEEP_ABOVE = 127
 JPEG_BLOCK = 64
 """Pixels of a block."""
+JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+"""Between the pixels, where 0xff is followed by 0, markers stand alone; those of 0xd0 to 0xd7 are among them."""
+JPEG_SCAN, JPEG_END = 0xDA, 0xD9
+SOUND_SCANS, MOST_SCANS = 20, 100
+"""Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
 CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
@@ -183,19 +190,41 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             ) from error
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
-        _check_whole(image, os.fstat(file.fileno()).st_size, path)
+        if image.format == "JPEG":
+            _check_jpeg(image, file, path)
         _check_plain(image, path)
         yield image
 
 
-def _check_whole(image: Image.Image, size: int, path: Path) -> None:
-    """Refuse a JPEG whose decoder would make up most of its pixels: it has a bit at least for each block of them."""
+def _check_jpeg(image: Image.Image, file: BufferedReader, path: Path) -> None:
+    """Refuse a JPEG whose decoder would make up most of its pixels, or go over them again and again."""
     width, height = image.size
-    if image.format == "JPEG" and 8 * size * JPEG_BLOCK < width * height:
+    size = os.fstat(file.fileno()).st_size
+    # It has a bit at least for each block of them.
+    if 8 * size * JPEG_BLOCK < width * height:
         raise InputError(
             f"{path} announces {width} x {height} pixels, and has {size:,} bytes: it is damaged or was cut short. "
             f"{CURE}"
         )
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        scans = jpeg_scans(content)
+    if scans > MOST_SCANS:
+        raise InputError(
+            f"{path} draws its pixels in {scans} passes, where sound files have {SOUND_SCANS} at most: it would take "
+            f"hours to decode. {CURE}"
+        )
+
+
+def jpeg_scans(content: bytes | mmap.mmap) -> int:
+    """Return how many times a JPEG goes over its pixels; what comes behind its end is not counted."""
+    place, scans = 2, 0
+    while found := JPEG_MARKER.search(content, place):
+        marker, place = content[found.end() - 1], found.end()
+        if marker == JPEG_END:
+            break
+        scans += marker == JPEG_SCAN
+        place += int.from_bytes(content[place : place + 2], "big")
+    return scans
 
 
 def _check_plain(image: Image.Image, path: Path) -> None:

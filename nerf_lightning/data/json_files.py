@@ -22,7 +22,7 @@ def read_json(path: Path) -> Any:
     try:
         text = read_text(path, allowed().json_bytes, CURE, "utf-8-sig")
         require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
@@ -31,6 +31,14 @@ def read_json(path: Path) -> Any:
     except ValueError as error:  # a number of thousands of digits
         raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
     _require_flat(content, path)
+    return content
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
+        raise ValueError(f"the key {twice[:200]!r} stands twice in one object, and which one holds is not clear")
     return content
 
 

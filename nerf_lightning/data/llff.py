@@ -3,7 +3,6 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from numpy import ndarray
 from nerf_lightning.budgets import require_within
 from nerf_lightning.data.capture import Capture, View
 from nerf_lightning.data.capture_reader import CaptureReader, picture_files
-from nerf_lightning.data.checks import contents, listed
+from nerf_lightning.data.checks import contents, is_folder, listed
 from nerf_lightning.data.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.data.photographs import Photograph
 from nerf_lightning.errors import InputError
@@ -46,13 +45,13 @@ class LlffReader(CaptureReader):
         pictures = self._pictures(root)
         self.require_inside(pictures, self.images)
         names = picture_files(pictures)
-        for name in names:
-            self.require_inside(pictures / name, self.images)
         if len(names) != len(rows):
             raise InputError(
                 f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
                 "in order of names. Remove the photographs that were not registered, or add those that are missing."
             )
+        for name in names:
+            self.require_inside(pictures / name, self.images)
         bounds = torch.from_numpy(rows[:, 15:])
         return Capture(
             views=tuple(self._view(pictures / name, name, row) for name, row in zip(names, rows, strict=True)),
@@ -63,7 +62,7 @@ class LlffReader(CaptureReader):
     def _pictures(self, root: Path) -> Path:
         asked = [self.images] if self.images else ["images", "images_2", "images_4", "images_8"]
         for name in asked:
-            if (root / name).is_dir():
+            if is_folder(root / name):
                 return root / name
         raise InputError(f"{root} has no folder {' or '.join(asked)} with the photographs. Set scene.images to it.")
 
@@ -89,10 +88,8 @@ def _array(path: Path) -> ndarray:
             array_header(file.read(HEADER_BYTES), os.fstat(file.fileno()).st_size)
             file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
-    except (MemoryError, OverflowError) as error:
-        raise InputError(f"{path} announces more numbers than fit into memory. It is damaged. {CURE}") from error
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:

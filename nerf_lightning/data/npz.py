@@ -3,6 +3,7 @@
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from nerf_lightning.data.base import Reader
 from nerf_lightning.data.checks import (
     FARTHEST,
     LEAST_FOCAL,
+    box_around_origin,
     check_bounds,
     check_divisible,
     check_step,
+    is_there,
     known_background,
     listed,
     pose_from_matrix,
@@ -107,7 +110,7 @@ class NpzReader(Reader):
             pixels=_pixels(images, self.downscale, self.path),
             near=torch.full((len(images),), float(self.near)),
             far=torch.full((len(images),), float(self.far)),
-            aabb=torch.tensor([[-self.aabb_half] * 3, [self.aabb_half] * 3]),
+            aabb=box_around_origin(self.aabb_half),
             splits={"train": train, "val": held, "test": held},
             view_names=tuple(str(view) for view in range(len(images))),
             background=known_background(self.background),
@@ -123,8 +126,7 @@ class NpzReader(Reader):
         known_background(self.background)
         if self.hold_every < 0:
             raise InputError(f"scene.hold_every is {self.hold_every}, but it must be 0 (in order) or more.")
-        if not self.aabb_half > 0:
-            raise InputError(f"scene.aabb_half is {self.aabb_half}, but half the side of a box must be above 0.")
+        box_around_origin(self.aabb_half)
 
     def _split(self, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the views to learn from and the ones held out."""
@@ -144,7 +146,7 @@ class NpzReader(Reader):
 
 def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
     """Return the three arrays; nothing in the file is executed (no pickles)."""
-    if not path.is_file():
+    if not is_there(path):
         raise InputError(f"The file {path} does not exist. Set scene.path to the .npz file, or copy it there.")
     try:
         # What is taken of it is bounded by its headers.
@@ -159,7 +161,7 @@ def _load(path: Path, max_gigabytes: float) -> dict[str, np.ndarray]:
 
 
 def _damaged(path: Path, error: Exception) -> str:
-    with open_regular(path, None) as file:
+    with suppress(OSError), open_regular(path, None) as file:
         if file.read(6) == b"\x93NUMPY":
             return f"{path} is not a numpy .npz archive: it holds a single array. {LAYOUT}"
     return f"{path} is not a numpy .npz archive, or is damaged: {error}. Remove it, and copy or download it again."

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
+from nerf_lightning.budgets import require_within
 from nerf_lightning.data.checks import listed
 from nerf_lightning.data.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, open_picture, read_rgba
 from nerf_lightning.errors import InputError
@@ -17,6 +18,8 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 FEWEST = 3
 SMALLEST_SIDE = 64
 JPEG_QUALITY = 95
+LENS_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
+LONGEST_TAG = 200
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
         allow_outside: follow links that lead out of it.
 
     Raises:
-        InputError: no such folder, fewer than three pictures in it, or one that cannot be read or is tiny.
+        InputError: no such folder, fewer than three pictures in it, more than a person has agreed to, or one
+            that cannot be read or is tiny.
     """
     try:
         files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
@@ -57,6 +61,7 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
+    require_within("views", len(pictures), f"images={folder}", "photographs")
     outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
     if outside and not allow_outside:
         raise InputError(
@@ -115,22 +120,23 @@ def _photograph(path: Path) -> FoundPhotograph:
             f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
             f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
-    exif = _exif(path)
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    turned = exif.get(ORIENTATION, 1)
-    tags = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
-    lens = (str(exif.get(ExifTags.Base.Model, "")), *(str(details.get(tag, "")) for tag in tags))
+    turned, lens = _exif(path)
     # Orientations 5 to 8 are quarter turns.
     return FoundPhotograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
 
 
-def _exif(path: Path) -> Image.Exif:
+def _exif(path: Path) -> tuple[object, tuple[str, ...]]:
+    """Return how a photograph is turned, and what tells its lens apart from others."""
     with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
-            return image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
+            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
+            # Of a TIFF, this reads the file.
+            details = exif.get_ifd(ExifTags.IFD.Exif)
         except DECODER_ERRORS:
-            return Image.Exif()  # damage is named once the pixels are decoded
+            exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
+    lens = (exif.get(ExifTags.Base.Model, ""), *(details.get(tag, "") for tag in LENS_TAGS))
+    return exif.get(ORIENTATION, 1), tuple(str(value)[:LONGEST_TAG] for value in lens)
 
 
 def _write_turned(path: Path, target: Path) -> None:

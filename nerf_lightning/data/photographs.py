@@ -136,7 +136,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
         return bool((rgba[..., 3] < 255).any())
 
     transparent = in_threads(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
-    return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0)
+    return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0, checksum=0)
 
 
 def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tuple[int, int]]:

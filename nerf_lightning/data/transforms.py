@@ -41,7 +41,7 @@ class TransformsReader(CaptureReader):
     def capture(self) -> Capture:
         """Return all frames, in the file's order."""
         path = self.folder() / self.file
-        if not path.is_file():
+        if not is_there(path):
             raise InputError(_absent(path))
         self.require_inside(path, self.file)
         content = read_json(path)
@@ -123,7 +123,7 @@ def _ngp_box(content: dict[str, Any], path: Path) -> Float[Tensor, "2 3"] | None
 
 
 def _absent(path: Path) -> str:
-    if (path.parent / "transforms_train.json").is_file():
+    if is_there(path.parent / "transforms_train.json"):
         return (
             f"{path} does not exist, but transforms_train.json does: this is the Blender format. "
             f"Use scene=blender scene.root={path.parent}."

@@ -44,13 +44,30 @@ def _held(part: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+    handle = _locked(part)
     try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
         os.close(handle)
+
+
+def _locked(part: Path) -> int:
+    """Make a file and lock it; where another process takes it for a dead one's in between, and removes it, again."""
+    while True:
+        handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX)  # whoever sweeps holds it for a moment
+        if _is_at(handle, part):
+            return handle
+        os.close(handle)
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Tell whether an open file is still the one of this name."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path, follow_symlinks=False))
+    except FileNotFoundError:
+        return False
 
 
 @cache
@@ -64,6 +81,7 @@ def _sweep(folder: Path) -> None:
                 handle = os.open(part, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    part.unlink()
+                    if _is_at(handle, part):
+                        part.unlink()
                 finally:
                     os.close(handle)

@@ -20,7 +20,7 @@ from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.json_file import write_json
 from nerf_lightning.export.pictures import save_png, to_bytes
-from nerf_lightning.export.seen_views import SeenView, see
+from nerf_lightning.export.seen_views import SeenView, require_room, see
 from nerf_lightning.geometry.cameras import camera_coordinates
 from nerf_lightning.geometry.frames import directions_to_user, unit_of
 from nerf_lightning.geometry.spread import spread
@@ -50,6 +50,7 @@ class ImagesExport(Export):
     def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
         views = self._views(record)
+        require_room(record.cameras, views, record.view_names)
         names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
         farthest = 0.0
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:

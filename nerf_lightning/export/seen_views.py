@@ -8,7 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.escaping import for_terminal
 from nerf_lightning.evaluation.geometry import normals_from_depth, surface_depth
+from nerf_lightning.free_memory import require_memory
 from nerf_lightning.geometry.cameras import (
     all_pixels,
     camera_coordinates,
@@ -19,6 +21,11 @@ from nerf_lightning.geometry.cameras import (
 from nerf_lightning.models.levels import RadianceModel
 from nerf_lightning.models.pictures import render_picture
 from nerf_lightning.types.scene import Cameras
+
+# Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
+STRAIGHT = 250
+# where rays go through normalised device coordinates.
+BENT = 370
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,24 @@ class SeenView:
     points: Float[Tensor, "height width 3"]
     normals: Float[Tensor, "height width 3"]
     """Unit, facing the camera; zero where the depth has no slope to speak of."""
+
+
+def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
+    """Refuse views whose rays take more memory than can be had, before the first of them is made.
+
+    Raises:
+        InputError: with the largest view, and what would fit.
+    """
+    each = BENT if cameras.ndc is not None else STRAIGHT
+    sizes = {view: int(cameras.width[view]) * int(cameras.height[view]) for view in views}
+    view = max(sizes, key=lambda view: sizes[view])
+    require_memory(
+        f"The view {for_terminal(names[view])} has {int(cameras.width[view])} x {int(cameras.height[view])} pixels and "
+        "is rendered as a whole",
+        sizes[view],
+        lambda pixels: each * pixels,
+        lambda pixels: f"Views of up to {pixels:,} pixels",
+    )
 
 
 def see(model: RadianceModel, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:

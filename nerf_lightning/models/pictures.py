@@ -110,19 +110,29 @@ def render_rays(model: RadianceModel, rays: RayBundle, background: Background, t
 
 
 def _render_all(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
-    device = next(model.parameters()).device
     at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
     while True:
         try:
-            parts = [_render_tile(model, rays[p].to(device), background) for p in tiles(rays.near.numel(), at_once)]
-            return [torch.cat(column) for column in zip(*parts, strict=True)]
+            return _render_in_tiles(model, rays, background, at_once)
         except RuntimeError as error:
             if at_once == 1 or not is_out_of_memory(error):
                 raise
         model.most_rays = at_once = at_once // 2
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
+
+
+def _render_in_tiles(model: RadianceModel, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
+    device, count = next(model.parameters()).device, rays.near.numel()
+    columns: list[Tensor] = []
+    for part in tiles(count, at_once):
+        rendered = _render_tile(model, rays[part].to(device), background)
+        # Made once: thousands of small results between what comes and goes would leave holes many times their size.
+        columns = columns or [result.new_empty(count, *result.shape[1:]) for result in rendered]
+        for column, result in zip(columns, rendered, strict=True):
+            column[part] = result
+    return columns
 
 
 def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> list[Tensor]:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 from nerf_lightning.export.figures import new_figure
 from nerf_lightning.reports.embedding import data_address
@@ -37,14 +38,25 @@ CHARTS = (
 )
 
 
-def curve_drawings(curves: Mapping[str, Curve]) -> list[tuple[str, str]]:
-    """Return label and address of each chart that there is something to draw in."""
+class Drawing(NamedTuple):
+    """A chart in a page."""
+
+    label: str
+    address: str
+    note: str
+    """What of it is not drawn; empty: all is."""
+
+
+def curve_drawings(curves: Mapping[str, Curve]) -> list[Drawing]:
+    """Return the charts that there is something to draw in."""
     drawings = []
     for chart in CHARTS:
         drawn = {tag: _finite(curve, chart) for tag, curve in sorted(curves.items()) if chart.tags.fullmatch(tag)}
-        drawn = dict(islice(((tag, curve) for tag, curve in drawn.items() if curve[0]), MOST_CURVES))
+        drawn = {tag: curve for tag, curve in drawn.items() if curve[0]}
         if drawn:
-            drawings.append((chart.label, data_address("image/svg+xml", _draw(chart, drawn))))
+            first, more = dict(islice(drawn.items(), MOST_CURVES)), len(drawn) - MOST_CURVES
+            note = f"{more} more curves are in the run's TensorBoard files." if more > 0 else ""
+            drawings.append(Drawing(chart.label, data_address("image/svg+xml", _draw(chart, first)), note))
     return drawings
 
 

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from nerf_lightning.data.doctor.check import Check
 from nerf_lightning.escaping import for_html
+from nerf_lightning.reports.curves import Drawing
 from nerf_lightning.reports.embedding import Embedded
 
 FOLDER = Path(__file__).parent
@@ -46,7 +47,7 @@ class Report:
     views: list[ViewOnPage] = field(default_factory=list)
     steps: list[tuple[str, Embedded]] = field(default_factory=list)
     """Pictures of one view while it was learnt."""
-    curves: Pairs = field(default_factory=list)
+    curves: list[Drawing] = field(default_factory=list)
     videos: Pairs = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
     """What the doctor found."""

@@ -175,8 +175,8 @@ class Controls:
             return
         self._wants_snapshot = False
         try:
-            path = free_name(self.folder, "snapshot", ".png", limits.MOST_SNAPSHOTS)
-            save_png(path, picture)
+            with free_name(self.folder, "snapshot", ".png", limits.MOST_SNAPSHOTS) as path:
+                save_png(path, picture)
         except OSError as error:  # nothing that is clicked ends a training
             self.session.client.add_notification("Snapshot", not_saved(error), color="red")
         else:

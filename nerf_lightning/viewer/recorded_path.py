@@ -64,9 +64,8 @@ class RecordedPath:
         if len(self.keyframes) < 2:
             return "A path needs two keyframes or more."
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            path = free_name(self.folder, "camera_path", ".yaml", limits.MOST_PATHS)
-            write_keyframes(path, self.keyframes)
+            with free_name(self.folder, "camera_path", ".yaml", limits.MOST_PATHS) as path:
+                write_keyframes(path, self.keyframes)
         except OSError as error:
             return as_plain_markdown(not_saved(error), MOST_SAID)
         return (

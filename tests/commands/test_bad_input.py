@@ -168,6 +168,26 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("data.batch_rays=0", "data.batch_rays=0"),
         ("init_from=nowhere.ckpt", "There is no checkpoint at nowhere.ckpt"),
         ("trainer.max_epochs=0", "trainer.max_epochs=0"),
+        ("trainer.max_epochs=inf", "trainer.max_epochs=inf: give a positive number up to"),
+        ("resume=5", "resume=5 does not fit: it must be a path"),
+        ("scene._target_=5", "See nerf train --help"),
+        ("trainer.num_threads=0", "trainer.num_threads=0: give a number from 1 to 4096"),
+        ("trainer.num_threads=1000000000", "trainer.num_threads=1000000000: give a number from 1 to 4096"),
+        ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
+        ("init_from=5", "init_from=5 does not fit: it must be a path"),
+        ("init_from=[1]", "init_from=[1] does not fit: it must be a path"),
+        ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 does not fit: it must be a Field, chosen by"),
+        ("model.levels.coarse.field=[1]", "model.levels.coarse.field=[1] does not fit: it must be a Field"),
+        ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Mend optimizer.*"),
+        ("callbacks.monitor=5", "callbacks.monitor=5 is no callback. To do without one, add ~callbacks.monitor."),
+        ("final=5", "final=5 does not fit: it holds settings, such as final.evaluate=VALUE"),
+        ("budget=null", "budget=None does not fit: it holds settings, such as budget.seconds=VALUE"),
+        ("data.batch_rays=1000000000000", "data.batch_rays=1000000000000, which takes"),
+        ("scene.aabb_half=inf", "scene.aabb_half is inf, but half the side of a box must be above 0"),
+        ("scene.far=1e300", "scene.far is 1e+300, but rays need 0 <= near < far <= 1e+09"),
+        ("model=5", "A group was given something else than the name of one of its options"),
+        ("field=null", "A group was given something else than the name of one of its options"),
+        ("encoder=[1]", "A group was given something else than the name of one of its options"),
     ],
 )
 def test_a_bad_setting_is_named_before_a_folder_is_taken(nerf, capture, tmp_path, override, words):
@@ -258,3 +278,9 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
     assert process.returncode == 130, output
     assert "Traceback" not in output
     assert not list(tmp_path.glob("*.mp4"))
+
+
+@pytest.mark.parametrize("command", ["render", "export what=cameras"])
+@pytest.mark.parametrize("ckpt", ["5", "[1]"])
+def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command, ckpt):
+    said(nerf(*command.split(), f"ckpt={ckpt}", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")

@@ -222,6 +222,7 @@ def state(**changed):
         (recorded(splits={"test": (0,)}), "splits lacks train"),
         (recorded(splits={"train": (), "test": (0,)}), "splits.train has 0 entries"),
         (recorded(splits={"train": (0, 1, 0)}), "splits.train names a view twice"),
+        (recorded(view_names=("a",) * 6), "view_names names two views alike"),
         (state(precision="transformer-engine"), "precision"),
         (state(tile_points=-1), "tile_points"),
         (state(choices=["scene"]), "choices"),
@@ -419,3 +420,11 @@ def test_values_that_no_config_of_ours_holds_are_refused(tmp_path, value):
 def test_a_recorded_place_that_no_file_can_have_is_not_taken(tmp_path, path):
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "lego_tiny"}), scene={"path": path})
     assert not [line for line in scene_of(str(file)) if line.startswith("scene.path=")]
+
+
+def test_a_model_without_a_level_is_refused(tmp_path):
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: c["model"].update(levels={})))
+    content = torch.load(file, weights_only=True)
+    content["state_dict"] = {}
+    torch.save(content, file)
+    refused(load_model, read_checkpoint(file), parts=("has no level (model.levels is empty)",))

@@ -38,6 +38,15 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
     assert "paths.output_dir" not in rows[0]
 
 
+def test_settings_without_a_column_are_counted_below(table, tmp_path):
+    for number in range(2):
+        overrides = tuple(f"optimizer.a{key:02d}={number}" for key in range(34))
+        leave_measured_run(tmp_path / "runs" / str(number), 20.0, overrides=overrides)
+    result, rows = table("published=false")
+    assert len([column for column in rows[0] if column.startswith("optimizer.")]) == 32
+    assert "2 more settings differ and have no column: optimizer.a32, optimizer.a33." in result.out
+
+
 def test_what_was_swept_within_model_or_scene_is_shown(table, tmp_path):
     for resolution, space in ((32, "bounded"), (64, "bounded"), (64, "contracted")):
         leave_measured_run(

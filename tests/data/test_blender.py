@@ -79,10 +79,10 @@ def test_names_are_the_shortest_that_differ(tmp_path):
     assert BlenderReader(str(tmp_path)).read().view_names == ("r_0", "r_1")
 
 
-def test_names_fall_back_to_the_path_in_the_file(root):
+def test_names_fall_back_to_the_path_in_the_file_of_a_split(root):
     frames = [{"file_path": f"./{split}/r_0.png", "transform_matrix": pose(0)} for split in ("val", "test")]
     write_transforms(root, "train", frames)
-    assert BlenderReader(str(root)).read().view_names[:2] == ("val/r_0", "test/r_0")
+    assert BlenderReader(str(root)).read().view_names[:2] == ("train/val/r_0", "train/test/r_0")
 
 
 def test_missing_val_is_held_out_from_train(root, caplog):

@@ -98,7 +98,7 @@ def colmap_of_many(root, name, record, count=10**7):
 
 def test_thirty_million_points_of_colmap(tmp_path):
     root = colmap_of_many(tmp_path / "capture", "points3D", 51, 3 * 10**7)
-    refused("colmap", root, r"points3D\.bin has 30,000,000 points, and more than 20,000,000")
+    refused("colmap", root, r"points3D\.bin has 30,000,000 points, and more than 10,000,000")
 
 
 @pytest.mark.parametrize(("name", "record"), [("cameras", 48), ("images", 73)])

@@ -13,6 +13,7 @@ from PIL import Image
 from running import start_code
 
 from nerf_lightning.data import photographs as module
+from nerf_lightning.data import pixel_file
 from nerf_lightning.data.images import area_downscale, crop_to_multiple, read_rgba
 from nerf_lightning.data.photographs import Photograph, read_photographs
 from nerf_lightning.errors import InputError
@@ -165,7 +166,13 @@ def another_size(path):
     note.write_text(json.dumps(header))
 
 
-@pytest.mark.parametrize("damage", [cut, blank, garble, forget, empty, another_size])
+def one_byte(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [cut, blank, garble, forget, empty, another_size, one_byte])
 def test_a_damaged_store_is_made_again(capture, cache, decoded, damage):
     before = read(capture, cache).rgba.clone()
     (path,) = cache.glob("*.pixels")
@@ -174,6 +181,21 @@ def test_a_damaged_store_is_made_again(capture, cache, decoded, damage):
     assert len(decoded) == 6
     assert torch.equal(read(capture, cache).rgba, before)
     assert len(decoded) == 6
+
+
+@pytest.mark.parametrize("verify", [False, True])
+def test_a_large_store_is_compared_with_its_checksum_only_where_it_is_asked_for(
+    tmp_path, cache, decoded, monkeypatch, verify
+):
+    Image.fromarray(picture(0, 512, 512)).save(tmp_path / "a.png")  # larger than the spots together
+    read([Photograph(tmp_path / "a.png")], cache, verify=True)
+    monkeypatch.setattr(pixel_file, "CHECKED_WHOLE", 1000)
+    (path,) = cache.glob("*.pixels")
+    content = bytearray(path.read_bytes())
+    content[5000] ^= 1  # between two spots
+    path.write_bytes(content)
+    read([Photograph(tmp_path / "a.png")], cache, verify=verify)
+    assert len(decoded) == 1 + verify
 
 
 def test_a_failed_reader_leaves_nothing_and_a_killed_one_nothing_that_is_believed(capture, cache):

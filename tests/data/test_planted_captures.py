@@ -319,7 +319,8 @@ def test_many_frames_of_one_picture_are_counted(tmp_path):
     for split in ("train", "val", "test"):
         path = root / f"transforms_{split}.json"
         content = json.loads(path.read_text())
-        content["frames"] = [content["frames"][0] | {"file_path": "./big"}] * 300
+        frame, up = content["frames"][0], "train/../"
+        content["frames"] = [frame | {"file_path": f"{number * up}big"} for number in range(300)]
         path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"900 pictures of 90,000 megapixels in all need 360.0 GB of memory"):
         BlenderReader(str(root)).read()

@@ -39,6 +39,28 @@ def test_what_is_being_written_stays(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt", "b.txt"]
 
 
+@pytest.mark.skipif(atomic.fcntl is None, reason="files have no owners there that could be asked for")
+def test_a_file_that_is_made_and_not_yet_locked_is_not_lost(tmp_path, monkeypatch):
+    """Another process that begins in between takes it for a dead one's."""
+    flock = atomic.fcntl.flock
+
+    def sweep_first(handle, operation):
+        monkeypatch.setattr(atomic.fcntl, "flock", flock)
+        atomic._sweep.cache_clear()
+        atomic._sweep(tmp_path)
+        flock(handle, operation)
+
+    (tmp_path / "a.txt").touch()
+    atomic._sweep(tmp_path)
+    monkeypatch.setattr(atomic.fcntl, "flock", sweep_first)
+    with whole_file(tmp_path / "a.txt") as part:
+        assert part.exists()
+        atomic._sweep.cache_clear()
+        atomic._sweep(tmp_path)
+        part.write_text("whole")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["whole"]
+
+
 def test_what_a_person_has_beside_it_stays(tmp_path):
     kept = (".notes.part.txt", "a.12.part.txt", ".profile", ".12.party")
     for name in kept:

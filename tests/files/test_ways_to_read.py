@@ -11,7 +11,7 @@ LOADERS = {"np", "torch", "OmegaConf"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
     "callbacks/live_view.py": ["print"],  # the address, which is ours
-    "cli.py": ["read_text", "print", "print", "print"],
+    "cli.py": ["load", "read_text", "print", "print", "print"],
     "commands/console.py": ["print"],
     "commands/sweep.py": ["print"],
     "commands/environment.py": ["read_text"],

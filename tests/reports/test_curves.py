@@ -2,6 +2,7 @@ import base64
 import math
 
 from nerf_lightning.reports.curves import curve_drawings
+from nerf_lightning.reports.page import Report, page
 
 
 def test_known_curves_are_drawn_together_and_unknown_names_are_not():
@@ -14,7 +15,8 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
         "train/loss_$\\evil": (steps, [1.0, 1.0, 1.0]),
         "<script>": (steps, [1.0, 1.0, 1.0]),
     }
-    drawings = dict(curve_drawings(curves))
+    drawings = {drawing.label: drawing.address for drawing in curve_drawings(curves)}
+    assert [drawing.note for drawing in curve_drawings(curves)] == ["", ""]
     assert list(drawings) == ["PSNR (dB)", "loss"]
     kind, _, content = drawings["loss"].partition(",")
     assert kind == "data:image/svg+xml;base64"
@@ -22,7 +24,10 @@ def test_known_curves_are_drawn_together_and_unknown_names_are_not():
     assert curve_drawings({}) == []
 
 
-def test_a_few_curves_are_drawn_of_thousands():
+def test_a_few_curves_are_drawn_of_thousands_and_it_is_said():
     curves = {f"train/loss_{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
-    ((_, address),) = curve_drawings(curves)
-    assert len(address) < 200_000
+    (drawing,) = curve_drawings(curves)
+    assert len(drawing.address) < 200_000
+    assert drawing.note == "2988 more curves are in the run's TensorBoard files."
+    text = page(Report("a run", curves=[drawing]))
+    assert "<figcaption>2988 more curves are in the run&#x27;s TensorBoard files.</figcaption>" in text

@@ -1,0 +1,32 @@
+"""Folders below a folder, however deep: Python's own `os.walk` (up to 3.11) and `rglob` go down by recursion."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Yield each folder, the folders in it and the other names in it, the folder itself first, as `os.walk` does.
+
+    Links to folders are named and not followed, so that a loop of links ends; folders that cannot be read are passed
+    over. What the caller takes out of the list of folders is not entered, and their order is the caller's.
+    """
+    waiting = [root]
+    while waiting:
+        base = waiting.pop()
+        folders, names = list[str](), list[str]()
+        try:
+            with os.scandir(base) as entries:
+                for entry in entries:
+                    (folders if _is_folder(entry) else names).append(entry.name)
+        except OSError:
+            continue
+        yield base, folders, names
+        waiting += [base / name for name in reversed(folders) if not os.path.islink(base / name)]
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a loop of links
+        return False

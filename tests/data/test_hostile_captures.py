@@ -1,0 +1,235 @@
+"""Captures that a stranger made to be opened: headers that no parser takes, deep folders, equal names."""
+
+import inspect
+import io
+import json
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from captures import write_blender, write_npz
+from malformed import WRITERS, edit_json
+from PIL import Image
+from posed_captures import Known, read, write_colmap
+from running import refused
+from support.budget import budget
+
+from nerf_lightning.data.blender import BlenderReader
+from nerf_lightning.data.capture_reader import picture_files
+from nerf_lightning.data.checks import box_around_origin, check_step, require_different
+from nerf_lightning.data.images import MOST_SCANS, image_size, jpeg_scans
+from nerf_lightning.data.npz import NpzReader
+from nerf_lightning.data.photograph_folder import find_photographs
+from nerf_lightning.files.walk import walk
+
+HEADERS = {
+    "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-9, -17)}",
+    "beyond": "{'descr': '<f8', 'fortran_order': False, 'shape': (0, 10000000000000000000000)}",
+    "flag": "{'descr': '<f8', 'fortran_order': False, 'shape': (True, 17)}",
+    "deep": "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "-" * 9000 + "1,)}",
+    "open": "{'descr': '<f8', 'fortran_order': False, 'shape': (1,",
+    "indented": "   {\n x",
+}
+
+
+def npy(header):
+    start = header.encode() + b"\n"
+    return b"\x93NUMPY\1\0" + len(start).to_bytes(2, "little") + start + bytes(9 * 17 * 8)
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_headers_of_arrays_that_no_parser_takes(tmp_path, name):
+    for key in ("images", "focal"):
+        path = write_npz(tmp_path / f"{key}.npz", **{key: None})
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(f"{key}.npy", npy(HEADERS[name]))
+        refused(NpzReader(str(path)).read, parts=("or is damaged: its header",))
+    root = WRITERS["llff"](tmp_path / "llff")
+    (root / "poses_bounds.npy").write_bytes(npy(HEADERS[name]))
+    refused(read, "llff", root, parts=("not an array of numbers as numpy saves it (its header",))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a file that can be opened and not read lies in /proc")
+def test_an_archive_that_cannot_be_read(tmp_path):
+    (tmp_path / "a.npz").symlink_to("/proc/self/mem")
+    refused(NpzReader(str(tmp_path / "a.npz")).read, parts=("a.npz is not a numpy .npz archive, or is damaged",))
+
+
+def test_folders_within_folders_without_end(tmp_path):
+    """As deep as names can be given; the limit is lowered, since what takes the folders away goes down by recursion."""
+    deepest = tmp_path.joinpath(*"abcdefghij" * 12)
+    deepest.mkdir(parents=True)
+    (deepest / "x.PNG").touch()
+    (deepest / "back").symlink_to(tmp_path)
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(len(inspect.stack()) + 60)
+    try:
+        found = picture_files(tmp_path)
+    finally:
+        sys.setrecursionlimit(before)
+    assert found == [f"{'/'.join('abcdefghij' * 12)}/x.PNG"]
+
+
+def test_folders_are_walked_as_python_does(tmp_path):
+    for name in ("b", "a", "a/c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").touch()
+    (tmp_path / "link").symlink_to("a")
+    (tmp_path / "loop").symlink_to("loop")
+    seen = []
+    for base, folders, names in walk(tmp_path):
+        folders.sort()
+        seen.append((base.relative_to(tmp_path).as_posix(), folders, sorted(names)))
+    assert seen == [
+        (".", ["a", "b", "link"], ["loop"]),
+        ("a", ["c"], ["file"]),
+        ("a/c", [], ["file"]),
+        ("b", [], ["file"]),
+    ]
+    assert list(walk(tmp_path / "absent")) == []
+
+
+def test_equal_names_are_found_in_one_pass():
+    class Name(str):
+        compared = 0
+
+        def __eq__(self, other):
+            Name.compared += 1
+            return str.__eq__(self, other)
+
+        __hash__ = str.__hash__
+
+    refused(require_different, [Name("a.png") for _ in range(1000)], "a.json", parts=("a.json lists a.png more than",))
+    assert Name.compared < 5000
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "words"),
+    [
+        ("transforms", {"file": "absent/transforms.json"}, "does not exist; the folder holds nothing that can be read"),
+        ("transforms", {"file": "x" * 5000}, "does not exist; the folder holds images"),
+        ("llff", {"images": "x" * 5000}, "has no folder x"),
+        ("colmap", {"images": "x" * 5000}, "does not exist, and the model's photographs are looked for there"),
+    ],
+)
+def test_settings_that_name_nothing(tmp_path, kind, settings, words):
+    root = WRITERS[kind](tmp_path / "capture")
+    refused(lambda: read(kind, root, **settings), parts=(words,))
+
+
+def test_a_folder_whose_name_is_none(tmp_path):
+    refused(read, "colmap", tmp_path / ("x" * 5000), parts=("does not exist",))
+    refused(BlenderReader("x" * 5000).read, parts=("does not exist",))
+    refused(NpzReader("x" * 5000).read, parts=("does not exist",))
+
+
+@pytest.mark.parametrize("times", [1e17, 1e-1])
+def test_a_focal_length_that_is_possible_for_another_picture_alone(tmp_path, times):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    focal = 1.0 if times > 1 else 5e8
+    size = {key: times * value for key, value in {"w": 16, "h": 12, "cx": 8, "cy": 6}.items()}
+    edit_json(root, lambda content: content | size | {"fl_x": focal, "fl_y": focal})
+    refused(read, "transforms", root, parts=("the view images/p_0.png has a focal length of", "which no lens has"))
+
+
+def test_sparse_points_beyond_everything(tmp_path):
+    root = write_colmap(tmp_path / "capture", Known(points=np.full((60, 3), 1e300)))
+    refused(lambda: read("colmap", root, space="bounded"), parts=("which is a mistake of the reconstruction",))
+
+
+def test_points_of_a_text_are_counted_too(tmp_path):
+    root = WRITERS["text"](tmp_path / "capture")
+    with budget(points=50):
+        refused(read, "colmap", root, parts=("points3D.txt has more than 50 points", "add budgets.points=N"))
+    with budget(points=60):
+        assert len(read("colmap", root).points) == 60
+
+
+def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
+    root = WRITERS["llff"](tmp_path / "capture")
+    (tmp_path / "elsewhere.png").touch()
+    (root / "images" / "more.png").symlink_to(tmp_path / "elsewhere.png")
+    refused(read, "llff", root, parts=("has 9 poses, but", "has 10 photographs"))
+    with budget(views=9):
+        refused(find_photographs, root / "images", parts=("has 10 photographs, and more than 9 are not taken",))
+
+
+def test_half_the_side_of_a_box_may_be_a_whole_number():
+    assert torch.equal(box_around_origin(2), torch.tensor([[-2.0] * 3, [2.0] * 3]))
+
+
+@pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
+def test_a_step_that_is_none(step):
+    refused(check_step, "skip.train", step, parts=(f"scene.skip.train is {step}, but it must be 1",))
+
+
+def test_a_key_that_stands_twice_in_a_json(tmp_path):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    path = root / "transforms.json"
+    path.write_text('{"fl_x": 99.0, ' + path.read_text().lstrip("{"))
+    refused(read, "transforms", root, parts=("transforms.json", "the key 'fl_x' stands twice in one object"))
+
+
+def blender(root, change):
+    write_blender(root, {"train": 3, "val": 2, "test": 2})
+    path = root / "transforms_train.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    return BlenderReader(str(root))
+
+
+def test_a_frame_that_is_listed_twice(tmp_path):
+    reader = blender(tmp_path / "a", lambda content: content["frames"].append(content["frames"][1]))
+    refused(reader.read, parts=("transforms_train.json lists train/r_1 more than once",))
+
+
+def test_a_picture_of_two_splits_has_two_names(tmp_path):
+    frame = {"file_path": "./test/r_0"}
+    reader = blender(tmp_path / "a", lambda content: content["frames"][1].update(frame))
+    names = reader.read().view_names
+    assert len(set(names)) == len(names) == 7
+    assert {"train/test/r_0", "test/test/r_0"} < set(names)
+
+
+def test_an_angle_of_true(tmp_path):
+    reader = blender(tmp_path / "a", lambda content: content.update(camera_angle_x=True))
+    refused(reader.read, parts=("camera_angle_x is True",))
+
+
+def test_a_tiff_with_the_cameras_settings(tmp_path):
+    exif = Image.Exif()
+    exif[0x0110] = "X100"
+    exif.get_ifd(0x8769)[0x920A] = 35.0
+    for name in ("a.tif", "b.tif", "c.tif"):
+        Image.new("RGB", (80, 80)).save(tmp_path / name, exif=exif.tobytes())
+    assert [photograph.lens for photograph in find_photographs(tmp_path)] == [("X100", "35.0", "", "")] * 3
+
+
+def jpeg(**settings):
+    content = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(
+        content, format="JPEG", **settings
+    )
+    return content.getvalue()
+
+
+def test_the_passes_of_a_jpeg_are_counted():
+    thumbnail = Image.Exif()
+    thumbnail[0x010E] = "\xff\xda"
+    assert jpeg_scans(jpeg()) == 1
+    assert jpeg_scans(jpeg(exif=thumbnail)) == 1
+    assert jpeg_scans(jpeg(progressive=True)) == 10
+    assert jpeg_scans(jpeg() + jpeg()) == 1
+    assert jpeg_scans(jpeg(progressive=True)[:3000]) >= 1
+    assert jpeg_scans(b"\xff\xd8\xff\xda") == 1
+
+
+def test_a_jpeg_that_goes_over_its_pixels_without_end(tmp_path):
+    """A pass can be a few bytes and takes a tenth of a second where the picture is large."""
+    sound = jpeg(progressive=True)
+    last = sound.rfind(b"\xff\xda")
+    (tmp_path / "a.jpg").write_bytes(sound[:-2] + MOST_SCANS * sound[last:-2] + b"\xff\xd9")
+    refused(image_size, tmp_path / "a.jpg", parts=("a.jpg draws its pixels in 110 passes",))
