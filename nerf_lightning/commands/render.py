@@ -7,14 +7,14 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints import Checkpoint, read_checkpoint
-from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.checkpoints import Checkpoint
+from nerf_lightning.commands.build import build
 from nerf_lightning.commands.console import say
 from nerf_lightning.commands.film_settings import film_settings, listed
 from nerf_lightning.commands.filming import film
+from nerf_lightning.commands.open_checkpoint import open_checkpoints
 from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
 from nerf_lightning.commands.processes import on_all_processes
-from nerf_lightning.commands.schema import required_path
 from nerf_lightning.commands.shots import Subject
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
@@ -29,25 +29,23 @@ def render(config: DictConfig) -> None:
     """Film one checkpoint, or several side by side; they are all that is needed."""
     plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     shown = film_settings(plain)
-    settings = build(config.trainer)
-    settings.prepare_machine()
-    checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in listed(plain["ckpt"])]
-    labels = labels_of(checkpoints, plain["labels"])
-    settings.keep_tile(checkpoints[0].tile_points)
     path = build(config.path)
+    opened = open_checkpoints(config, listed(plain["ckpt"]))
+    labels = labels_of([each.checkpoint for each in opened], plain["labels"])
     subjects = [
         Subject(
-            settings.prepare(load_model(checkpoint)),
-            checkpoint.scene,
-            known_background(config.background or checkpoint.scene.background),
+            each.model,
+            each.checkpoint.scene,
+            known_background(config.background or each.checkpoint.scene.background),
             label,
         )
-        for checkpoint, label in zip(checkpoints, labels, strict=True)
+        for each, label in zip(opened, labels, strict=True)
     ]
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoints[0].path, "render"))
+    first = opened[0]
+    folder = output_folder(config.paths.output_dir, beside_checkpoint(first.checkpoint.path, "render"))
     with torch.no_grad():
-        shown = replace(shown, precision=settings.precision)
-        written = film(subjects, path, settings.inference_tile_points, folder, shown)
+        shown = replace(shown, precision=first.settings.precision)
+        written = film(subjects, path, first.tile_points, folder, shown)
     say(*map(str, written))
 
 

@@ -8,12 +8,12 @@ from urllib.parse import urlsplit
 
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
-from nerf_lightning.commands.build import build, load_model
+from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.commands.build import build
 from nerf_lightning.commands.console import say
+from nerf_lightning.commands.open_checkpoint import open_checkpoint
 from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.commands.recorded_frame import in_recorded_frame
-from nerf_lightning.commands.schema import required_path
 from nerf_lightning.data.checks import known_background
 from nerf_lightning.errors import InputError
 from nerf_lightning.types.scene import Scene
@@ -34,17 +34,14 @@ def run(config: DictConfig) -> None:
     """Serve the page until Ctrl-C or SIGTERM."""
     require_viser()
     named_places(config.viewer.hosts)
-    settings = build(config.trainer)
-    settings.prepare_machine()
-    checkpoint = read_checkpoint(required_path("ckpt", config.ckpt))
-    settings.keep_tile(checkpoint.tile_points)
-    model = settings.prepare(load_model(checkpoint))
+    opened = open_checkpoint(config)
+    checkpoint = opened.checkpoint
     record = checkpoint.scene
     background = known_background(config.background or record.background)
     scene = _scene(config, record) if config.photographs else None
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
-    renderer = SlicedRenderer(model, record, background, settings.inference_tile_points)
+    renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)
     warm_up(renderer)
     studio = Studio(renderer)
     where = config.host, config.port, config.max_height, config.viewer.hosts

@@ -129,14 +129,14 @@ class HashField(Field):
         return out.view(*features.shape[:-1], out.shape[-1])
 
     def _unit(self, positions: Tensor) -> Tensor:
-        if self.contracted:
+        if self.contracted.is_on():
             # The ball of radius 2 fills the unit cube.
             return contract(in_unit_ball(positions, self.aabb)) / 4.0 + 0.5
         return to_unit_cube(positions, self.aabb)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
-        if self.contracted:
+        if self.contracted.is_on():
             return density
         center, half = center_and_half(self.aabb)
         return torch.where(((positions - center).abs() <= half).all(dim=-1), density, 0.0)

@@ -142,7 +142,7 @@ class NerfMLP(Field):
                     nn.init.zeros_(module.bias)
 
     def _trunk(self, positions: Tensor) -> Tensor:
-        if self.contracted:
+        if self.contracted.is_on():
             positions = contract(in_unit_ball(positions, self.aabb))
         encoded = self.position_encoder(positions)
         hidden = encoded

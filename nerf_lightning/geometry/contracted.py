@@ -34,7 +34,8 @@ class Contracted(nn.Module):
         """Look the buffer up again, since it was written to."""
         self._known = None
 
-    def __bool__(self) -> bool:
+    def is_on(self) -> bool:
+        """Tell whether space is contracted."""
         if self._known is None:
             self._known = bool(self.switch)
         return self._known

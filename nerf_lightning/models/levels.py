@@ -230,7 +230,7 @@ class RadianceModel(nn.Module):
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
         for module in self.modules():
             if isinstance(module, Contracted):
-                bool(module)  # read from its buffer in a compiled field, it would cut the program in pieces
+                module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
     def update(self, step: int, key: int) -> None:

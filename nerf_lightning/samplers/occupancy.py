@@ -76,7 +76,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         self,
         resolution: int = 128,
         num_cascades: int | None = None,
-        num_steps: int = 512,
+        num_steps: int = 256,
         cone_angle: float | None = None,
         update_every: int = 16,
         warmup_steps: int = 256,
@@ -268,7 +268,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
     def _fit_to_space(self) -> None:
         """Make the grid as large as the space wants it; what it held is forgotten."""
         resolution, cascades, cone_angle = self.wanted
-        if self.contracted:
+        if self.contracted.is_on():
             resolution = max(BLOCK, resolution // 2 // BLOCK * BLOCK) if cascades is None else resolution
             cascades = CASCADES_ENDLESS if cascades is None else cascades
             cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle

@@ -41,7 +41,7 @@ class StratifiedSampler(Sampler):
             jitter = random.uniform("stratified", self.num_samples - 1) - 0.5
             s = torch.cat([s[..., :1], s[..., 1:-1] + jitter / self.num_samples, s[..., -1:]], dim=-1)
         near, far = rays.near[..., None], rays.far[..., None]
-        if self.contracted:
+        if self.contracted.is_on():
             low, high = spread(near), spread(far)
             return RaySamples(edges=unspread(low + s * (high - low)), endless=True)
         return RaySamples(edges=near + s * (far - near))

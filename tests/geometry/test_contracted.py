@@ -21,20 +21,20 @@ from nerf_lightning.geometry.contracted import Contracted
 def test_the_config_overrules_the_scene(fixed, space, result):
     switch = Contracted(fixed)
     switch.place(replace(ball_scene(), space=space))
-    assert bool(switch) is result
+    assert switch.is_on() is result
 
 
 def test_a_second_scene_turns_it_again():
     switch = Contracted()
     for space in ("contracted", "bounded", "contracted"):
         switch.place(replace(ball_scene(), space=space))
-        assert bool(switch) == (space == "contracted")
+        assert switch.is_on() == (space == "contracted")
 
 
 @pytest.mark.parametrize("state", [True, False])
 def test_it_travels_in_the_state_dict(state):
     one, other = Contracted(), Contracted()
     one.switch.fill_(state)
-    assert not bool(other)
+    assert not other.is_on()
     other.load_state_dict(one.state_dict())
-    assert bool(other) is state
+    assert other.is_on() is state
