@@ -1,6 +1,7 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
 import gc
+import logging
 import os
 import sys
 from pathlib import Path
@@ -48,6 +49,15 @@ def pytest_runtest_protocol(item, nextitem):
 def _quiet_threads():
     """Two threads at most: more would only wait for each other on a small machine."""
     torch.set_num_threads(min(MOST_THREADS, torch.get_num_threads()))
+
+
+@pytest.fixture(autouse=True)
+def _no_handlers_of_logs_are_left():
+    """Those that Hydra installs write to what one test has captured, which is closed when it ends."""
+    before = logging.root.handlers[:]
+    yield
+    for handler in set(logging.root.handlers).difference(before):
+        logging.root.removeHandler(handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

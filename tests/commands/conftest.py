@@ -1,7 +1,6 @@
 """A capture that a command can read, a finished run on it, and ways to call `nerf`."""
 
 import csv
-import logging
 import os
 import sys
 from dataclasses import dataclass
@@ -51,7 +50,7 @@ def nerf(monkeypatch, capfd):
         monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
         monkeypatch.setattr(Hydra, "get_mode", mode_as_typed)
         capfd.readouterr()
-        code, environment, handlers = 0, dict(os.environ), logging.root.handlers[:]
+        code, environment = 0, dict(os.environ)
         try:
             cli.main()
         except SystemExit as stop:
@@ -60,8 +59,6 @@ def nerf(monkeypatch, capfd):
             # What a command says to the processes that it starts is not said to those of later tests.
             for name in os.environ.keys() - environment.keys():
                 del os.environ[name]
-            # Those that Hydra installed write to what this test has captured, which is closed when it ends.
-            logging.root.handlers[:] = handlers
             monkeypatch.undo()
         return Result(code, *capfd.readouterr())
 

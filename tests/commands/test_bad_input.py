@@ -10,6 +10,7 @@ import yaml
 from running import FAST, refused, said, start
 
 from nerf_lightning.checkpoints import read_checkpoint
+from nerf_lightning.checkpoints.format import FORMAT
 from nerf_lightning.commands.build import load_model
 
 
@@ -51,7 +52,7 @@ def refused_when_planted(nerf, last, tmp_path, plant, *words, by_command):
 
 def test_a_checkpoint_of_another_format(nerf, last, tmp_path):
     path = changed(last, tmp_path, lambda content: content["nerf_lightning"].__setitem__("format", 99))
-    said(nerf("render", path), "has checkpoint format 99", "reads format 2", "Use the version that wrote it")
+    said(nerf("render", path), "has checkpoint format 99", f"reads format {FORMAT}", "Use the version that wrote it")
 
 
 def test_a_file_of_torch_that_is_no_checkpoint_of_ours(nerf, tmp_path):

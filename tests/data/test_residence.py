@@ -142,8 +142,8 @@ def test_the_budget_decides(monkeypatch):
     ],
 )
 def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, expected):
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
     data = RayDataModule(ball_scene(), Progress(), seed=0, num_steps=1, device_budget=0, prefetch=prefetch)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
     data.settle(torch.device(kind))
     assert data.batches.prefetch_for == (None if expected is None else torch.device(expected))
     assert data.batches.scene is data.scene
@@ -165,7 +165,7 @@ def test_pixels_that_fit_move_once(monkeypatch):
 def test_a_mapped_store_is_sent_by_name(tmp_path):
     def make(path):
         path.write_bytes(bytes(range(20)) * 8)
-        return Header(1, [[4, 8]], has_transparency=True, masked=True, contents=None, spots=0)
+        return Header(1, [[4, 8]], has_transparency=True, masked=True, contents=None, spots=0, checksum=0)
 
     store = stored(tmp_path / "store", None, make)
     message = pickle.dumps(store)

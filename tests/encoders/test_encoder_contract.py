@@ -7,8 +7,11 @@ from configs import composed, options
 from nerf_lightning.commands.build import build
 from nerf_lightning.encoders.base import Encoder
 
+CONSTANT = "spherical_harmonics_1"
+"""Says nothing of what it is given, on purpose."""
 
-@pytest.fixture(params=options("encoder"))
+
+@pytest.fixture(params=[option for option in options("encoder") if option != CONSTANT])
 def encoder(request):
     return build(composed("train", f"encoder={request.param}").encoder)
 
@@ -65,3 +68,10 @@ def test_a_model_learns_with_it(encoder):
     (output.rgb.sum() + output.density.sum()).backward()
     grads = [parameter.grad for parameter in field.parameters()]
     assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads)
+
+
+def test_the_constant_is_one():
+    points = torch.rand(4, 3)
+    features = build(composed("train", f"encoder={CONSTANT}").encoder)(points)
+    assert features.shape == (4, 1)
+    assert features.unique().numel() == 1
