@@ -1,5 +1,5 @@
 """`python -m nerf_lightning` is `nerf`."""
 
-from nerf_lightning.cli import main
+from nerf_lightning.cli.main import main
 
 main()

@@ -8,6 +8,7 @@ import html
 import logging
 import re
 import unicodedata
+from collections.abc import Iterable
 from typing import Any
 
 from nerf_lightning.errors import InputError
@@ -136,3 +137,14 @@ def _is_unprintable(letter: str) -> bool:
 
 def _after_backslash(found: re.Match[str]) -> str:
     return f"{found[0][:-1]}\\{found[0][-1]}"
+
+
+def listed(items: Iterable[object], cap: int = 10) -> str:
+    """Return the items separated by commas in one line, at most `cap` of them.
+
+    >>> listed([1, 2, 3, 4], cap=2)
+    '1, 2 and 2 more'
+    """
+    names = [for_terminal(str(item)) for item in items]
+    shown = ", ".join(names[:cap])
+    return shown if len(names) <= cap else f"{shown} and {len(names) - cap} more"

@@ -4,6 +4,7 @@ Processes are joined by `commands.processes`; here only torch.distributed is ask
 its share of the same global batch, and what any of them decides from, all of them know.
 """
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -132,3 +133,10 @@ def from_first(make: Callable[[], Item]) -> Item:
     if told[1] is not None:
         raise InputError(told[1])
     return told[0]
+
+
+def processes_here() -> int:
+    """Return how many of the run's processes are on this machine."""
+    if distributed.is_torchelastic_launched():
+        return int(os.environ["LOCAL_WORLD_SIZE"])
+    return int(os.environ["SLURM_NTASKS"]) // int(os.environ.get("SLURM_NNODES", "1"))

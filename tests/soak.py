@@ -19,7 +19,7 @@ from pathlib import Path
 
 import psutil
 
-from nerf_lightning import cli
+from nerf_lightning.cli import main as cli
 
 # Rounds until caches, kernels and the allocator have settled.
 WARM_UP = 3

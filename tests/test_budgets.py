@@ -3,12 +3,12 @@
 from dataclasses import asdict
 
 import pytest
-from configs import composed, loaded
 from omegaconf import OmegaConf
+from support.configs import composed, loaded
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed, allowed, require_within
-from nerf_lightning.conf_folder import conf_folder
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
 
 
 @pytest.fixture(autouse=True)

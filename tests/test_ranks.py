@@ -4,8 +4,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import ball_scene
-from systems import gradients, make_system
+from support.scenes import ball_scene
+from support.systems import gradients, make_system
 
 from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import RayBatches

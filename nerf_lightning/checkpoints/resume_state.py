@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.optimizer_state import Build, require_fitting_optimizer
-from nerf_lightning.data.ray_batches import Progress, batch_sizes
+from nerf_lightning.data.ray_batches import batch_sizes
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.schema import Description, Plain, Unfit, like
+from nerf_lightning.nerf.types.progress import Progress
 
 CURE = (
     "The checkpoint is damaged, or made by somebody else: go on from another one (resume=RUN_FOLDER takes the newest "

@@ -3,14 +3,15 @@
 import importlib
 from typing import Any
 
-from nerf_lightning.encoders.base import Encoder
 from nerf_lightning.errors import InputError
-from nerf_lightning.fields.base import Field
-from nerf_lightning.models.levels import Level, RadianceModel
-from nerf_lightning.samplers.base import AnySampler
+from nerf_lightning.nerf.encoders.base import Encoder
+from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.models.base import Level
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.base import AnySampler
 
 CONTRACTS = (Encoder, Field, AnySampler, Level, RadianceModel)
-ROOMS = tuple(f"nerf_lightning.{room}." for room in ("encoders", "fields", "samplers", "models"))
+ROOMS = tuple(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models"))
 LARGEST_NUMBER = 1 << 53
 
 

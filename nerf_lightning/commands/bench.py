@@ -5,6 +5,6 @@ from omegaconf import DictConfig
 
 def run(config: DictConfig) -> float:
     """Measure, print a table, write bench.json; return training rays per second."""
-    from nerf_lightning.commands.benchmark import benchmark
+    from nerf_lightning.bench.benchmark import benchmark
 
     return benchmark(config)

@@ -10,15 +10,15 @@ from pathlib import Path
 from omegaconf import DictConfig
 from rich.text import Text
 
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import StdoutConsole, say
-from nerf_lightning.commands.output_folder import output_folder
-from nerf_lightning.data.doctor.check import Check
-from nerf_lightning.data.doctor.examine import examine
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import StdoutConsole, say
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.examine import examine
+from nerf_lightning.doctor.picture import doctor_picture
 from nerf_lightning.escaping import for_terminal
-from nerf_lightning.export.doctor_picture import doctor_picture
-from nerf_lightning.export.json_file import write_json
-from nerf_lightning.export.pictures import save_png
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.visualization.pictures import save_png
 
 STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
 

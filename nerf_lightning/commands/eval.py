@@ -3,14 +3,14 @@
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.finish import metric_lines
-from nerf_lightning.commands.open_checkpoint import open_checkpoint
-from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
-from nerf_lightning.commands.processes import on_all_processes
-from nerf_lightning.commands.protocol import measured_of
-from nerf_lightning.commands.recorded_frame import in_recorded_frame
+from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say
+from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.training.evaluate_and_film import metric_lines
+from nerf_lightning.training.launch.processes import on_all_processes
+from nerf_lightning.training.open_checkpoint import open_checkpoint
 
 
 def run(config: DictConfig) -> float:

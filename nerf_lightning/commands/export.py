@@ -4,12 +4,12 @@ import torch
 from omegaconf import DictConfig
 
 from nerf_lightning import ranks
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.open_checkpoint import open_checkpoint
-from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
-from nerf_lightning.commands.processes import on_all_processes
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say
 from nerf_lightning.export.base import Export
+from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.training.launch.processes import on_all_processes
+from nerf_lightning.training.open_checkpoint import open_checkpoint
 
 
 def run(config: DictConfig) -> None:

@@ -13,19 +13,18 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.overrides import to_type
-from nerf_lightning.commands.run_folder import job_folder
-from nerf_lightning.commands.schema import require_fitting_values, required_path
-from nerf_lightning.data.checks import listed
-from nerf_lightning.data.image_pairs import chosen_matching
-from nerf_lightning.data.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
-from nerf_lightning.data.progress import StageProgress
-from nerf_lightning.data.sfm_settings import SfmSettings, stage_costs
-from nerf_lightning.data.structure_from_motion import SparseModel, reconstruct, require_pycolmap
-from nerf_lightning.data.video_frames import count_frames, frame_stride, write_sharp_frames
+from nerf_lightning.config.instantiate import require_fitting_values, required_path
+from nerf_lightning.config.overrides import to_type
+from nerf_lightning.console import StageProgress, say
 from nerf_lightning.errors import InputError, require_positive
-from nerf_lightning.export.video import require_ffmpeg
+from nerf_lightning.escaping import listed
+from nerf_lightning.runs.folder import job_folder
+from nerf_lightning.sfm.image_pairs import chosen_matching
+from nerf_lightning.sfm.photographs import FoundPhotograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.sfm.reconstruction import SparseModel, reconstruct, require_pycolmap
+from nerf_lightning.sfm.settings import SfmSettings, stage_costs
+from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sharp_frames
+from nerf_lightning.video.encoding import require_ffmpeg
 
 READING, FRAMES = "reading photographs", "choosing frames"
 READING_COST, FRAME_COST = 0.1, 0.02

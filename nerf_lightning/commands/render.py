@@ -7,17 +7,17 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints import Checkpoint
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.film_settings import film_settings, listed
-from nerf_lightning.commands.filming import film
-from nerf_lightning.commands.open_checkpoint import open_checkpoints
-from nerf_lightning.commands.output_folder import beside_checkpoint, output_folder
-from nerf_lightning.commands.processes import on_all_processes
-from nerf_lightning.commands.shots import Subject
-from nerf_lightning.data.checks import known_background
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say
+from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
+from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.training.launch.processes import on_all_processes
+from nerf_lightning.training.open_checkpoint import open_checkpoints
+from nerf_lightning.video.film import film
+from nerf_lightning.video.settings import as_list, film_settings
+from nerf_lightning.video.shots import Subject
 
 
 def run(config: DictConfig) -> None:
@@ -30,7 +30,7 @@ def render(config: DictConfig) -> None:
     plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     shown = film_settings(plain)
     path = build(config.path)
-    opened = open_checkpoints(config, listed(plain["ckpt"]))
+    opened = open_checkpoints(config, as_list(plain["ckpt"]))
     labels = labels_of([each.checkpoint for each in opened], plain["labels"])
     subjects = [
         Subject(
@@ -59,7 +59,7 @@ def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
         names = [_run_name(checkpoint.path) for checkpoint in checkpoints]
         twice = len(set(names)) < len(names)
         return [f"{name} {each.path.stem}" if twice else name for name, each in zip(names, checkpoints, strict=True)]
-    labels = list(map(str, listed(given)))
+    labels = list(map(str, as_list(given)))
     if len(labels) != len(checkpoints):
         raise InputError(f"labels={labels}: give one for each of the {len(checkpoints)} checkpoints, or null.")
     return labels

@@ -7,30 +7,31 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.budgets import allowed
-from nerf_lightning.checkpoints import newest_checkpoint
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.links import require_nothing_from_outside
-from nerf_lightning.commands.measured_parts import facts, per_image, tables, views_on_page
-from nerf_lightning.commands.output_folder import output_folder
-from nerf_lightning.commands.recorded_scene import scene_overrides
-from nerf_lightning.commands.run_curves import read_curves
-from nerf_lightning.commands.run_results import FILES
-from nerf_lightning.commands.run_summary import read_json_object, read_note
-from nerf_lightning.data.doctor.check import Check
-from nerf_lightning.data.doctor.examine import examine
-from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.checkpoints.reading import SceneRecord, newest_checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.scene_overrides import scene_overrides
+from nerf_lightning.console import StageProgress, say
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.examine import examine
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.files.links import require_nothing_from_outside
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.plain_yaml import plain_yaml, read_plain_yaml
-from nerf_lightning.reports.coverage import coverage
-from nerf_lightning.reports.curves import curve_drawings
-from nerf_lightning.reports.embedding import embedded_file, embedded_video
-from nerf_lightning.reports.page import Report, page
+from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
+from nerf_lightning.report.curves import curve_drawings, read_curves
+from nerf_lightning.report.embedding import Embedded, embedded, embedded_file, embedded_video
+from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page
+from nerf_lightning.report.page import Report, page
+from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.runs.results import FILES
+from nerf_lightning.runs.summary import read_note
+from nerf_lightning.visualization.camera_layout import coverage_picture
 
 MOST_STEPS = 24
 VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": "while it was learnt"}
@@ -155,3 +156,15 @@ def _reason(error: InputError | OSError) -> str:
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return str(error)
+
+
+def coverage(record: SceneRecord) -> Embedded:
+    """Return the coverage map of a recorded scene."""
+    return embedded(coverage_picture(_without_pictures(record)).numpy())
+
+
+def _without_pictures(record: SceneRecord) -> Scene:
+    none = torch.zeros(0, dtype=torch.long)
+    pixels = PixelStore(torch.zeros(0, 4, dtype=torch.uint8), none, none, none, has_transparency=False)
+    splits = {split: record.splits.get(split, ()) for split in ("train", "val", "test")}
+    return Scene(**{**vars(record), "splits": splits}, pixels=pixels, protocol={}, truth=None)

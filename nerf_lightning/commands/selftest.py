@@ -9,23 +9,24 @@ from omegaconf import DictConfig
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from nerf_lightning import __version__
-from nerf_lightning.checkpoints import read_checkpoint
-from nerf_lightning.commands.build import build, load_model
-from nerf_lightning.commands.console import StdoutConsole, say, stderr_console
-from nerf_lightning.commands.devices import DeviceType, has_tf32
-from nerf_lightning.commands.environment import environment
-from nerf_lightning.commands.output_folder import output_folder
-from nerf_lightning.commands.trainer import PRODUCTS, TrainerSettings
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import load_model
+from nerf_lightning.console import StdoutConsole, say, stderr_console
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.json_file import write_json
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.products import Products
+from nerf_lightning.evaluation.protocol import environment
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.products import Products
+from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.selftest.all_checks import carry_out, find_checks
 from nerf_lightning.selftest.check import Check, Row
 from nerf_lightning.selftest.machine import machine
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.runs import Runs
 from nerf_lightning.selftest.table import machine_lines, remarks, result_table
+from nerf_lightning.training.launch.devices import DeviceType, has_tf32
+from nerf_lightning.training.launch.trainer import PRODUCTS, TrainerSettings
 
 TRAINERS: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu"}
 

@@ -8,10 +8,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.output_folder import output_folder
-from nerf_lightning.commands.run_results import FILES, RunResult, find_runs, read_result
-from nerf_lightning.commands.run_table import (
+from nerf_lightning.console import say
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.runs.output_folder import output_folder
+from nerf_lightning.runs.published import published_for
+from nerf_lightning.runs.results import FILES, RunResult, find_runs, read_result
+from nerf_lightning.runs.table import (
     ORDERS,
     group_rows,
     group_seeds,
@@ -20,10 +23,7 @@ from nerf_lightning.commands.run_table import (
     one_protocol,
     without_empty,
 )
-from nerf_lightning.commands.table_files import Row, print_rows, write_rows
-from nerf_lightning.data.checks import listed
-from nerf_lightning.errors import InputError
-from nerf_lightning.reports.published import published_for
+from nerf_lightning.runs.table_files import Row, print_rows, write_rows
 
 
 @dataclass

@@ -13,30 +13,31 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
-from nerf_lightning.callbacks.checkpoints import Checkpoints
-from nerf_lightning.callbacks.folder_guard import FolderGuard, require_run
-from nerf_lightning.callbacks.stop_signals import StopSignals
-from nerf_lightning.callbacks.time_budget import TimeBudget
-from nerf_lightning.callbacks.writers import errors_told_once
-from nerf_lightning.checkpoints import make_record, read_checkpoint
-from nerf_lightning.commands.build import build, build_system, load_weights
-from nerf_lightning.commands.finish import Finish
-from nerf_lightning.commands.former_overrides import to_give_again
-from nerf_lightning.commands.log_file import log_file
-from nerf_lightning.commands.memory_plan import announce_memory
-from nerf_lightning.commands.overrides import to_type
-from nerf_lightning.commands.preemption import preemptible, wants_restart
-from nerf_lightning.commands.processes import on_all_processes
-from nerf_lightning.commands.run_folder import ResumePoint, RunFolder, job_folder, open_run, write_config
-from nerf_lightning.commands.schema import required_path
-from nerf_lightning.commands.tensorboard import describe_run
-from nerf_lightning.commands.tile_choice import measured_tile
-from nerf_lightning.commands.trainer import TrainerSettings
+from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.config.instantiate import build, required_path
+from nerf_lightning.config.load_model import load_weights
+from nerf_lightning.config.overrides import to_type
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.data.ray_batches import Progress
 from nerf_lightning.errors import InputError
-from nerf_lightning.system import RadianceFieldSystem
-from nerf_lightning.types.scene import Scene
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.runs.log_file import log_file
+from nerf_lightning.runs.saved_overrides import to_give_again
+from nerf_lightning.training.build import build_system
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
+from nerf_lightning.training.callbacks.folder_guard import FolderGuard, require_run
+from nerf_lightning.training.callbacks.hparams import describe_run
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.callbacks.watcher import errors_told_once
+from nerf_lightning.training.evaluate_and_film import Finish
+from nerf_lightning.training.launch.preemption import preemptible, wants_restart
+from nerf_lightning.training.launch.processes import on_all_processes
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.memory_plan import announce_memory
+from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.tile_size import measured_tile
 
 log = logging.getLogger(__name__)
 

@@ -8,21 +8,21 @@ from urllib.parse import urlsplit
 
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.commands.build import build
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.open_checkpoint import open_checkpoint
-from nerf_lightning.commands.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.commands.recorded_frame import in_recorded_frame
-from nerf_lightning.data.checks import known_background
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say
+from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
-from nerf_lightning.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
+from nerf_lightning.training.open_checkpoint import open_checkpoint
 from nerf_lightning.viewer.admission import named_places
-from nerf_lightning.viewer.look import Look
+from nerf_lightning.viewer.camera_state import CameraState
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.photographs import Photographs
-from nerf_lightning.viewer.slices import SlicedRenderer
-from nerf_lightning.viewer.studio import Studio
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import SlicedRenderer
 
 WARM_UP_HEIGHT = 64
 IDLE_SECONDS = 0.2
@@ -43,17 +43,17 @@ def run(config: DictConfig) -> None:
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "viewer"))
     renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)
     warm_up(renderer)
-    studio = Studio(renderer)
+    queue = RenderQueue(renderer)
     where = config.host, config.port, config.max_height, config.viewer.hosts
-    page = Page(studio, Photographs(record, scene, background), folder, *where)
+    page = Page(queue, Photographs(record, scene, background), folder, *where)
     stopped = _stop_signals()
     say(f"The page is at {page.address} (Ctrl-C ends it)")
     if config.open_browser:
         open_browser(page.address)
     try:
         while not stopped:
-            if not studio.work():
-                studio.wait(IDLE_SECONDS)
+            if not queue.work():
+                queue.wait(IDLE_SECONDS)
     finally:
         page.close()
 
@@ -62,7 +62,7 @@ def warm_up(renderer: SlicedRenderer) -> None:
     """Render a small picture from the first photograph's place: kernels are loaded, the speed is known."""
     c2w = renderer.scene.cameras.c2w[0]
     for _ in range(2):
-        for _ in renderer.slices(Look(c2w, 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT), WARM_UP_HEIGHT):
+        for _ in renderer.slices(CameraState(c2w, 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT), WARM_UP_HEIGHT):
             pass
 
 

@@ -7,11 +7,12 @@ import torch
 from lightning.pytorch import LightningDataModule
 
 from nerf_lightning import ranks
-from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, Progress, RayBatches
-from nerf_lightning.data.residence import budget_bytes, num_bytes, on_device
+from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_device
+from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches
 from nerf_lightning.errors import InputError
-from nerf_lightning.free_memory import free_memory, require_memory
-from nerf_lightning.types.scene import Scene
+from nerf_lightning.machine import free_memory, require_memory
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Scene
 
 # Of a batch, at least: where its pixels lie, its rays, and what they should look like.
 RAY_BYTES = 120

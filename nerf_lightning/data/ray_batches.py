@@ -4,59 +4,21 @@ The order of rays is a permutation of all training pixels, new in each epoch and
 is stored but how many rays have been seen, so a resumed run goes on exactly where it stopped.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.data.prefetch import made_ahead
-from nerf_lightning.data.residence import sent
+from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.cameras import rays_through_pixels
-from nerf_lightning.randomness import fold, permute
-from nerf_lightning.types.rays import Batch, PixelIndex
-from nerf_lightning.types.scene import Scene
-
-
-@dataclass
-class Progress:
-    """How far a run is: all that its randomness and its order of rays depend on, besides the config."""
-
-    attempt: int = 0
-    """Raised by the collapse guard at each restart."""
-    step: int = 0
-    """Steps taken in this attempt."""
-    rays_seen: int = 0
-    """Rays trained on in this attempt, those of the centre crop included."""
-    batch_rays: int = 0
-    """Rays of the next step; they may adapt to how many samples a ray has."""
-    largest_batch: int = 0
-    """Rays of a step at most."""
-    rollbacks: int = 0
-    """Attempts that went back to a checkpoint, instead of the beginning."""
-
-    @property
-    def restarts(self) -> int:
-        """Attempts that began anew."""
-        return self.attempt - self.rollbacks
-
-    def advance(self, num_rays: int) -> None:
-        """Count one step of `num_rays` rays."""
-        self.step += 1
-        self.rays_seen += num_rays
-
-    def take_up(self, other: "Progress") -> None:
-        """Go on from the place of another run."""
-        for place in fields(self):
-            setattr(self, place.name, getattr(other, place.name))
-
-    def restart(self) -> None:
-        """Begin a new attempt."""
-        self.attempt, self.step, self.rays_seen = self.attempt + 1, 0, 0
-
+from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.randomness import fold, permute
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch, PixelIndex
+from nerf_lightning.nerf.types.scene import Scene
 
 BATCH_SIZES = 8
 
@@ -111,7 +73,7 @@ class PixelDomain:
         return PixelIndex(view=self.views[slot], x=column + self.left[slot], y=row + self.top[slot])
 
 
-def gather(scene: Scene, pixels: PixelIndex) -> Batch:
+def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
     """Return rays, colours and weights of pixels."""
     flat = scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
     mask = scene.pixels.mask
@@ -192,7 +154,7 @@ class RayBatches:
 
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
-        return gather(self.scene, self.pixels_at(attempt, rays_seen, batch_rays))
+        return gather_batch(self.scene, self.pixels_at(attempt, rays_seen, batch_rays))
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""
@@ -241,4 +203,31 @@ class FixedRays:
         return len(self.chunks)
 
     def __iter__(self) -> Iterator[Batch]:
-        return (gather(self.scene, pixels) for pixels in self.chunks)
+        return (gather_batch(self.scene, pixels) for pixels in self.chunks)
+
+
+Place = tuple[int, int, int]
+"""Attempt, rays seen in it, and rays of the batch: all that a batch depends on besides the config."""
+
+
+def made_ahead(make: Callable[[int, int, int], Batch], current: Callable[[], Place]) -> Iterator[Batch]:
+    """Return the batch of the current place, again and again, each made while the step before it runs.
+
+    The thread makes what follows if the run goes on as it does. Where it goes elsewhere meanwhile (a restart, batches
+    of another size), what was made is dropped, and the batch that is asked for is made on the spot: which rays
+    follow is a function of the place alone, with or without this thread.
+
+    Args:
+        make: takes a place; called in both threads, perhaps at once. It must not enter numba's thread pool.
+        current: the run's place.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
+        guess: Place | None = None
+        made: Future[Batch] | None = None
+        while True:
+            place = current()
+            batch = made.result() if made is not None and place == guess else make(*place)
+            attempt, rays_seen, batch_rays = place
+            guess = (attempt, rays_seen + batch_rays, batch_rays)
+            made = pool.submit(make, *guess)
+            yield batch

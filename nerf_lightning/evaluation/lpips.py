@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.products import own_precision
-from nerf_lightning.tensor_files import load_tensors
+from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.nerf.products import own_precision
 
 LPIPS_HINT = (
     "it needs the weights of a backbone: where torchvision is installed, run "

@@ -3,9 +3,9 @@
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
-from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
 
 
 class Export(ABC):

@@ -11,20 +11,20 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.data.images import ENDINGS
-from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.console import StageProgress
+from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_file_name
-from nerf_lightning.export.atomic import whole_file
 from nerf_lightning.export.base import Export
-from nerf_lightning.export.json_file import write_json
-from nerf_lightning.export.pictures import save_png, to_bytes
-from nerf_lightning.export.seen_views import SeenView, require_room, see
-from nerf_lightning.geometry.cameras import camera_coordinates
-from nerf_lightning.geometry.frames import directions_to_user, unit_of
-from nerf_lightning.geometry.spread import spread
-from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.export.visibility import SeenView, require_room, see
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.nerf.geometry.cameras import camera_coordinates
+from nerf_lightning.nerf.geometry.frames import directions_to_user, unit_of
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]
 Split = Literal["train", "val", "test", "all"]
@@ -76,7 +76,7 @@ class ImagesExport(Export):
         views = everything if self.split == "all" else record.splits.get(self.split, ())
         if not views:
             raise InputError(f"{record.name} has no {self.split} views. Choose another split with what.split=...")
-        return spread(views, self.max_views or len(views))
+        return evenly_spaced_subset(views, self.max_views or len(views))
 
     def _depth(self, seen: SeenView, record: SceneRecord, view: int) -> Float[ndarray, "height width"]:
         depth = seen.depth

@@ -8,20 +8,17 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export, refuse_ndc
-from nerf_lightning.export.components import without_floaters
-from nerf_lightning.export.lattice import require_resolution, sample_density
-from nerf_lightning.export.marching import marching_cubes
-from nerf_lightning.export.mesh_files import MeshFormat, save_mesh
-from nerf_lightning.export.mesh_libraries import require_library
-from nerf_lightning.export.seen_faces import seen_faces
-from nerf_lightning.export.surface_colors import SeenFrom, surface_colors
-from nerf_lightning.export.surface_level import surface_level
-from nerf_lightning.geometry.frames import directions_to_user, points_to_user
-from nerf_lightning.models.levels import RadianceModel
+from nerf_lightning.export.density_grid import require_resolution, sample_density
+from nerf_lightning.export.marching_cubes import marching_cubes, without_floaters
+from nerf_lightning.export.mesh_files import MeshFormat, require_library, save_mesh
+from nerf_lightning.export.surface import SeenFrom, surface_colors, surface_level
+from nerf_lightning.export.visibility import seen_faces
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
 
 # The density's grid, and as much again for the mesh.
 BYTES_PER_POINT = 8

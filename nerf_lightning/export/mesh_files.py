@@ -1,5 +1,6 @@
-"""Mesh files: PLY, OBJ and GLB, with a colour and a normal for each vertex."""
+"""Mesh files: PLY, OBJ and GLB, with a colour and a normal for each vertex, by libraries that are an extra."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -7,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from nerf_lightning.export.atomic import whole_file
-from nerf_lightning.export.mesh_libraries import require_library
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import whole_file
 
 MeshFormat = Literal["ply", "obj", "glb"]
 
@@ -50,3 +51,18 @@ def _unlit(tree: dict[str, Any]) -> None:
     for mesh in tree["meshes"]:
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
+
+
+def require_library(name: str) -> Any:
+    """Return a module of the extra `mesh`.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"Exporting a mesh needs {name.partition('.')[0].replace('skimage', 'scikit-image')}, which is not "
+            f"installed or does not load here ({error}). Install it with: pip install 'nerf-lightning[mesh]'"
+        ) from error

@@ -1,24 +1,27 @@
-"""A coloured point cloud with normals, from the rendered depth of the training views."""
+"""A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY."""
 
 import logging
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.data.progress import StageProgress
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export
-from nerf_lightning.export.pictures import to_bytes
-from nerf_lightning.export.point_file import save_points
-from nerf_lightning.export.seen_views import SeenView, at_most, nearest_views, num_agreeing, see
-from nerf_lightning.free_memory import require_memory
-from nerf_lightning.geometry.frames import directions_to_user, points_to_user
-from nerf_lightning.geometry.spread import spread
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.types.scene import Cameras
+from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.machine import require_memory
+from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.visualization.pictures import to_bytes
 
 # What all views' points are held in until they are confirmed, and the picture of each; then once more, as one cloud.
 BYTES_PER_PIXEL = 90
@@ -71,7 +74,7 @@ class PointsExport(Export):
 
     def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
-        views = spread(record.splits["train"], self.max_views)
+        views = evenly_spaced_subset(record.splits["train"], self.max_views)
         self._require_memory(record.cameras[views])
         cameras = at_most(record.cameras, self.longest)
         clouds: dict[int, Tensor] = {}
@@ -144,3 +147,25 @@ def _cloud(view: SeenView, kept: Tensor) -> Float[Tensor, "points 9"]:
     """Return places, normals and colours of the pixels that are kept and have a normal."""
     kept = kept & (view.normals.norm(dim=-1) > 0.5)
     return torch.cat([view.points[kept], view.normals[kept], view.rgb[kept]], dim=-1)
+
+
+NUMBERS, COLORS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
+LAYOUT = np.dtype([*((name, "<f4") for name in NUMBERS), *((name, "u1") for name in COLORS)])
+
+
+def save_points(
+    path: Path,
+    points: Float[ndarray, "points 3"],
+    normals: Float[ndarray, "points 3"],
+    colors: UInt8[ndarray, "points 3"],
+) -> None:
+    """Write a point cloud, whole or not at all."""
+    rows = np.empty(len(points), LAYOUT)
+    for name, column in zip((*NUMBERS, *COLORS), (*points.T, *normals.T, *colors.T), strict=True):
+        rows[name] = column
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property float {name}" for name in NUMBERS] + [f"property uchar {name}" for name in COLORS]
+    header += ["end_header"]
+    with whole_file(path) as part, part.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode())
+        file.write(rows.tobytes())

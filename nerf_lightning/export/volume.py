@@ -8,17 +8,17 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.data.progress import StageProgress
-from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.console import StageProgress
 from nerf_lightning.export.base import Export, refuse_ndc
-from nerf_lightning.export.json_file import write_json
-from nerf_lightning.export.lattice import Lattice, Report, require_resolution, sample_density
-from nerf_lightning.export.looks import looks_from_nearest
-from nerf_lightning.export.pictures import to_bytes
-from nerf_lightning.geometry.frames import unit_of
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.tiles import tiles
+from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
+from nerf_lightning.export.surface import looks_from_nearest
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.tiles import tiles
+from nerf_lightning.visualization.pictures import to_bytes
 
 # Density, colour, and the density again in the user's units.
 BYTES_PER_POINT = 12

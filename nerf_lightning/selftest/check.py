@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from nerf_lightning.products import Products
+from nerf_lightning.nerf.products import Products
 
 UNIT: dict[Products, float] = {"float32": 2.0**-24, "tf32": 2.0**-11, "bfloat16": 2.0**-9}
 """The largest relative error of rounding a number to nearest, for each kind of factor."""

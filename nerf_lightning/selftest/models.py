@@ -7,23 +7,24 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
-from nerf_lightning.encoders.frequency import FrequencyEncoder
-from nerf_lightning.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.fields.hash_field import HashField
-from nerf_lightning.fields.nerf_mlp import NerfMLP
-from nerf_lightning.losses.base import Loss
-from nerf_lightning.losses.mse import MeanSquaredError
-from nerf_lightning.losses.proposal import ProposalLoss
-from nerf_lightning.models.levels import DenseLevel, RadianceModel
-from nerf_lightning.models.masked_level import MaskedLevel
-from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.models.proposal_level import ProposalLevel
-from nerf_lightning.optimizers.table_adam import TableAdam
-from nerf_lightning.samplers.importance import ImportanceSampler
-from nerf_lightning.samplers.occupancy import OccupancySampler
-from nerf_lightning.samplers.proposal import ProposalSampler
-from nerf_lightning.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.proposal import ProposalLoss
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.proposal_level import ProposalLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.samplers.importance import ImportanceSampler
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.proposal import ProposalSampler
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
 CAPACITY = 1 << 15
 

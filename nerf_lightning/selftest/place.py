@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.products import Products
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.products import Products
 from nerf_lightning.selftest.runs import Runs
 
 

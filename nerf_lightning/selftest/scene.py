@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
-from nerf_lightning.geometry.poses import look_at
-from nerf_lightning.types.scene import PixelStore, Scene
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 RADIUS = 0.8
 NUM_VIEWS, SIZE = 10, 20

@@ -1,4 +1,4 @@
-"""A view as a picture of one of its channels: colour, depth, opacity, normals."""
+"""A view as a picture: one of its channels, or truth and render side by side, in a window of any shape."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,11 +6,12 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
-from nerf_lightning.evaluation.geometry import normals_from_depth
-from nerf_lightning.export.pictures import color_map, faded, to_bytes, visible_range
-from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
-from nerf_lightning.viewer.slices import View
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.viewer.renderer import View
+from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
 COLOR = "colour"
 
@@ -50,3 +51,35 @@ CHANNELS: dict[str, Callable[[View], Tensor]] = {
     "opacity": _opacity,
     "normals": _normals,
 }
+
+
+PAPER = 237
+LINE = 255
+
+
+def wiped(
+    truth: UInt8[Tensor, "height width 3"], render: UInt8[Tensor, "height width 3"], share: float
+) -> UInt8[Tensor, "height width 3"]:
+    """Return the truth in the left `share` of the picture and the render in the rest, with a line between.
+
+    >>> wiped(torch.zeros(1, 4, 3).byte(), torch.full((1, 4, 3), 9).byte(), 0.5)[0, :, 0].tolist()
+    [0, 255, 9, 9]
+    """
+    cut = round(share * truth.shape[1])
+    joined = torch.cat([truth[:, :cut], render[:, cut:]], dim=1)
+    if 0 < cut < truth.shape[1]:
+        joined[:, cut - 1] = LINE
+    return joined
+
+
+def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the picture in the middle of paper whose width over height is `aspect`.
+
+    >>> in_window(torch.zeros(2, 2, 3).byte(), 2.0).shape
+    torch.Size([2, 4, 3])
+    """
+    height, width, _ = picture.shape
+    beside = max(0, round(height * aspect) - width)
+    above = max(0, round(width / aspect) - height)
+    edges = (0, 0, beside // 2, beside - beside // 2, above // 2, above - above // 2)
+    return pad(picture, edges, value=PAPER)

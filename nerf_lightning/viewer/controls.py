@@ -6,16 +6,15 @@ from typing import Any, TypeVar
 
 import torch
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.export.pictures import save_png
-from nerf_lightning.geometry.clipping import CropBox
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
-from nerf_lightning.viewer.free_name import free_name, not_saved
+from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.plain_text import as_plain_markdown
-from nerf_lightning.viewer.recorded_path import LEAST_SECONDS, RecordedPath
-from nerf_lightning.viewer.session import Session
+from nerf_lightning.viewer.recorded_path import LEAST_SECONDS, RecordedPath, free_name, not_saved
+from nerf_lightning.visualization.pictures import save_png
 
 Number = TypeVar("Number", int, float)
 
@@ -34,10 +33,10 @@ class Controls:
         folder: where snapshots and camera paths are written.
     """
 
-    def __init__(self, session: Session, folder: Path):
+    def __init__(self, session: ViewerClient, folder: Path):
         self.session, self.folder = session, folder
         self.gui = session.client.gui
-        self.harmless = session.studio.complaints.harmless
+        self.harmless = session.queue.complaints.harmless
         self.frusta = Frusta(session, self._enter)
         self.path = RecordedPath(session, folder, self.frusta.add_keyframe)
         self._wants_snapshot = False
@@ -71,7 +70,7 @@ class Controls:
         def _(_: Any) -> None:
             self._wants_snapshot = True
             self.session.refinement.refresh()
-            self.session.studio.wake()
+            self.session.queue.wake()
 
     def _add_photographs(self) -> None:
         names = self.session.photographs.record.view_names

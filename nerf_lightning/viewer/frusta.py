@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerf_lightning.geometry.clipping import CropBox
-from nerf_lightning.viewer.session import Session
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.viewer.client import ViewerClient
 
 ROOT, CAMERAS, KEYFRAMES, BOX = "/overlay", "/overlay/cameras", "/overlay/keyframes", "/overlay/crop"
 GREY, ORANGE, BLUE = (90, 90, 90), (240, 120, 20), (40, 110, 220)
@@ -24,7 +24,7 @@ class Frusta:
         on_click: called with the view whose camera was clicked.
     """
 
-    def __init__(self, session: Session, on_click: Callable[[int], None]):
+    def __init__(self, session: ViewerClient, on_click: Callable[[int], None]):
         self.session, self.scene = session, session.client.scene
         self.size = SCALE * session.around.radius
         self.root = self.scene.add_frame(ROOT, show_axes=False)
@@ -69,7 +69,7 @@ class Frusta:
         thumbnail = photographs.thumbnail(view)
         image = None if thumbnail is None else thumbnail.numpy()
         handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)
-        handle.on_click(self.session.studio.complaints.harmless(lambda _: self.on_click(view)))
+        handle.on_click(self.session.queue.complaints.harmless(lambda _: self.on_click(view)))
 
     def _frustum(
         self, name: str, c2w: Tensor, fov: float, aspect: float, color: tuple[int, int, int], image: np.ndarray | None

@@ -9,16 +9,16 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints import SceneRecord
+from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.paths.base import frame_of
+from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
+from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import Controls
 from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import free_port
-from nerf_lightning.viewer.session import Session
-from nerf_lightning.viewer.studio import Studio
+from nerf_lightning.viewer.render_queue import RenderQueue
 
 # People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
@@ -46,7 +46,7 @@ class Page:
     """Listen, and serve everybody a picture of their own.
 
     Args:
-        studio: renders; whoever owns the page calls its `work`.
+        queue: renders; whoever owns the page calls its `work`.
         photographs: of the capture, for frusta and comparison.
         folder: where snapshots and camera paths are written.
         host: the address to listen on; 127.0.0.1 is heard by this machine alone.
@@ -60,7 +60,7 @@ class Page:
 
     def __init__(
         self,
-        studio: Studio,
+        queue: RenderQueue,
         photographs: Photographs,
         folder: Path,
         host: str,
@@ -69,16 +69,16 @@ class Page:
         hosts: Sequence[str] | None = None,
     ) -> None:
         viser = require_viser()
-        from nerf_lightning.viewer.guarded_server import Guard  # websockets comes with viser
+        from nerf_lightning.viewer.guarded_server import Guard
 
-        self.studio, self.photographs, self.folder = studio, photographs, folder
+        self.queue, self.photographs, self.folder = queue, photographs, folder
         self.most_height = most_height
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb)
         # A page that is closed amid a picture is nothing to speak of.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.admission = Admission(host, hosts)
-        guard = Guard(self.admission, studio.complaints)
+        guard = Guard(self.admission, queue.complaints)
         with _quietly(), guard.in_place():
             self.server = viser.ViserServer(host, free_port(host, port), label="nerf_lightning", verbose=False)
         if not guard.is_in_place:
@@ -87,8 +87,8 @@ class Page:
         self._dress(record)
         self._seats: set[int] = set()
         self._lock = threading.Lock()
-        self.server.on_client_connect(studio.complaints.harmless(self._welcome))
-        self.server.on_client_disconnect(studio.complaints.harmless(self._take_leave))
+        self.server.on_client_connect(queue.complaints.harmless(self._welcome))
+        self.server.on_client_disconnect(queue.complaints.harmless(self._take_leave))
 
     @property
     def address(self) -> str:
@@ -118,7 +118,7 @@ class Page:
         if not self._has_seat(client.client_id):
             client.add_notification("Full", FULL, color="red")
             return
-        session = Session(client, self.studio, self.photographs, self.around, self.most_height)
+        session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
         Controls(session, self.folder)
         # Who has left meanwhile may have been seen off before being here.
@@ -133,7 +133,7 @@ class Page:
             return True
 
     def _take_leave(self, client: Any) -> None:
-        self.studio.remove(client.client_id)
+        self.queue.remove(client.client_id)
         with self._lock:
             self._seats.discard(client.client_id)
 

@@ -1,7 +1,8 @@
-"""A camera path that somebody records by keyframes."""
+"""A camera path that somebody records by keyframes, and saves under a name that is free."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.checkpoints import SceneRecord
-from nerf_lightning.geometry.paths.keyframes import Keyframe, Point, write_keyframes
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.video.paths.keyframes import Keyframe, Point, write_keyframes
 from nerf_lightning.viewer import limits
-from nerf_lightning.viewer.free_name import free_name, not_saved
+from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.plain_text import as_plain_markdown
-from nerf_lightning.viewer.session import Session
 
 LEAST_SECONDS = 0.1
 # Letters of a message: it names a file, and shall be whole.
@@ -31,7 +31,7 @@ class RecordedPath:
         draw: shows a keyframe (number, pose, field of view in radians, width over height); returns a handle.
     """
 
-    def __init__(self, session: Session, folder: Path, draw: Callable[[int, Tensor, float, float], Any]):
+    def __init__(self, session: ViewerClient, folder: Path, draw: Callable[[int, Tensor, float, float], Any]):
         self.session, self.folder, self.draw = session, folder, draw
         self.keyframes: list[Keyframe] = []
         self.times: list[float] = []
@@ -104,3 +104,36 @@ def keyframe_in_user_frame(
 def _rounded(values: Tensor) -> Point:
     x, y, z = (round(value, 6) for value in values.tolist())
     return x, y, z
+
+
+@contextmanager
+def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]:
+    """Lend a path with the first number that no file has; names never come from the page.
+
+    An empty file keeps the name, so that of several browsers that save at once each has its own; it goes where the
+    block fails.
+
+    Raises:
+        OSError: so many there are already, and whoever clicks on would fill the disk; or it cannot be made.
+    """
+    path = _made(folder, stem, ending, most)
+    try:
+        yield path
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def _made(folder: Path, stem: str, ending: str, most: int) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(1, most + 1):
+        path = folder / f"{stem}_{number:03d}{ending}"
+        with suppress(FileExistsError):
+            path.touch(exist_ok=False)
+            return path
+    raise OSError(f"{folder} holds {most} of them, the most that the page writes")
+
+
+def not_saved(error: OSError) -> str:
+    """Return what to tell a person whose file could not be written."""
+    return f"It could not be saved: {error}. Make room, or start again with another paths.output_dir=DIR."

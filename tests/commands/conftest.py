@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from hydra._internal.hydra import Hydra
-from running import FAST, FAST_PATH, start_cold
-from scenes import ball_scene
 from support.made_once import made_once
 from support.one_composition import mode_as_typed
 from support.resumed import trained
+from support.running import FAST, FAST_PATH, start_cold
+from support.scenes import ball_scene
 
-from nerf_lightning import cli
+from nerf_lightning.cli import main as cli
 
 
 @dataclass

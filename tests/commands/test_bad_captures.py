@@ -1,8 +1,8 @@
 """What a person reads when a capture is broken: one paragraph, exit code 2, and no run folder."""
 
 import pytest
-from posed_captures import Known, write_colmap, write_llff, write_transforms
-from running import FAST, said
+from support.posed_captures import Known, write_colmap, write_llff, write_transforms
+from support.running import FAST, said
 
 BROKEN = {
     "colmap": ("sparse/0/images.bin", ("images.bin ends after 100 bytes", "cut short", "nerf poses images=DIR")),

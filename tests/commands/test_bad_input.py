@@ -7,11 +7,11 @@ import time
 import pytest
 import torch
 import yaml
-from running import FAST, refused, said, start
+from support.running import FAST, refused, said, start
 
-from nerf_lightning.checkpoints import read_checkpoint
 from nerf_lightning.checkpoints.format import FORMAT
-from nerf_lightning.commands.build import load_model
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.load_model import load_model
 
 
 @pytest.fixture
@@ -82,11 +82,11 @@ def test_nothing_from_a_file_is_executed(nerf, tmp_path):
         "os.system",
         "builtins.eval",
         "lightning.pytorch.loggers.csv_logs.os.system",
-        "nerf_lightning.commands.build.instantiate",
-        "nerf_lightning.fields.nerf_mlp.torch.load",
-        "nerf_lightning.fields.nerf_mlp.functional.relu",
-        "nerf_lightning.fields.nerf_mlp.Encoder",
-        "nerf_lightning.encoders.nothing.Here",
+        "nerf_lightning.config.load_model.instantiate",
+        "nerf_lightning.nerf.fields.nerf_mlp.torch.load",
+        "nerf_lightning.nerf.fields.nerf_mlp.functional.relu",
+        "nerf_lightning.nerf.fields.nerf_mlp.Encoder",
+        "nerf_lightning.nerf.encoders.nothing.Here",
     ],
 )
 def test_a_checkpoint_builds_only_our_own_model_parts(nerf, last, tmp_path, target):
@@ -222,10 +222,10 @@ def test_a_full_disk_outside_checkpoints_is_one_paragraph(nerf, last, tmp_path, 
     def full(*arguments, **options):
         raise OSError(28, "No space left on device", "metrics.json")
 
-    monkeypatch.setattr("nerf_lightning.commands.scoring.write_metrics", full)
+    monkeypatch.setattr("nerf_lightning.evaluation.evaluator.write_metrics", full)
     import sys as system
 
-    from nerf_lightning import cli
+    from nerf_lightning.cli import main as cli
 
     monkeypatch.setattr(system, "argv", ["nerf", "eval", f"ckpt={last}", f"paths.output_dir={tmp_path}"])
     with pytest.raises(SystemExit) as stop:

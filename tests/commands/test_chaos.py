@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from captures import picture, pose
 from PIL import Image
-from running import FAST, said, start, start_code
+from support.captures import picture, pose
+from support.running import FAST, said, start, start_code
 
-from nerf_lightning.commands.suggestions import paragraph
+from nerf_lightning.config.messages import paragraph
 from nerf_lightning.errors import InputError
 
 QUIET = (
@@ -41,15 +41,15 @@ class Phase:
 
 PHASES = {
     "evaluating": Phase(
-        "nerf_lightning.commands.scoring:Scoring.score",
+        "nerf_lightning.evaluation.evaluator:Scoring.score",
         ("eval", "ckpt={last}", "scene=npz", "scene.path={capture}", "trainer.num_threads=1"),
     ),
     "filming": Phase(
-        "nerf_lightning.commands.film_frames:FilmFrames.open",
+        "nerf_lightning.video.frames:FilmFrames.open",
         ("render", "ckpt={last}", "path.num_frames=4", "trainer.num_threads=1"),
     ),
     "filming frames": Phase(
-        "nerf_lightning.commands.film_frames:FilmFrames.open",
+        "nerf_lightning.video.frames:FilmFrames.open",
         ("render", "ckpt={last}", "path.num_frames=4", "format=frames", "trainer.num_threads=1"),
     ),
     "exporting images": Phase(
@@ -66,7 +66,7 @@ PHASES = {
          "trainer.num_threads=1"),
     ),
     "decoding": Phase(
-        "nerf_lightning.data.pixel_file:_make",
+        "nerf_lightning.data.pixels.mapped_store:_make",
         ("train", "scene=transforms", "scene.root={photographs}", "scene.cache_dir={out}/cache", *FAST, *QUIET,
          "trainer.max_steps=1", "resume=auto"),
         "cache/*",
@@ -78,7 +78,7 @@ PHASES = {
         "cache/*",
     ),
     "finishing": Phase(
-        "nerf_lightning.commands.finish:Finish.__call__",
+        "nerf_lightning.training.evaluate_and_film:Finish.__call__",
         ("train", "scene=npz", "scene.path={capture}", *FAST, "trainer.num_threads=1", "logger=none", "resume=auto"),
     ),
 }  # fmt: skip
@@ -86,9 +86,9 @@ PHASES = {
 # that its files exceed.
 QUICK = {
     "evaluating": ("PIL.Image:Image.save", 2500),
-    "filming": ("nerf_lightning.export.video:_chain", 1000),
+    "filming": ("nerf_lightning.video.encoding:_chain", 1000),
     "exporting images": ("nerf_lightning.export.images:write_json", 1000),
-    "decoding": ("nerf_lightning.data.pixel_file:_spots", 2500),
+    "decoding": ("nerf_lightning.data.pixels.mapped_store:_spots", 2500),
 }
 
 
@@ -112,7 +112,7 @@ def places(capture, finished_run, photographs):
 def run_as_planned(phase, plans, places, out):
     """Run a phase's command once for each plan; return the exit codes and what was said."""
     arguments = [argument.format(out=out, **places) for argument in phase.arguments]
-    script = "import runpy; runpy.run_path('tests/killed_runs.py', run_name='__main__')"
+    script = "import runpy; runpy.run_path('tests/support/killed_runs.py', run_name='__main__')"
     process = start_code(script, json.dumps(plans), *arguments, f"paths.output_dir={out}")
     codes, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
@@ -254,7 +254,7 @@ def test_a_run_that_is_stopped_for_a_while_goes_on(capture, tmp_path):
 
 BACK = """
 import sys, time
-from nerf_lightning import cli
+from nerf_lightning.cli import main as cli
 
 shift, real, calls = float(sys.argv.pop(1)), time.time, []
 

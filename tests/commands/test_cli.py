@@ -4,8 +4,8 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
-from nerf_lightning.cli import find_commands
-from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.cli.main import find_commands
+from nerf_lightning.files.folders import conf_folder
 
 
 def test_help_lists_every_command_with_its_line(nerf):
@@ -19,7 +19,7 @@ def test_help_lists_every_command_with_its_line(nerf):
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys; sys.argv = ['nerf', '--help']; from nerf_lightning.cli import main; main(); "
+        "import sys; sys.argv = ['nerf', '--help']; from nerf_lightning.cli.main import main; main(); "
         "print([m for m in ('torch', 'hydra', 'numpy', 'lightning') if m in sys.modules])"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

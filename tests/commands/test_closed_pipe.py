@@ -5,9 +5,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from running import FAST, start
+from support.running import FAST, start
 
-from nerf_lightning.closed_pipe import READER_LEFT, ends_quietly
+from nerf_lightning.cli.broken_pipe import READER_LEFT, ends_quietly
 
 
 def unread(*arguments, buffered=True, merged=False):

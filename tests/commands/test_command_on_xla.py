@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from running import FAST
+from support.running import FAST
 
 pytestmark = [
     pytest.mark.xla,
@@ -19,10 +19,10 @@ pytestmark = [
 TESTS = Path(__file__).parents[1]
 
 PROGRAM = """
-from xla_host import XLAHostAccelerator
-from nerf_lightning.commands import xla
+from support.xla_host import XLAHostAccelerator
+from nerf_lightning.training.launch import xla
 xla.ACCELERATOR = XLAHostAccelerator
-from nerf_lightning import cli
+from nerf_lightning.cli import main as cli
 cli.main()
 """
 

@@ -2,8 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from corner import FOCAL, HEIGHT, WIDTH, write_corner
 from PIL import Image
+from support.corner import FOCAL, HEIGHT, WIDTH, write_corner
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from running import said
+from support.running import said
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_full_disk_is_one_paragraph_and_leaves_nothing(nerf, last, tmp_path, m
         patched.setattr(np, "savez_compressed", full)
         import sys as system
 
-        from nerf_lightning import cli
+        from nerf_lightning.cli import main as cli
 
         arguments = [
             "nerf",

@@ -5,7 +5,7 @@ import time
 
 import pytest
 import torch
-from running import FAST, FAST_PATH, start
+from support.running import FAST, FAST_PATH, start
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
 STEPS = 70

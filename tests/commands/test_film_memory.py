@@ -5,21 +5,20 @@ from dataclasses import replace
 import psutil
 import pytest
 import torch
-from running import FAST
-from scenes import ball_scene
+from support.running import FAST
+from support.scenes import ball_scene
 from torch import nn
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.commands.film_memory import bytes_per_pixel, require_room
-from nerf_lightning.commands.film_settings import FilmSettings
-from nerf_lightning.commands.filming import film
-from nerf_lightning.commands.peak_bytes import peak_bytes
-from nerf_lightning.commands.shots import Subject
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.cameras import pinhole_cameras
-from nerf_lightning.geometry.paths.orbit import Orbit
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.types.renderings import Rendering
+from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.training.memory_trial import peak_bytes
+from nerf_lightning.video.film import bytes_per_pixel, film, require_room
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.shots import Subject
 
 SIDE = 256
 EVERYTHING = ("rgb", "depth", "opacity", "normals", "levels")

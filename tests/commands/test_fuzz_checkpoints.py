@@ -4,16 +4,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from running import FAST_PATH
 from support.altered import alterations
 from support.fuzzing import fuzzed, harmless
 from support.resumed import Resumed
+from support.running import FAST_PATH
 
 from nerf_lightning.budgets import Budgets, allow
-from nerf_lightning.checkpoints import read_checkpoint
-from nerf_lightning.commands.build import load_model
-from nerf_lightning.geometry.cameras import rays_through_pixels
-from nerf_lightning.types.rays import PixelIndex
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.load_model import load_model
+from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.types.rays import PixelIndex
 
 
 @pytest.fixture(scope="module")

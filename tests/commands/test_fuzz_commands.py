@@ -5,11 +5,11 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from measured_runs import leave_measured_run
-from posed_captures import Known, ring, write_transforms
-from running import said
 from support.fuzzing import fuzzed, harmless
+from support.measured_runs import leave_measured_run
 from support.mutations import damaged, mutated
+from support.posed_captures import Known, ring, write_transforms
+from support.running import said
 
 
 def run_of(nerf, *arguments):

@@ -4,9 +4,9 @@ import argparse
 
 import pytest
 from hydra._internal.utils import get_args_parser
-from running import said
+from support.running import said
 
-from nerf_lightning.commands.hydra_options import options_first
+from nerf_lightning.cli.arguments import options_first
 
 TAKING_A_VALUE = [
     (option, (action.choices or ["x/y z"])[0])

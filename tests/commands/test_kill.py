@@ -6,8 +6,8 @@ import time
 
 import pytest
 import torch
-from killed_runs import PLACES
-from running import FAST, start_code
+from support.killed_runs import PLACES
+from support.running import FAST, start_code
 
 STEPS = 36
 # A start of such a run lasts a second or so once everything is imported.
@@ -22,7 +22,7 @@ def finish_after(plans, capture, folder):
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=4",
         "trainer.val_every_steps=12", f"paths.output_dir={folder}",
     )  # fmt: skip
-    script = "import runpy; runpy.run_path('tests/killed_runs.py', run_name='__main__')"
+    script = "import runpy; runpy.run_path('tests/support/killed_runs.py', run_name='__main__')"
     process = start_code(script, json.dumps([*plans, None]), *arguments)
     codes, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors

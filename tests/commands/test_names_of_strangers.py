@@ -10,35 +10,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from captures import write_blender
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.initialize import initialize_config_dir
-from known_fields import ball, solid
-from measured_runs import leave_measured_run
 from omegaconf import OmegaConf
 from PIL import Image
-from posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
-from scenes import ball_scene
+from support.captures import write_blender
+from support.known_fields import ball, solid
+from support.measured_runs import leave_measured_run
+from support.posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
+from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.commands.console import say
-from nerf_lightning.commands.finish import metric_lines
-from nerf_lightning.commands.kept_views import picture_name
-from nerf_lightning.commands.metrics_files import METRICS, summary, write_metrics
-from nerf_lightning.commands.protocol import split_hash
-from nerf_lightning.conf_folder import conf_folder
-from nerf_lightning.data.blender import BlenderReader
-from nerf_lightning.data.doctor.check import Check
-from nerf_lightning.data.photograph_folder import find_photographs
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.console import say
+from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.picture import _write_verdicts
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.cameras import CamerasExport
-from nerf_lightning.export.colmap_files import colmap_files
-from nerf_lightning.export.doctor_picture import _write_verdicts
-from nerf_lightning.export.figures import new_figure, picture_of
+from nerf_lightning.evaluation.kept_views import picture_name
+from nerf_lightning.evaluation.metrics_files import METRICS, summary, write_metrics
+from nerf_lightning.evaluation.protocol import split_hash
+from nerf_lightning.export.cameras import CamerasExport, colmap_files
 from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.export.pictures import with_caption
-from nerf_lightning.reports.page import Report, page
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.report.page import Report, page
+from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.training.evaluate_and_film import metric_lines
+from nerf_lightning.visualization.figures import new_figure, picture_of
+from nerf_lightning.visualization.pictures import with_caption
 
 NOT_UTF8 = os.fsdecode(b"p_\xff.png")
 BAD = ["p_\n.png", "p_\x1b[2J.png", "p_\x9b2J.png", NOT_UTF8]

@@ -6,7 +6,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from nerf_lightning.commands.overrides import to_type
+from nerf_lightning.config.overrides import to_type
 
 NAMES = [
     "data/fox",

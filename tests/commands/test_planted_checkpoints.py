@@ -7,13 +7,14 @@ import pytest
 import torch
 import yaml
 from omegaconf import OmegaConf
-from planted import Payload, compress, in_config, many_bytes, peak_of, replace_pickle, write_checkpoint
-from running import refused, said
 from support.budget import budget
+from support.planted import Payload, compress, in_config, many_bytes, peak_of, replace_pickle, write_checkpoint
+from support.running import refused, said
 
-from nerf_lightning.checkpoints import read_checkpoint
-from nerf_lightning.commands.build import build, load_model
-from nerf_lightning.commands.recorded_scene import scene_overrides
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import load_model
+from nerf_lightning.config.scene_overrides import scene_overrides
 
 MEGABYTE = 2**20
 
@@ -88,8 +89,8 @@ TARGETS = [
     "torch.hub.load",
     "lightning.pytorch.loggers.csv_logs.os.system",
     "hydra.utils.instantiate",
-    "nerf_lightning.models.levels.torch.hub.load",
-    "nerf_lightning.encoders.../../evil.Class",
+    "nerf_lightning.nerf.models.base.torch.hub.load",
+    "nerf_lightning.nerf.encoders.../../evil.Class",
     "nerf_lightning.commands.train.run",
     ["os.system"],
     {"_target_": "os.system"},
@@ -309,8 +310,8 @@ def bombs(folder):
 def test_bombs_stay_small(tmp_path):
     expected = bombs(tmp_path)
     code = (
-        "from nerf_lightning.checkpoints import read_checkpoint\n"
-        "from nerf_lightning.commands.build import load_model\n"
+        "from nerf_lightning.checkpoints.reading import read_checkpoint\n"
+        "from nerf_lightning.config.load_model import load_model\n"
         "from nerf_lightning.errors import InputError\n"
         "load_model(read_checkpoint(sys.argv[1]))\n"
         "# begin\n"
@@ -338,17 +339,17 @@ def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
         loaded(file)
 
 
-SAMPLER = "nerf_lightning.samplers.occupancy.OccupancySampler"
-FREQUENCY = "nerf_lightning.encoders.frequency.FrequencyEncoder"
-GRID = "nerf_lightning.encoders.hash_grid.HashGridEncoder"
-FIELD = "nerf_lightning.fields.hash_field.HashField"
+SAMPLER = "nerf_lightning.nerf.samplers.occupancy.OccupancySampler"
+FREQUENCY = "nerf_lightning.nerf.encoders.frequency.FrequencyEncoder"
+GRID = "nerf_lightning.nerf.encoders.hash_grid.HashGridEncoder"
+FIELD = "nerf_lightning.nerf.fields.hash_field.HashField"
 IMPOSSIBLE = [
     *({"sampler": {"_target_": SAMPLER, key: value}} for key, value in (
         ("num_steps", 0), ("num_steps", -1), ("num_cascades", 0), ("num_cascades", 60), ("cone_angle", -1e-3),
         ("cone_angle", 1e9), ("update_every", 0), ("warmup_steps", -1), ("prune_after", -1), ("decay", 2.0),
         ("decay", -1.0), ("min_alpha", -1.0), ("opaque_below", -1.0), ("opaque_below", 2.0), ("capacity", 0),
     )),
-    {"sampler": {"_target_": "nerf_lightning.samplers.importance.ImportanceSampler", "num_samples": -1}},
+    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.importance.ImportanceSampler", "num_samples": -1}},
     {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": 10_000}}},
     {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": -1}}},
     {"field": {"position_encoder": {"_target_": GRID, "max_resolution": 1 << 40}}},

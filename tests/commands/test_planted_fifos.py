@@ -6,26 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import write_blender
-from malformed import WRITERS
-from measured_runs import leave_measured_run
-from posed_captures import read
-from running import said
+from support.captures import write_blender
+from support.malformed import WRITERS
+from support.measured_runs import leave_measured_run
+from support.posed_captures import read
+from support.running import said
 from support.waiting import fifo, within
 
-from nerf_lightning.commands.log_file import log_file
-from nerf_lightning.commands.run_curves import read_curves
-from nerf_lightning.commands.sweep_job import read_records
-from nerf_lightning.data.blender import BlenderReader
 from nerf_lightning.data.bricks.reader import BricksReader
-from nerf_lightning.data.npz import NpzReader
-from nerf_lightning.data.photograph_folder import find_photographs
-from nerf_lightning.data.video_files import require_video
+from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.lpips import load_lpips
-from nerf_lightning.plain_yaml import read_plain_yaml
-from nerf_lightning.reports.embedding import embedded_file, embedded_video
-from nerf_lightning.tensor_files import load_tensors
+from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.report.curves import read_curves
+from nerf_lightning.report.embedding import embedded_file, embedded_video
+from nerf_lightning.runs.log_file import log_file
+from nerf_lightning.runs.sweep_job import read_records
+from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.video_frames import require_video
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs are posix's")
 SECONDS = 20

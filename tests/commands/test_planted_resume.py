@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 import torch
-from running import FAST_PATH
 from support.resumed import Resumed
+from support.running import FAST_PATH
 
 from nerf_lightning.errors import InputError
 

@@ -6,14 +6,14 @@ import sys
 import pytest
 from filelock import FileLock
 from omegaconf import OmegaConf
-from running import FAST, said
 from support.budget import budget
+from support.running import FAST, said
 
-from nerf_lightning.commands.former_overrides import former_overrides, to_give_again
-from nerf_lightning.commands.links import require_no_way_out
-from nerf_lightning.commands.run_folder import RunFolder, _difference, _newest_unfinished, open_run
-from nerf_lightning.commands.run_summary import read_note
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.runs.folder import RunFolder, _difference, _newest_unfinished, open_run
+from nerf_lightning.runs.saved_overrides import former_overrides, to_give_again
+from nerf_lightning.runs.summary import read_note
 
 
 @pytest.fixture
@@ -167,7 +167,7 @@ def test_a_garbled_note_is_another_run(nerf, capture, run, note):
 
 @pytest.mark.parametrize("note", [{"finished_at_step": "x"}, {"seconds": "x"}, {"seconds": 10**400}, {"seconds": [1]}])
 def test_a_note_of_other_kinds_is_no_number(tmp_path, note):
-    from configs import composed
+    from support.configs import composed
 
     config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
     open_run(config, 100, None).release()
@@ -213,7 +213,7 @@ def test_links_within_a_run_folder_are_fine(run, tmp_path):
 
 
 def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
-    from configs import composed
+    from support.configs import composed
 
     config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
     open_run(config, 100, None).release()
@@ -227,7 +227,7 @@ def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
 
 def test_pictures_in_a_run_folder_start_no_program(tmp_path):
     """PIL's own choice of a decoder would take this for EPS, and start Ghostscript."""
-    from nerf_lightning.commands.finish import _film_progress
+    from nerf_lightning.training.evaluate_and_film import _film_progress
 
     for step in (1, 2):
         path = tmp_path / "images" / "progress" / f"step_{step}.png"

@@ -4,14 +4,14 @@ import sys
 
 import pytest
 import yaml
-from running import FAST, said
+from support.running import FAST, said
 from test_planted_runs import FILES, HARMLESS, PLANTED
 
-from nerf_lightning.commands.former_overrides import former_sweep, to_give_again
-from nerf_lightning.commands.sweep_record import JOB_NUMBER, SweepRecord, sweep_record
-from nerf_lightning.conf_folder import conf_folder
+from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.errors import InputError
-from nerf_lightning.sweep_arguments import sweep_arguments
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.runs.saved_overrides import former_sweep, to_give_again
+from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord, sweep_record
 
 # Of the README, of train --help, and their kin; in parts that may be given together.
 SWEPT = [
@@ -190,7 +190,7 @@ def test_what_the_user_types_again_is_the_users(tmp_path):
 
 
 def test_the_printed_command_repeats_what_the_folder_does_not(tmp_path):
-    from nerf_lightning.commands.sweep import Sweep
+    from nerf_lightning.runs.sweep import Sweep
 
     lines = [
         "hydra.sweep.dir=x",

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from alignment import colmap_poses, pose_errors
-from captures import real_capture
-from corner import write_corner
 from PIL import Image
+from support.alignment import colmap_poses, pose_errors
+from support.captures import real_capture
+from support.corner import write_corner
 
 pytest.importorskip("pycolmap")
 # imageio's reader of videos forgets its pipes.

@@ -8,10 +8,10 @@ import time
 
 import pytest
 import torch
-from running import FAST, start
+from support.running import FAST, start
 
-from nerf_lightning.commands.preemption import preemptible, wants_restart
-from nerf_lightning.commands.slurm import requeue, slurm_job, was_requeued
+from nerf_lightning.slurm import requeue, slurm_job, was_requeued
+from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 
 # What srun sets for a job of one task; by SLURM_NTASKS Lightning recognises Slurm.
 SLURM = {

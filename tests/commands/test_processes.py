@@ -6,12 +6,12 @@ import time
 
 import pytest
 import torch
-from running import FAST, FAST_PATH, start, start_cold
 from support.ports import unused_port
+from support.running import FAST, FAST_PATH, start, start_cold
 
-from nerf_lightning.commands import processes
-from nerf_lightning.commands.processes import num_processes
 from nerf_lightning.errors import InputError
+from nerf_lightning.training.launch import processes
+from nerf_lightning.training.launch.processes import num_processes
 
 STEPS = 50
 # Two processes take 51 and 50 of 101 rays, of 32 points each. One process that is given tiles of so many points cuts

@@ -5,18 +5,11 @@ import subprocess
 
 import pytest
 import torch
-from scenes import ball_scene, tiny_model
+from support.scenes import ball_scene, tiny_model
 
 from nerf_lightning import __version__
-from nerf_lightning.commands import protocol
-from nerf_lightning.commands.protocol import (
-    commit,
-    config_hash,
-    differences,
-    measured_how,
-    measured_of,
-    weights_hash,
-)
+from nerf_lightning.evaluation import protocol
+from nerf_lightning.evaluation.protocol import commit, config_hash, differences, measured_how, measured_of, weights_hash
 
 MEASURED = {"scene": "a", "split": "test", "background": "white", "pixels": "float", "lpips": None}
 

@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from posed_captures import Known, ring, write_colmap, write_llff, write_transforms
-from running import FAST
+from support.posed_captures import Known, ring, write_colmap, write_llff, write_transforms
+from support.running import FAST
 
 WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}
 LEAST = ("final.video=false", "logger=none", "evaluation.num_pictures=0")

@@ -11,22 +11,23 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from known_fields import INSIDE, solid
-from running import said, start
-from scenes import ball_scene, tiny_field
+from support.known_fields import INSIDE, solid
+from support.running import said, start
+from support.scenes import ball_scene, tiny_field
 
-from nerf_lightning import cli
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.commands.film_frames import FilmFrames
-from nerf_lightning.commands.film_settings import FilmSettings
-from nerf_lightning.commands.filming import film
-from nerf_lightning.commands.shots import Subject, make_shots
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.cli import main as cli
 from nerf_lightning.errors import InputError
-from nerf_lightning.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
-from nerf_lightning.geometry.paths.look_at import LookAt
-from nerf_lightning.geometry.paths.orbit import Orbit
-from nerf_lightning.models.levels import DenseLevel, RadianceModel
-from nerf_lightning.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+from nerf_lightning.video.film import film
+from nerf_lightning.video.frames import FilmFrames
+from nerf_lightning.video.paths.look_at import LookAt
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.shots import Subject, make_shots
 
 # Takes x to y, y to z and z to x: boxes stay boxes.
 CYCLE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -5,15 +5,15 @@ import re
 import shutil
 
 import pytest
-from browser import opened
-from measured_runs import leave_measured_run
-from running import said
+from support.browser import opened
+from support.measured_runs import leave_measured_run
+from support.running import said
 
 
 @pytest.fixture(scope="module")
 def page_of_run(finished_run, tmp_path_factory):
     """The page of a real run, written by a process of its own; with what the command printed."""
-    from running import start
+    from support.running import start
 
     folder = tmp_path_factory.mktemp("page")
     process = start("report", finished_run, f"paths.output_dir={folder}")

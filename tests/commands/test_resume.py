@@ -6,7 +6,7 @@ import time
 
 import pytest
 import torch
-from running import FAST, start
+from support.running import FAST, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 STEPS = 110

@@ -4,17 +4,17 @@ import json
 
 import pytest
 import torch
-from configs import composed
 from omegaconf import OmegaConf
-from running import FAST
-from scenes import ball_scene
+from support.configs import composed
+from support.running import FAST
+from support.scenes import ball_scene
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from nerf_lightning.checkpoints import make_record
-from nerf_lightning.commands.protocol import config_hash
-from nerf_lightning.commands.run_folder import ResumePoint, open_run, write_config
-from nerf_lightning.commands.run_identity import settings_digest
+from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.protocol import config_hash
+from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
 
 
 def config(tmp_path, *overrides):

@@ -3,10 +3,10 @@
 import json
 
 import pytest
-from self_tested import Finished
+from support.self_tested import Finished
 
 from nerf_lightning.commands import selftest
-from nerf_lightning.kernels import hash_grid_numba
+from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.selftest.checks import kernels
 
 
@@ -31,8 +31,8 @@ def test_a_machine_that_computes_right(nerf, kernels_alone, tmp_path):
 
 
 def test_a_machine_whose_kernel_is_off_by_one_percent(nerf, kernels_alone, monkeypatch, tmp_path):
-    right = hash_grid_numba.forward
-    monkeypatch.setattr(hash_grid_numba, "forward", lambda *given: 1.01 * right(*given))
+    right = hash_grid_cpu.forward
+    monkeypatch.setattr(hash_grid_cpu, "forward", lambda *given: 1.01 * right(*given))
     result = nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out")
     assert result.code == 1
     assert "WRONG: hash grid: features: 0.01 exceeds 9.54e-07 (8 corners" in result.out
@@ -45,7 +45,7 @@ def test_a_kernel_that_raises_is_wrong_and_the_rest_goes_on(nerf, kernels_alone,
     def broken(*given):
         raise SystemError("unknown opcode")
 
-    monkeypatch.setattr(hash_grid_numba, "point_gradient", broken)
+    monkeypatch.setattr(hash_grid_cpu, "point_gradient", broken)
     result = nerf("selftest", "trainer=cpu", f"paths.output_dir={tmp_path}/out")
     assert result.code == 1
     assert "WRONG: hash grid: gradient of the points: SystemError: unknown opcode" in result.out

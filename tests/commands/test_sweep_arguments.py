@@ -1,12 +1,12 @@
 """What a sweep is asked for, before Hydra reads it."""
 
 import pytest
-from configs import composed
-from running import start_code
+from support.configs import composed
+from support.running import start_code
 
-from nerf_lightning.commands.sweep_record import JOB_NUMBER, SweepRecord
+from nerf_lightning.cli.sweep_arguments import sweep_arguments
 from nerf_lightning.errors import InputError
-from nerf_lightning.sweep_arguments import sweep_arguments
+from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord
 
 
 def leave_sweep(folder, *arguments, slurm_job=None):

@@ -9,9 +9,9 @@ import time
 import pytest
 import torch
 from omegaconf import OmegaConf
-from running import FAST, start
+from support.running import FAST, start
 
-from nerf_lightning.commands import sweep
+from nerf_lightning.runs import sweep
 
 QUICK = (*FAST, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
 

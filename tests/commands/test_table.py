@@ -5,8 +5,8 @@ import json
 import statistics
 
 import pytest
-from measured_runs import PROTOCOL, leave_measured_run, ours
-from running import said
+from support.measured_runs import PROTOCOL, leave_measured_run, ours
+from support.running import said
 
 
 def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):

@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from measured_runs import leave_measured_run
+from support.measured_runs import leave_measured_run
 
 from nerf_lightning.commands.table import folder_for
-from nerf_lightning.export.atomic import whole_file
+from nerf_lightning.files.atomic import whole_file
 
 
 def test_the_table_lies_in_the_folder_that_was_named(nerf, tmp_path):

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from measured_runs import leave_measured_run, ours
+from support.measured_runs import leave_measured_run, ours
 
 
 def test_texts_of_strangers_stay_texts(table, tmp_path):

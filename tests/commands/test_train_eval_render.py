@@ -6,10 +6,10 @@ import json
 import imageio.v3 as iio
 import pytest
 import torch
-from captures import real_capture
-from running import FAST
+from support.captures import real_capture
+from support.running import FAST
+from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from videos import read_video
 
 
 def events(folder):

@@ -2,12 +2,12 @@ import logging
 
 import pytest
 import torch
-from scenes import tiny_model
+from support.scenes import tiny_model
 
-from nerf_lightning.commands import devices, trainer
-from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.errors import InputError
-from nerf_lightning.products import Linear
+from nerf_lightning.nerf.products import Linear
+from nerf_lightning.training.launch import devices, trainer
+from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, product
 
 @pytest.mark.slow
 def test_bfloat16_trains_and_evaluates(nerf, capture, tmp_path):
-    from running import FAST
+    from support.running import FAST
 
     result = nerf(
         "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.precision=bf16-mixed", "trainer.max_steps=3",

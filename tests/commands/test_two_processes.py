@@ -3,7 +3,7 @@
 import subprocess
 
 import pytest
-from running import FAST, start, start_code
+from support.running import FAST, start, start_code
 
 BUILD_BRICKS = """
 import sys

@@ -9,15 +9,15 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from browser import drag, opened, wait_until
-from planted import write_checkpoint
-from running import said, start
+from support.browser import drag, opened, wait_until
+from support.planted import write_checkpoint
 from support.ports import unused_port
-from viser_client import ViserClient
+from support.running import said, start
+from support.viser_client import ViserClient
 
+from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands import view
 from nerf_lightning.errors import InputError
-from nerf_lightning.preparing import prepared
 from nerf_lightning.viewer import page as page_module
 
 
@@ -144,7 +144,7 @@ def folder_of_page(monkeypatch):
     """Where the page would write; it is not opened."""
     folders = []
 
-    def opened(studio, photographs, folder, *where):
+    def opened(queue, photographs, folder, *where):
         folders.append(folder)
         raise KeyboardInterrupt
 

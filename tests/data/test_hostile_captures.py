@@ -9,20 +9,20 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from captures import write_blender, write_npz
-from malformed import WRITERS, edit_json
 from PIL import Image
-from posed_captures import Known, read, write_colmap
-from running import refused
 from support.budget import budget
+from support.captures import write_blender, write_npz
+from support.malformed import WRITERS, edit_json
+from support.posed_captures import Known, read, write_colmap
+from support.running import refused
 
-from nerf_lightning.data.blender import BlenderReader
-from nerf_lightning.data.capture_reader import picture_files
-from nerf_lightning.data.checks import box_around_origin, check_step, require_different
-from nerf_lightning.data.images import MOST_SCANS, image_size, jpeg_scans
-from nerf_lightning.data.npz import NpzReader
-from nerf_lightning.data.photograph_folder import find_photographs
+from nerf_lightning.data.captures.checks import box_around_origin, check_step, require_different
+from nerf_lightning.data.captures.reader import picture_files
+from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans
+from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.files.walk import walk
+from nerf_lightning.sfm.photographs import find_photographs
 
 HEADERS = {
     "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-9, -17)}",

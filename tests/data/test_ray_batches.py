@@ -1,8 +1,9 @@
 import torch
-from scenes import ball_scene
+from support.scenes import ball_scene
 
-from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, Progress, RayBatches, gather
-from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.types.progress import Progress
 
 
 def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
@@ -69,7 +70,7 @@ def test_a_restarted_run_goes_through_a_crop_even_where_the_first_had_none():
 def test_a_gathered_batch_is_the_pixels_own_colour_and_ray():
     scene = ball_scene()
     pixels = batches(scene).pixels_at(0, 0)
-    batch = gather(scene, pixels)
+    batch = gather_batch(scene, pixels)
     for row in range(5):
         view, x, y = int(pixels.view[row]), int(pixels.x[row]), int(pixels.y[row])
         rays = rays_through_pixels(scene.cameras, all_pixels(scene.cameras, view), scene.near, scene.far)

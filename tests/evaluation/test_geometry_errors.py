@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.evaluation.geometry import depth_error, normal_error, normals_from_depth, surface_depth
-from nerf_lightning.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
-from nerf_lightning.geometry.poses import look_at
+from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 
 FAR = 6.0
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf_lightning.evaluation.ray_errors import RayErrors
+from nerf_lightning.evaluation.metrics import RayErrors
 
 
 def test_rays_without_an_error_have_a_finite_psnr_and_nothing_to_doubt():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from bricks_surface import distances, exact_surface, on_mesh
-from running import start
+from support.bricks_surface import distances, exact_surface, on_mesh
+from support.running import start
 
 POINTS = 100_000
 

@@ -6,8 +6,8 @@ import logging
 import numpy as np
 import pytest
 import torch
-from known_fields import ball, solid
-from posed_captures import (
+from support.known_fields import ball, solid
+from support.posed_captures import (
     Known,
     read,
     ring,
@@ -19,9 +19,9 @@ from posed_captures import (
     write_transforms,
 )
 
-from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.cameras import CamerasExport
-from nerf_lightning.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 
 # Around an axis of no special place.
 ROTATION = rotation_from_quaternion(torch.tensor([0.2, 0.4, -0.7, 0.5], dtype=torch.float64)).numpy()

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_fields import ball, solid
 from PIL import Image
-from scenes import ball_scene
+from support.known_fields import ball, solid
+from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.images import ImagesExport
-from nerf_lightning.geometry.frames import similarity, upright_rotation
+from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
 
 TILE, SIZE, UNIT = 1 << 15, 33, 50.0
 TURN = upright_rotation(torch.tensor([1.0, 0.0, 0.0]))

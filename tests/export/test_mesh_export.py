@@ -10,19 +10,18 @@ import psutil
 import pytest
 import torch
 import trimesh
-from known_fields import INSIDE, ball, solid
-from posed_captures import Known, read, write_colmap
-from scenes import ball_scene
 from scipy.spatial import cKDTree
+from support.known_fields import INSIDE, ball, solid
+from support.posed_captures import Known, read, write_colmap
+from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
-from nerf_lightning.export import mesh_libraries
-from nerf_lightning.export.components import without_floaters
-from nerf_lightning.export.lattice import Lattice
-from nerf_lightning.export.marching import marching_cubes
+from nerf_lightning.export import mesh_files as mesh_libraries
+from nerf_lightning.export.density_grid import Lattice
+from nerf_lightning.export.marching_cubes import marching_cubes, without_floaters
 from nerf_lightning.export.mesh import MeshExport
-from nerf_lightning.geometry.frames import similarity, unit_of, upright_rotation
+from nerf_lightning.nerf.geometry.frames import similarity, unit_of, upright_rotation
 
 RADIUS = 0.8
 TILE = 1 << 15

@@ -8,23 +8,23 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from known_fields import INSIDE, ball, solid
-from scenes import ball_scene, some_rays
+from support.known_fields import INSIDE, ball, solid
+from support.scenes import ball_scene, some_rays
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.commands.peak_bytes import peak_bytes
-from nerf_lightning.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.lattice import CHUNK
-from nerf_lightning.export.looks import PAIRS, looks_from_facing, looks_from_nearest
+from nerf_lightning.export.density_grid import CHUNK
+from nerf_lightning.export.surface import PAIRS, looks_from_facing, looks_from_nearest
 from nerf_lightning.export.volume import BYTES_PER_POINT, VolumeExport
-from nerf_lightning.fields.hash_field import HashField
-from nerf_lightning.geometry.frames import similarity
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.masked_level import MaskedLevel
-from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.training.memory_trial import peak_bytes
 
 CENTER = (0.3, 0.0, -0.2)
 

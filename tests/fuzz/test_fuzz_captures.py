@@ -8,19 +8,19 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from captures import npz_content, write_blender
 from hypothesis import given
 from hypothesis import strategies as st
-from posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
+from support.captures import npz_content, write_blender
 from support.fuzzing import fuzzed, harmless
 from support.mutations import changed_array, damaged, damaged_text, mutated, saved
+from support.posed_captures import Known, read, ring, write_colmap, write_llff, write_transforms
 
-from nerf_lightning.checkpoints import make_record
 from nerf_lightning.checkpoints.format import scene as kept_scene
-from nerf_lightning.checkpoints.possible import require_possible_scene
-from nerf_lightning.data.blender import BlenderReader
-from nerf_lightning.data.npz import NpzReader
-from nerf_lightning.geometry.cameras import coarse_pixels, rays_through_pixels
+from nerf_lightning.checkpoints.possible_scenes import require_possible_scene
+from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 
 WRITERS = {
     "transforms": write_transforms,

@@ -12,20 +12,19 @@ import torch
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from posed_captures import Known, read, ring, write_colmap
-from scenes import ball_scene
 from support.fuzzing import fuzzed, harmless
 from support.mutations import changed_array, damaged, damaged_text, mutated, saved
+from support.posed_captures import Known, read, ring, write_colmap
+from support.scenes import ball_scene
 from tensorboard.compat.proto.event_pb2 import Event
 from torch.utils.tensorboard import SummaryWriter
 
-from nerf_lightning.commands.run_curves import read_curves
 from nerf_lightning.data.bricks.cache import Rendered, cached
 from nerf_lightning.evaluation.lpips import LPIPS, load_lpips
-from nerf_lightning.geometry.paths.base import frame_of
-from nerf_lightning.geometry.paths.keyframe_path import KeyframePath
-from nerf_lightning.geometry.poses import is_rigid
-from nerf_lightning.reports.curves import curve_drawings
+from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.report.curves import curve_drawings, read_curves
+from nerf_lightning.video.paths.base import frame_of
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
 
 KEYFRAMES = {
     "keyframes": [

@@ -12,7 +12,7 @@ from PIL import Image, PngImagePlugin
 from support.fuzzing import fuzzed, harmless
 from support.mutations import EXTREMES, damaged
 
-from nerf_lightning.data.images import image_size, read_mask, read_rgba
+from nerf_lightning.data.pixels.images import image_size, read_mask, read_rgba
 
 MEGABYTE = 1 << 20
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)

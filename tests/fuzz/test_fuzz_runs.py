@@ -6,19 +6,19 @@ import re
 
 import pytest
 import yaml
-from configs import composed
 from hypothesis import given
 from hypothesis import strategies as st
-from measured_runs import leave_measured_run
+from support.configs import composed
 from support.fuzzing import fuzzed, harmless
+from support.measured_runs import leave_measured_run
 from support.mutations import damaged, damaged_text, mutated
 
 from nerf_lightning.commands import report, table
-from nerf_lightning.commands.former_overrides import former_overrides, former_sweep
-from nerf_lightning.commands.run_folder import open_run
-from nerf_lightning.commands.run_identity import fingerprint, run_identity
-from nerf_lightning.commands.sweep_record import SweepRecord
+from nerf_lightning.config.identity import fingerprint, run_identity
 from nerf_lightning.escaping import FORMULAS
+from nerf_lightning.runs.folder import open_run
+from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep
+from nerf_lightning.runs.sweep_record import SweepRecord
 
 OVERRIDES = ("scene=blender", "model=fast", "optimizer.lr=2e-3", "scene.root='my data'")
 ROW = {"name": "r_0", "psnr": 30.0, "ssim": 0.9, "lpips": None, "seconds": 0.5}
@@ -36,7 +36,7 @@ CHOICES = {"runtime": {"cwd": "/work", "choices": {"scene": "blender", "model": 
 @pytest.fixture(autouse=True)
 def _no_sweep(monkeypatch):
     """What these commands ask Hydra for beside the config."""
-    monkeypatch.setattr("nerf_lightning.commands.output_folder.job_folder", lambda: None)
+    monkeypatch.setattr("nerf_lightning.runs.output_folder.job_folder", lambda: None)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import urllib.request
 
 import pytest
 import torch
-from running import FAST, FAST_PATH, start
+from support.running import FAST, FAST_PATH, start
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from self_tested import a_place
-from triton_twin import check_against_the_reference
+from support.self_tested import a_place
+from support.triton_twin import check_against_the_reference
 
-from nerf_lightning.kernels import backends
-from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.checks import kernels
 
@@ -34,7 +35,7 @@ def test_triton_agrees_on_many_points_and_in_half_precision(cuda):
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 1 << 20])
 def test_triton_takes_any_number_of_points(count, cuda, generator):
-    assert backends.twin("hash_grid_triton") is not None, backends.why_not("hash_grid_triton")
+    assert backends.twin("hash_grid.cuda") is not None, backends.why_not("hash_grid.cuda")
     layout = hash_grid_layout(16, 19, 16, 2048)  # model=fast_large: the last entry's place takes 24 bits
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.randint(0, 4096, (count, 3), generator=generator) / 4096.0
@@ -66,6 +67,6 @@ def test_where_triton_does_not_compile_plain_torch_does_its_work(device, generat
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.rand(500, 3, generator=generator)
     expected = interpolate(table.double(), points.double(), layout)
-    monkeypatch.setattr("nerf_lightning.kernels.hash_grid.cuda_twin", lambda *given: None)
+    monkeypatch.setattr("nerf_lightning.nerf.kernels.hash_grid.interpolate.cuda_twin", lambda *given: None)
     found = interpolate(table.to(device), points.to(device), layout)
     torch.testing.assert_close(found.cpu().double(), expected, rtol=0, atol=1e-4)

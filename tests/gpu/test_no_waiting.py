@@ -10,18 +10,18 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from configs import options
-from gpu_training import default_callbacks, step_by_step
 from lightning.pytorch import Callback
+from support.configs import options
+from support.gpu_training import default_callbacks, step_by_step
 
-from nerf_lightning.commands.trainer import TrainerSettings
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.data.ray_batches import Progress
-from nerf_lightning.models.grid_level import GridLevel
-from nerf_lightning.schedules.exponential import ExponentialDecay
+from nerf_lightning.nerf.models.occupancy_level import GridLevel
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
 WARM = 2  # the optimizer's state, numbers kept on the device, compiled kernels
@@ -103,7 +103,7 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     scene, progress, chosen = ball_scene(), Progress(), METHODS[method]
     settings = TrainerSettings(max_steps=48, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=48)
     model = chosen.model()
-    model.place(scene)
+    model.fit_to(scene)
     system = RadianceFieldSystem(
         model, chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0, None, {}
     )

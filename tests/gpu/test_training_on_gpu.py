@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from configs import options
-from gpu_training import step_by_step
-from self_tested import a_place
+from support.configs import options
+from support.gpu_training import step_by_step
+from support.self_tested import a_place
 
-from nerf_lightning.kernels.backends import without
+from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.checks import training
 from nerf_lightning.selftest.models import METHODS
@@ -57,7 +57,7 @@ def test_compiled_fields_compute_the_same(products, cuda):
 
 
 def test_tf32_is_really_used_and_float32_is_not_lowered(cuda):
-    from nerf_lightning.products import linear
+    from nerf_lightning.nerf.products import linear
 
     features, weight = torch.randn(512, 512, device=cuda), torch.randn(512, 512, device=cuda)
     exact = features.double() @ weight.double().t()

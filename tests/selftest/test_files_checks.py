@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from self_tested import a_place, rows_of
+from support.self_tested import a_place, rows_of
 
 from nerf_lightning.selftest.checks import files
 from nerf_lightning.selftest.runs import Runs

@@ -2,9 +2,15 @@
 
 import pytest
 import torch
-from self_tested import a_place, rows_of
+from support.self_tested import a_place, rows_of
 
-from nerf_lightning.kernels import adam_numba, backends, hash_grid_numba, march_numba, mlp_tiles, packed, packed_numba
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
+from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
+from nerf_lightning.nerf.kernels.march import cpu as march_cpu
+from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
+from nerf_lightning.nerf.kernels.packed import cpu as packed_cpu
+from nerf_lightning.nerf.kernels.packed import integrate as packed
 from nerf_lightning.selftest.checks import kernels
 
 
@@ -48,23 +54,23 @@ def rounded(points, weights, keep):
     return out, kept
 
 
-RIGHT_TABLE_GRADIENT, RIGHT_ADAM = hash_grid_numba.add_table_gradient, adam_numba.adam_step
-RIGHT_MARCH, RIGHT_MLP = march_numba.march, mlp_tiles.forward
+RIGHT_TABLE_GRADIENT, RIGHT_ADAM = hash_grid_cpu.add_table_gradient, adam_cpu.adam_step
+RIGHT_MARCH, RIGHT_MLP = march_cpu.march, mlp_cpu.forward
 MISTAKES = {
-    "hash grid: features": (hash_grid_numba, "forward", off_by_one_percent(hash_grid_numba, "forward")),
-    "hash grid: gradient of the table": (hash_grid_numba, "add_table_gradient", table_gradient),
+    "hash grid: features": (hash_grid_cpu, "forward", off_by_one_percent(hash_grid_cpu, "forward")),
+    "hash grid: gradient of the table": (hash_grid_cpu, "add_table_gradient", table_gradient),
     "hash grid: gradient of the points": (
-        hash_grid_numba, "point_gradient", off_by_one_percent(hash_grid_numba, "point_gradient"),
+        hash_grid_cpu, "point_gradient", off_by_one_percent(hash_grid_cpu, "point_gradient"),
     ),
-    "march: rays": (march_numba, "march", marching),
-    "packed samples: light": (packed_numba, "integrate", off_by_one_percent(packed_numba, "integrate")),
+    "march: rays": (march_cpu, "march", marching),
+    "packed samples: light": (packed_cpu, "integrate", off_by_one_percent(packed_cpu, "integrate")),
     "packed samples: gradients": (
-        packed_numba, "integrate_gradient", off_by_one_percent(packed_numba, "integrate_gradient"),
+        packed_cpu, "integrate_gradient", off_by_one_percent(packed_cpu, "integrate_gradient"),
     ),
-    "packed samples: where": (packed_numba, "num_visible", lambda density, samples, least: samples.bounds.diff()),
-    "adam: weights": (adam_numba, "adam_step", adam),
+    "packed samples: where": (packed_cpu, "num_visible", lambda density, samples, least: samples.bounds.diff()),
+    "adam: weights": (adam_cpu, "adam_step", adam),
     "search": (kernels, "search", lambda ordered, numbers, right: (ordered[..., None, :] < numbers[..., None]).sum(-1)),
-    "perceptron, float32: value": (mlp_tiles, "forward", rounded),
+    "perceptron, float32: value": (mlp_cpu, "forward", rounded),
 }  # fmt: skip
 
 
@@ -83,13 +89,13 @@ def test_the_capacity_path_is_checked_too(monkeypatch):
 
 
 def test_gradients_of_the_perceptron_are_checked_too(monkeypatch):
-    right = mlp_tiles.backward
+    right = mlp_cpu.backward
 
     def wrong(*given):
         points, weights = right(*given)
         return points, [1.01 * weight for weight in weights]
 
-    monkeypatch.setattr(mlp_tiles, "backward", wrong)
+    monkeypatch.setattr(mlp_cpu, "backward", wrong)
     rows = rows_of(kernels.checks(a_place()), "perceptron, float32")
     assert [row.outcome for row in rows] == ["ok", "wrong"]
 

@@ -5,10 +5,12 @@ import sys
 
 import pytest
 import torch
-from self_tested import a_place, rows_of
+from support.self_tested import a_place, rows_of
 
-from nerf_lightning.kernels import backends, hash_grid_numba, mlp_tiles
-from nerf_lightning.products import Linear
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
+from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
+from nerf_lightning.nerf.products import Linear
 from nerf_lightning.selftest.checks import training
 from nerf_lightning.selftest.models import METHODS
 
@@ -30,8 +32,8 @@ def test_whole_trainings_learn_and_end_alike(method):
 
 
 def test_a_kernel_that_is_off_by_one_percent_shows_in_the_gradients(monkeypatch):
-    right = hash_grid_numba.forward
-    monkeypatch.setattr(hash_grid_numba, "forward", lambda *given: 1.01 * right(*given))
+    right = hash_grid_cpu.forward
+    monkeypatch.setattr(hash_grid_cpu, "forward", lambda *given: 1.01 * right(*given))
     words = [f"{method}, float32: gradients" for method in METHODS if "hash" in method]
     assert [row.outcome for row in rows_of(training.checks(a_place()), *words)] == ["wrong"] * 4
 
@@ -46,15 +48,15 @@ def test_a_precision_that_is_lowered_shows_in_the_gradients(monkeypatch):
 
 @pytest.mark.slow
 def test_an_optimizer_that_is_wrong_shows_in_the_psnr(monkeypatch):
-    from nerf_lightning.kernels import adam_numba
+    from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
 
     training._reference("packed hash grid")
-    right = adam_numba.adam_step
+    right = adam_cpu.adam_step
 
     def sluggish(parameter, grad, first, second, step_size, *rest):
         right(parameter, grad, first, second, 0.9 * step_size, *rest)
 
-    monkeypatch.setattr(adam_numba, "adam_step", sluggish)
+    monkeypatch.setattr(adam_cpu, "adam_step", sluggish)
     assert rows_of(training.checks(a_place()), "packed hash grid, float32: PSNR")[0].outcome == "wrong"
 
 
@@ -77,7 +79,7 @@ def test_without_a_compiler_torch_compile_is_not_run(monkeypatch):
 
 COMPILED = """
 import torch
-from nerf_lightning.kernels import backends
+from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.selftest.checks import training
 
 compile_it = torch.nn.Module.compile
@@ -99,11 +101,11 @@ def test_a_compiled_field_is_one_program():
 
 
 def test_the_perceptrons_of_a_training_are_the_kernels(monkeypatch):
-    right = mlp_tiles.forward
+    right = mlp_cpu.forward
 
     def wrong(*given, **options):
         out, kept = right(*given, **options)
         return 1.01 * out, kept
 
-    monkeypatch.setattr(mlp_tiles, "forward", wrong)
+    monkeypatch.setattr(mlp_cpu, "forward", wrong)
     assert rows_of(training.checks(a_place()), "masked hash grid, float32: gradients")[0].outcome == "wrong"

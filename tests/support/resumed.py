@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from configs import composed
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
-from running import FAST, start
 from support.altered import Altered
+from support.configs import composed
+from support.running import FAST, start
 
-from nerf_lightning.callbacks.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.commands.train import _build_parts
-from nerf_lightning.conf_folder import conf_folder
-from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.training.system import RadianceFieldSystem
 
 SHORT = ("final.evaluate=false", "final.video=false", "trainer.precision=32-true")
 

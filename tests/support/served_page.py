@@ -8,25 +8,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-from scenes import ball_scene, tiny_model
 from support.ports import unused_port
-from viser_client import ViserClient
+from support.scenes import ball_scene, tiny_model
+from support.viser_client import ViserClient
 
-from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.viewer.page import Page
 from nerf_lightning.viewer.photographs import Photographs
-from nerf_lightning.viewer.slices import SlicedRenderer
-from nerf_lightning.viewer.studio import Studio
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import SlicedRenderer
 
 HEIGHT = 24
 
 
 @dataclass
 class ServedPage:
-    """The page, the studio that draws for it, and where it is."""
+    """The page, the queue that draws for it, and where it is."""
 
     page: Page
-    studio: Studio
+    queue: RenderQueue
     worker: threading.Thread
 
     @property
@@ -69,19 +69,19 @@ class ServedPage:
 def served(folder: Path, record: dict | None = None, **options):
     """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture."""
     record = replace(scene_record(ball_scene(num_views=4, size=16)), **(record or {}))
-    studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
-    page = Page(studio, Photographs(record, None, "white"), folder, "127.0.0.1", unused_port(), HEIGHT, **options)
+    queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
+    page = Page(queue, Photographs(record, None, "white"), folder, "127.0.0.1", unused_port(), HEIGHT, **options)
     over = threading.Event()
 
     def work() -> None:
         while not over.is_set():
-            if not studio.work():
-                studio.wait(0.02)
+            if not queue.work():
+                queue.wait(0.02)
 
     worker = threading.Thread(target=work, daemon=True)
     worker.start()
     try:
-        yield ServedPage(page, studio, worker)
+        yield ServedPage(page, queue, worker)
     finally:
         over.set()
         worker.join()

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from scenes import ball_scene
+from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints import scene_record
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.viewer.camera_state import CameraState, camera_of
 from nerf_lightning.viewer.channels import CHANNELS, picture_of
-from nerf_lightning.viewer.look import Look, camera_of
 from nerf_lightning.viewer.photographs import Photographs
-from nerf_lightning.viewer.slices import View
+from nerf_lightning.viewer.renderer import View
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def plane():
     """A wall across the view, one unit behind the middle; the camera looks along -y."""
     c2w = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 3], [0, 1, 0, 0]])
     c2w[:, 0] *= -1  # right, up, back is a right-handed system
-    camera, _, _ = camera_of(Look(c2w, 0.8, 12, 12), scene_record(ball_scene()), 12)
-    from nerf_lightning.geometry.cameras import all_pixels, rays_through_pixels
+    camera, _, _ = camera_of(CameraState(c2w, 0.8, 12, 12), scene_record(ball_scene()), 12)
+    from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 
     rays = rays_through_pixels(camera, all_pixels(camera, 0), torch.zeros(1), torch.zeros(1))
     depth = 4.0 / -rays.directions[..., 1]

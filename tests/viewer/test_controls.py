@@ -5,17 +5,17 @@ from dataclasses import replace
 from unittest.mock import MagicMock
 
 import pytest
-from scenes import ball_scene, tiny_model
+from support.scenes import ball_scene, tiny_model
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.geometry.paths.base import frame_of
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import controls, limits
+from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import Controls
 from nerf_lightning.viewer.frusta import quaternion_of
 from nerf_lightning.viewer.photographs import Photographs
-from nerf_lightning.viewer.session import Session
-from nerf_lightning.viewer.slices import SlicedRenderer
-from nerf_lightning.viewer.studio import Studio
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import SlicedRenderer
 
 HEIGHT = 12
 
@@ -53,24 +53,24 @@ class Gui:
 
 
 class Panel:
-    """A person's panel over a ball, and the studio that serves them."""
+    """A person's panel over a ball, and the queue that serves them."""
 
     def __init__(self, folder, **changed):
         scene = ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
-        self.studio = Studio(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
+        self.queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
         self.client, self.gui = MagicMock(client_id=1), Gui()
         self.client.gui = self.gui
         c2w, camera = record.cameras.c2w[0], self.client.camera
         camera.wxyz, camera.position, camera.fov = quaternion_of(c2w), c2w[:, 3].double().numpy(), 0.6
         camera.image_width, camera.image_height = 16, HEIGHT
         around = frame_of(record.cameras, record.aabb)
-        self.session = Session(self.client, self.studio, Photographs(record, None, "white"), around, HEIGHT)
+        self.session = ViewerClient(self.client, self.queue, Photographs(record, None, "white"), around, HEIGHT)
         self.session.start()
         Controls(self.session, folder)
 
     def work(self):
-        while self.studio.work():
+        while self.queue.work():
             pass
 
     def snapshot(self):
@@ -160,7 +160,7 @@ def test_the_crop_box_is_the_scenes(tmp_path):
     panel.gui.made["z"].value = (0.0, 0.5)
     panel.gui.made["z"].act(None)
     assert panel.session.crop.size.tolist() == pytest.approx([2.0, 2.0, 0.5])
-    assert panel.studio.work()
+    assert panel.queue.work()
 
 
 def test_without_a_crop_box_it_is_said_why(tmp_path):

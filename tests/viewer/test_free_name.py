@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from nerf_lightning.viewer.free_name import free_name
+from nerf_lightning.viewer.recorded_path import free_name
 
 
 def test_two_that_save_at_once_have_two_names(tmp_path):

@@ -176,7 +176,7 @@ def test_nobody_publishes_the_page_through_somebody_elses_server(page, client, m
 
 def test_a_flood_of_messages_is_thinned(page, client, monkeypatch):
     wishes = []
-    monkeypatch.setattr("nerf_lightning.viewer.session.Session.look", lambda self: wishes.append(1))
+    monkeypatch.setattr("nerf_lightning.viewer.client.ViewerClient.look", lambda self: wishes.append(1))
     began = time.monotonic()
     for number in range(6 * limits.MOST_MESSAGES_PER_SECOND):
         client.look_from(number)
@@ -196,14 +196,14 @@ def test_a_flood_of_pings_closes_its_client_alone(page, client):
 
 
 def test_an_error_while_drawing_for_one_ends_neither_the_page_nor_the_loop(page, client, monkeypatch, caplog):
-    plain = page.studio.renderer.slices
+    plain = page.queue.renderer.slices
 
     def slices(look, height):
         if look.width == 77:
             raise RuntimeError("cannot be\ndrawn")
         return plain(look, height)
 
-    monkeypatch.setattr(page.studio.renderer, "slices", slices)
+    monkeypatch.setattr(page.queue.renderer, "slices", slices)
     hostile = page.client(width=77)
     for degrees in range(5):
         hostile.look_from(degrees)

@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from browser import opened, wait_until
+from support.browser import opened, wait_until
 from support.served_page import served
 
 pytestmark = pytest.mark.slow

@@ -6,19 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene
+from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.geometry.frames import points_from_user, similarity, upright_rotation
-from nerf_lightning.geometry.paths.keyframes import read_keyframes
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.nerf.geometry.frames import points_from_user, similarity, upright_rotation
+from nerf_lightning.video.paths.keyframes import read_keyframes
 from nerf_lightning.viewer import limits
+from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.recorded_path import RecordedPath
-from nerf_lightning.viewer.session import Session
 
 EYES = ([4.0, 0.0, 1.0], [0.0, 4.0, 2.0])
 
 
-class FakeSession(Session):
+class FakeSession(ViewerClient):
     def __init__(self, client, record):
         self.client, self.photographs = client, SimpleNamespace(record=record)
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from nerf_lightning.viewer.look import Look
-from nerf_lightning.viewer.refinement import Refinement
-from nerf_lightning.viewer.slices import SlicedRenderer
-from nerf_lightning.viewer.studio import Studio
+from nerf_lightning.viewer.camera_state import CameraState
+from nerf_lightning.viewer.progressive import ProgressiveRendering
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import SlicedRenderer
 
 MOVING = 40
 
@@ -33,11 +33,11 @@ def seen():
 
 @pytest.fixture
 def refinement(seen):
-    return Refinement(lambda view, look, finest: seen.append((*view, finest)), most_height=300)
+    return ProgressiveRendering(lambda view, look, finest: seen.append((*view, finest)), most_height=300)
 
 
 def a_look(height=1000):
-    return Look(torch.eye(4)[:3], 1.0, 1000, height)
+    return CameraState(torch.eye(4)[:3], 1.0, 1000, height)
 
 
 def work_out(refinement, most=10_000):
@@ -91,28 +91,30 @@ def test_a_refreshed_view_is_rendered_once_more_at_its_finest(refinement, seen):
 
 def test_who_moves_comes_before_who_waits_for_details_and_nobody_starves():
     seen = []
-    studio = Studio(FakeRenderer())
-    people = [Refinement(lambda view, look, finest, who=who: seen.append((who, view[1])), 300) for who in range(3)]
+    queue = RenderQueue(FakeRenderer())
+    people = [
+        ProgressiveRendering(lambda view, look, finest, who=who: seen.append((who, view[1])), 300) for who in range(3)
+    ]
     for who, person in enumerate(people):
         person.ask(a_look())
-        studio.add(who, person)
-    while studio.work():
+        queue.add(who, person)
+    while queue.work():
         pass
     assert [height for _, height in seen[:3]] == [40, 40, 40]
     assert sorted(who for who, height in seen if height == 300) == [0, 1, 2]
     people[2].ask(a_look())
     people[1].refresh()
-    studio.work()
+    queue.work()
     assert people[2]._job is not None
     assert people[1]._job is None
 
 
 def test_somebody_who_left_is_not_served():
-    studio = Studio(FakeRenderer())
-    person = Refinement(lambda *_: None, 300)
+    queue = RenderQueue(FakeRenderer())
+    person = ProgressiveRendering(lambda *_: None, 300)
     person.ask(a_look())
-    studio.add(1, person)
-    assert not studio.is_empty
-    studio.remove(1)
-    assert not studio.work()
-    assert studio.is_empty
+    queue.add(1, person)
+    assert not queue.is_empty
+    queue.remove(1)
+    assert not queue.work()
+    assert queue.is_empty

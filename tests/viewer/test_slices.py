@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import ball_scene, tiny_model
-from static_models import fast_model
+from support.scenes import ball_scene, tiny_model
+from support.static_models import fast_model
 
-from nerf_lightning.checkpoints import scene_record
-from nerf_lightning.geometry.clipping import CropBox
-from nerf_lightning.models.packed_level import PackedLevel
-from nerf_lightning.models.pictures import render_picture
-from nerf_lightning.viewer import slices
-from nerf_lightning.viewer.look import Look, camera_of, pose_of
-from nerf_lightning.viewer.slices import SlicedRenderer
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.viewer import renderer as slices
+from nerf_lightning.viewer.camera_state import CameraState, camera_of, pose_of
+from nerf_lightning.viewer.renderer import SlicedRenderer
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def renderer(scene):
 def behind_grid(scene):
     """A model that asks its field only in occupied cells: those in which the photographs' alpha leaves something."""
     model = fast_model(PackedLevel).eval()
-    model.place(scene)
+    model.fit_to(scene)
     return SlicedRenderer(model, scene_record(scene), "white", 4096)
 
 
@@ -46,7 +46,7 @@ def finished(generator):
 
 def test_a_photographs_look_in_slices_is_its_picture(scene, renderer):
     renderer.rays_per_second = 64 / slices.SLICE_SECONDS  # the first slice has 64 rays
-    look = Look(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1)
+    look = CameraState(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1)
     view, count = finished(renderer.slices(look, 16))
     whole = render_picture(renderer.model, scene.cameras, 1, scene.near, scene.far, "white", 4096)
     assert count >= 2
@@ -56,22 +56,22 @@ def test_a_photographs_look_in_slices_is_its_picture(scene, renderer):
 
 def test_a_free_look_from_a_photographs_place_sees_what_the_photograph_sees(scene, renderer):
     fov = 2 * float(torch.atan(torch.tensor(0.5 / 1.6)))
-    view, _ = finished(renderer.slices(Look(scene.cameras.c2w[2], fov, 640, 640), 16))
+    view, _ = finished(renderer.slices(CameraState(scene.cameras.c2w[2], fov, 640, 640), 16))
     whole = render_picture(renderer.model, scene.cameras, 2, view_near(scene, 2), view_far(scene, 2), "white", 4096)
     assert torch.allclose(view.rgb, whole.rgb, atol=1e-4)
 
 
 def view_near(scene, view):
-    return camera_of(Look(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[1].expand(4)
+    return camera_of(CameraState(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[1].expand(4)
 
 
 def view_far(scene, view):
-    return camera_of(Look(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[2].expand(4)
+    return camera_of(CameraState(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[2].expand(4)
 
 
 def test_outside_of_the_crop_box_there_is_only_background(scene, renderer):
     box = CropBox.from_user((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), torch.eye(4))
-    view, _ = finished(renderer.slices(Look(scene.cameras.c2w[0], 0.6, 32, 32, crop=box), 32))
+    view, _ = finished(renderer.slices(CameraState(scene.cameras.c2w[0], 0.6, 32, 32, crop=box), 32))
     assert torch.equal(view.rgb[0], torch.ones(32, 3))
     assert float(view.opacity[0].max()) == 0.0
     assert float(view.opacity[16, 16]) > 0.0
@@ -80,9 +80,9 @@ def test_outside_of_the_crop_box_there_is_only_background(scene, renderer):
 def test_the_near_plane_goes_with_somebody_who_comes_closer(scene):
     record = scene_record(scene)
     c2w = scene.cameras.c2w[0].clone()
-    _, near, far = camera_of(Look(c2w, 0.6, 8, 8), record, 8)
+    _, near, far = camera_of(CameraState(c2w, 0.6, 8, 8), record, 8)
     c2w[:, 3] *= 0.5
-    _, nearer, less_far = camera_of(Look(c2w, 0.6, 8, 8), record, 8)
+    _, nearer, less_far = camera_of(CameraState(c2w, 0.6, 8, 8), record, 8)
     assert float(near) == pytest.approx(2.0, abs=1e-4)
     assert 0 < float(nearer) < 0.1
     walked = float(c2w[:, 3].norm())
@@ -91,9 +91,9 @@ def test_the_near_plane_goes_with_somebody_who_comes_closer(scene):
 
 def test_a_tall_photograph_fits_into_a_wide_window(scene):
     record = scene_record(scene)
-    cameras, _, _ = camera_of(Look(scene.cameras.c2w[0], 0.6, 200, 100, photograph=0), record, 50)
+    cameras, _, _ = camera_of(CameraState(scene.cameras.c2w[0], 0.6, 200, 100, photograph=0), record, 50)
     assert (int(cameras.width), int(cameras.height)) == (50, 50)
-    cameras, _, _ = camera_of(Look(scene.cameras.c2w[0], 0.6, 50, 100, photograph=0), record, 100)
+    cameras, _, _ = camera_of(CameraState(scene.cameras.c2w[0], 0.6, 50, 100, photograph=0), record, 100)
     assert (int(cameras.width), int(cameras.height)) == (50, 50)
 
 
@@ -106,7 +106,7 @@ def test_opencvs_rotation_becomes_ours(scene):
 
 
 def test_the_speed_that_was_seen_decides_the_size_while_moving(scene, renderer):
-    look = Look(scene.cameras.c2w[0], 0.6, 400, 300)
+    look = CameraState(scene.cameras.c2w[0], 0.6, 400, 300)
     renderer.rays_per_second = 120_000.0
     assert renderer.height_while_moving(look) == 94  # 12,000 rays, 4 to 3
     renderer.rays_per_second = 10.0
@@ -115,7 +115,7 @@ def test_the_speed_that_was_seen_decides_the_size_while_moving(scene, renderer):
 
 def test_behind_an_occupancy_grid_slices_are_the_whole_picture(scene, behind_grid):
     behind_grid.rays_per_second = 64 / slices.SLICE_SECONDS
-    view, count = finished(behind_grid.slices(Look(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1), 16))
+    view, count = finished(behind_grid.slices(CameraState(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1), 16))
     whole = render_picture(behind_grid.model, scene.cameras, 1, scene.near, scene.far, "white", 4096)
     assert count >= 2
     assert torch.allclose(view.rgb, whole.rgb, atol=2e-3)  # a ray may end when its light is below 1e-3
@@ -125,7 +125,7 @@ def test_behind_an_occupancy_grid_slices_are_the_whole_picture(scene, behind_gri
 
 
 def test_behind_an_occupancy_grid_a_crop_box_only_takes_away(scene, behind_grid):
-    look = Look(scene.cameras.c2w[0], 0.6, 32, 32)
+    look = CameraState(scene.cameras.c2w[0], 0.6, 32, 32)
     whole, _ = finished(behind_grid.slices(look, 32))
     all_of_it = CropBox.from_user((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), torch.eye(4))
     uncut, _ = finished(behind_grid.slices(replace(look, crop=all_of_it), 32))

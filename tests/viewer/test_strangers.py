@@ -66,7 +66,7 @@ def test_who_has_no_token_is_told_where_it_is(page, query):
 
 @pytest.mark.parametrize("token", ["", "none"])
 def test_a_program_without_the_token_gets_no_session(page, token):
-    from viser_client import ViserClient
+    from support.viser_client import ViserClient
 
     address = f"http://127.0.0.1:{page.port}/?token={token}"
     assert "that nerf printed" in refused(lambda: ViserClient(address))
@@ -75,7 +75,7 @@ def test_a_program_without_the_token_gets_no_session(page, token):
 
 
 def test_the_page_keeps_the_token_in_a_cookie_that_no_script_reads(page):
-    from viser_client import ViserClient
+    from support.viser_client import ViserClient
 
     status, headers, text = page.get(f"/?token={page.token}")
     assert status == 200

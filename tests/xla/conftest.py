@@ -17,8 +17,8 @@ def _xla_on_the_cpu(monkeypatch):
         import torch_xla
 
         torch_xla.device()
-    from xla_host import XLAHostAccelerator
+    from support.xla_host import XLAHostAccelerator
 
-    from nerf_lightning.commands import xla
+    from nerf_lightning.training.launch import xla
 
     monkeypatch.setattr(xla, "ACCELERATOR", XLAHostAccelerator)

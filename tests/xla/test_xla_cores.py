@@ -15,8 +15,8 @@ import os
 import sys
 from pathlib import Path
 import torch
-from xla_host import XLAHostAccelerator, train
-from nerf_lightning.commands import xla
+from support.xla_host import XLAHostAccelerator, train
+from nerf_lightning.training.launch import xla
 
 xla.ACCELERATOR = XLAHostAccelerator
 folder = Path(sys.argv[1])

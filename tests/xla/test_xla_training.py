@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from static_models import MODELS
+from support.static_models import MODELS
 
-from nerf_lightning.callbacks.checkpoints import Checkpoints
-from nerf_lightning.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 
 pytestmark = [
     pytest.mark.xla,
@@ -18,7 +18,7 @@ SETTLED = {"nerf": 2, "fast_dense": 13}
 
 @pytest.mark.parametrize("name", MODELS)
 def test_losses_equal_the_cpus_and_the_step_is_compiled_once(name, tmp_path):
-    from xla_host import train
+    from support.xla_host import train
 
     there = train(tmp_path / "xla", name, "tpu", callbacks=[Checkpoints(every_steps=1000)])
     here = train(tmp_path / "cpu", name, "cpu")
@@ -34,7 +34,7 @@ def test_losses_equal_the_cpus_and_the_step_is_compiled_once(name, tmp_path):
 
 
 def test_products_are_bfloat16_and_weights_float32(tmp_path):
-    from xla_host import train
+    from support.xla_host import train
 
     there = train(tmp_path / "xla", "nerf", "tpu", precision="bf16-mixed", steps=8)
     here = train(tmp_path / "cpu", "nerf", "cpu", precision="bf16-mixed", steps=8)
@@ -63,7 +63,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_stops_the_device_is_noticed(fault, tmp_path):
-    from xla_host import train
+    from support.xla_host import train
 
     planted, noticed = FAULTS[fault]
     run = train(tmp_path, "nerf", "tpu", steps=6, loss=Planted(planted))
@@ -75,7 +75,7 @@ def test_what_stops_the_device_is_noticed(fault, tmp_path):
 def test_a_search_stays_on_the_device(right, generator):
     from torch_xla.debug import metrics
 
-    from nerf_lightning.kernels.search import search
+    from nerf_lightning.nerf.kernels.search import search
 
     ordered = torch.rand(7, 20, generator=generator).sort(-1).values
     numbers = torch.cat([torch.rand(7, 30, generator=generator), ordered[:, ::3]], dim=-1)

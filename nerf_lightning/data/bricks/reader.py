@@ -1,5 +1,6 @@
-"""The embedded scene: a fire engine of bricks, rendered on first use and cached. No download."""
+"""The embedded scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
 
+import math
 import multiprocessing
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -11,17 +12,19 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 from rich.progress import Progress
+from torch import Tensor
 
+from nerf_lightning.console import progress_bar
 from nerf_lightning.cores import num_cores
-from nerf_lightning.data.base import Reader
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
 from nerf_lightning.data.bricks.vehicle import fire_engine
-from nerf_lightning.data.bricks.views import bricks_cameras
-from nerf_lightning.data.cache_folder import default_folder
-from nerf_lightning.data.progress import progress_bar
+from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
-from nerf_lightning.types.scene import Background, Cameras, PixelStore, Scene, Truth
+from nerf_lightning.files.folders import default_folder
+from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene, Truth
 
 RENDER_VERSION = 1
 """Part of the cache's key: raise it whenever a pixel changes."""
@@ -173,3 +176,39 @@ def _progress() -> Progress:
     """One bar per run: not in the workers of a loader, nor on the other ranks."""
     main = multiprocessing.parent_process() is None and os.environ.get("LOCAL_RANK", "0") == "0"
     return progress_bar(shown=main)
+
+
+DISTANCE = 4.0311
+"""From each camera to the origin, as in the Blender scenes."""
+FIELD_OF_VIEW = 0.6911112070083618
+"""Horizontal, in radians, as in the Blender scenes."""
+LOWEST, HIGHEST = 0.05, 0.97
+"""Sine of the elevation: above the horizon, short of the pole, where a picture has no upright."""
+PLASTIC = 1.32471795724474602596
+"""Root of x^3 = x + 1; its powers spread points evenly over a square, however many are taken."""
+
+
+def bricks_cameras(train: int, val: int, test: int, resolution: int) -> Cameras:
+    """Return square views that look at the origin: train first, then val, then test.
+
+    Train and val are successive points of one additive recurrence, so val lies in the gaps of train.
+    """
+    index = torch.arange(train + val, dtype=torch.float64)
+    sphere = _on_sphere((0.5 + index / PLASTIC) % 1, LOWEST + (HIGHEST - LOWEST) * ((0.5 + index / PLASTIC**2) % 1))
+    eyes = DISTANCE * torch.cat([sphere, _orbit(test)])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    c2w = look_at(eyes, torch.zeros_like(eyes), up).float()
+    return pinhole_cameras(c2w, focal_from_fov(resolution, FIELD_OF_VIEW), resolution, resolution)
+
+
+def _orbit(num_views: int) -> Float[Tensor, "views 3"]:
+    """Once around, rising and sinking twice, between 14 and 46 degrees of elevation."""
+    turn = (torch.arange(num_views, dtype=torch.float64) + 0.4) / max(num_views, 1)
+    elevation = math.radians(30) + math.radians(16) * torch.sin(4 * math.pi * turn)
+    return _on_sphere(turn, elevation.sin())
+
+
+def _on_sphere(turn: Float[Tensor, "views"], height: Float[Tensor, "views"]) -> Float[Tensor, "views 3"]:
+    radius = (1 - height**2).sqrt()
+    angle = 2 * math.pi * turn
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), height], dim=-1)

@@ -7,20 +7,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf_lightning.checkpoints import SceneRecord, read_checkpoint
-from nerf_lightning.data.images import read_rgba
-from nerf_lightning.data.video_frames import count_frames
+from nerf_lightning.checkpoints.reading import SceneRecord, read_checkpoint
+from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.metrics import psnr
-from nerf_lightning.geometry.paths.base import frame_of
-from nerf_lightning.geometry.paths.photographs import Photographs
-from nerf_lightning.models.levels import RadianceModel
-from nerf_lightning.models.pictures import Picture, render_picture
+from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.selftest.check import Check
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.runs import FILM_VIEWS, STEPS, STOP
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene
-from nerf_lightning.tensor_files import load_tensors
-from nerf_lightning.types.scene import Cameras
+from nerf_lightning.sfm.video_frames import count_frames
+from nerf_lightning.video.paths.base import frame_of
+from nerf_lightning.video.paths.photographs import Photographs
 
 ONE_STEP = 0.03
 """The learning rate: about what a step moves a weight by."""

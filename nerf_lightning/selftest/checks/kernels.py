@@ -7,21 +7,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf_lightning.geometry.boxes import distances_in_box
-from nerf_lightning.kernels import backends
-from nerf_lightning.kernels.adam import adam_step, adam_step_torch
-from nerf_lightning.kernels.carving import possible_cells
-from nerf_lightning.kernels.compile import CPU_TWINS
-from nerf_lightning.kernels.hash_grid import hash_grid_layout, interpolate
-from nerf_lightning.kernels.hash_grid_torch import interpolate_torch
-from nerf_lightning.kernels.march import March, OccupancyCells, blocks_of, march
-from nerf_lightning.kernels.march_torch import march_torch
-from nerf_lightning.kernels.mlp import mlp, mlp_torch
-from nerf_lightning.kernels.packed import integrate, num_visible
-from nerf_lightning.kernels.packed_torch import integrate_torch, transmittance_torch
-from nerf_lightning.kernels.search import search
-from nerf_lightning.products import TILE_ROWS as TILE
-from nerf_lightning.products import Products
+from nerf_lightning.nerf.geometry.boxes import distances_in_box
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.adam.step import adam_step, adam_step_torch
+from nerf_lightning.nerf.kernels.carving.carve import possible_cells
+from nerf_lightning.nerf.kernels.compile import CPU_TWINS
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.reference import march_torch
+from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
+from nerf_lightning.nerf.kernels.packed.integrate import integrate, num_visible
+from nerf_lightning.nerf.kernels.packed.reference import integrate_torch, transmittance_torch
+from nerf_lightning.nerf.kernels.search import search
+from nerf_lightning.nerf.products import TILE_ROWS as TILE
+from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.selftest.check import (
     UNIT,
     CannotRun,
@@ -34,7 +37,6 @@ from nerf_lightning.selftest.check import (
 )
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.types.rays import PackedSamples, RayBundle
 
 POINTS, RAYS = 2048, 400
 GRID_TERMS, PACKED_SAMPLES, MLP_SIZES = 64, 60, (32, 64, 64, 3)
@@ -110,7 +112,7 @@ def checks(place: Place) -> list[Check]:
 def _twins(place: Place) -> list[Check]:
     """Return a check for each compiled kernel: whether it runs at all. What it computes, the checks below say."""
     if place.is_cuda:
-        return [_loads("hash_grid_triton", "triton")]
+        return [_loads("hash_grid.cuda", "triton")]
     if place.device.type == "cpu":
         found = [_loads(name, "numba") for name in CPU_TWINS]
         return [*found, _absent("hash_grid (triton)", "it is for GPUs, and the device here is the CPU")]
@@ -123,7 +125,7 @@ def _loads(module: str, library: str) -> Check:
             raise CannotRun(f"{backends.why_not(module)}: plain torch does its work, many times slower")
         return 0.0
 
-    name = f"{module.rpartition('_')[0]} ({library}): compiles and runs"
+    name = f"{module.rpartition('.')[0]} ({library}): compiles and runs"
     return Check(name, 0.0, "it was compiled and gave finite numbers", difference)
 
 
@@ -246,7 +248,7 @@ def _adam(device: torch.device) -> float:
 def _carving() -> float:
     centers = 1.5 * torch.randn(20_000, 3, generator=_generator())
     scene = ball_scene()
-    with backends.without("carving_numba"):
+    with backends.without("carving.cpu"):
         expected = possible_cells(scene, centers, 0.05)
     return float((possible_cells(scene, centers, 0.05) != expected).sum())
 

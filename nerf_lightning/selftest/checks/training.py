@@ -5,18 +5,19 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from nerf_lightning.data.ray_batches import FixedRays, Progress, RayBatches
-from nerf_lightning.data.residence import on_device
-from nerf_lightning.encoders.base import tables_of
-from nerf_lightning.kernels.backends import can_compile, without
-from nerf_lightning.kernels.compile import CPU_TWINS
-from nerf_lightning.products import Products
-from nerf_lightning.schedules.exponential import ExponentialDecay
+from nerf_lightning.data.pixels.placement import on_device
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.kernels.backends import can_compile, without
+from nerf_lightning.nerf.kernels.compile import CPU_TWINS
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart, relative
 from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.system import RadianceFieldSystem
+from nerf_lightning.training.system import RadianceFieldSystem
 
 SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
 # Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
@@ -26,7 +27,7 @@ PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 
 LEARNT = 1e4
 """Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
 CPU = torch.device("cpu")
-TORCH_ALONE = (*CPU_TWINS, "mlp_tiles")
+TORCH_ALONE = (*CPU_TWINS, "mlp.cpu")
 
 
 class Training:
@@ -35,7 +36,7 @@ class Training:
     def __init__(self, method: str, device: torch.device, products: Products, tile_points: int | None):
         scene, progress, chosen = ball_scene(), Progress(), METHODS[method]
         model = chosen.model()
-        model.place(scene)
+        model.fit_to(scene)
         self.system = RadianceFieldSystem(
             model=model,
             loss=chosen.loss(),

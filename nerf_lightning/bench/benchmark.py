@@ -1,0 +1,254 @@
+"""`nerf bench`: interleaved measurements, medians of ratios.
+
+Machines are noisy and their speed drifts, so every round measures each kind once, and two kinds are compared round by
+round. Kinds: the configured step (tiled, in the configured precision), the same step in plain float32 without tiles,
+the machine's matrix product, making a batch, the configured step with batches from the loader, and rendering. "Plain"
+is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid kernel, no
+screening of what lies behind opaque samples.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich.progress import track
+
+from nerf_lightning.bench.callbacks import watching_seconds
+from nerf_lightning.bench.kernels import kernel_ratios
+from nerf_lightning.bench.stages import (
+    MATRIX_FLOPS,
+    LoadedSteps,
+    flops_per_ray,
+    multiplication,
+    seconds_to_psnr,
+    stage_seconds,
+)
+from nerf_lightning.bench.table import min_median_max, print_table
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say, stderr_console
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.machine import peak_memory, seconds_of
+from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.training.build import build_system
+from nerf_lightning.training.callbacks.watcher import Watcher
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.tile_size import measured_tile
+
+MOST_STEPS = 2000
+
+
+@dataclass
+class Bench:
+    """What is measured, ready to run."""
+
+    settings: TrainerSettings
+    system: RadianceFieldSystem
+    data: RayDataModule
+    optimizer: torch.optim.Optimizer
+    plain_optimizer: torch.optim.Optimizer
+
+    @property
+    def batches(self) -> RayBatches:
+        """The training rays."""
+        return self.data.batches
+
+    @cached_property
+    def batch(self) -> Batch:
+        """The batch that every kind gets, as large as batches are once the model has been trained."""
+        return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
+
+    def train_on(self, batch: Batch, plain: bool = False) -> None:
+        """Compute gradients and update, and nothing else."""
+        optimizer = self.plain_optimizer if plain else self.optimizer
+        optimizer.zero_grad()
+        self.system.accumulate_gradients(batch, lambda loss: loss.backward())
+        optimizer.step()
+
+    def take_step(self) -> None:
+        """Take one step of training, loading and all."""
+        progress = self.batches.progress
+        batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
+        self.system.training_step(batch, 0)
+
+
+def benchmark(config: DictConfig) -> float:
+    """Measure as the config says."""
+    bench = _prepare(config)
+    reached = _train_first(bench, config)
+    loaded_steps = LoadedSteps(bench.batches, bench.train_on, config.steps)
+    kinds: dict[str, Callable[[], Any]] = {
+        "matrix": multiplication(bench.settings),
+        "train": lambda: _train(bench, config.steps, plain=False),
+        "train_plain": lambda: _train(bench, config.steps, plain=True),
+        "load": lambda: bench.batches.at(0, bench.batches.crop_rays(0)),
+        "loaded": loaded_steps,
+        "render": lambda: _render(bench, config.render_rays, plain=False),
+        "render_plain": lambda: _render(bench, config.render_rays, plain=True),
+    }
+    kinds["train"]()
+    peak = peak_memory()  # before the whole batches of the plain kinds
+    seconds = _interleaved(kinds, config.rounds)
+    num_rays = bench.batch.rays.near.numel()
+    flops = flops_per_ray(bench.system, bench.batch)
+    seconds["wait"] = loaded_steps.waits[1:]
+    per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
+    result: dict[str, Any] = {name: min_median_max([row[name] for row in per_round]) for name in per_round[0]}
+    result |= {name: min_median_max(values) for name, values in _stages(bench, seconds["train"], config.steps).items()}
+    watching = _watching(bench, config)
+    steps = [one / config.steps for one in seconds["train"]]
+    result |= {name: min_median_max([value / step for step in steps]) for name, value in watching.items()}
+    if config.kernels:
+        ratios = kernel_ratios(bench.settings.device, config.rounds)
+        result |= {name: min_median_max(values) for name, values in ratios.items()}
+    result |= {
+        "seconds_and_steps_to_target_psnr": reached,
+        "machine": bench.settings.describe(),
+        "tile_points": bench.settings.tile_points,
+        "batch_rays": num_rays,
+        "training_flops_per_ray": flops,
+        "peak_memory_gigabytes": peak,
+        "rounds": config.rounds,
+    }
+    print_table(result)
+    folder = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
+    write_json(folder / "bench.json", result)
+    say(f"written to {folder / 'bench.json'}")
+    return float(result["training rays/s"]["median"])
+
+
+def _train_first(bench: Bench, config: DictConfig) -> tuple[float, int] | None:
+    """Train until a PSNR is reached, and return seconds and steps; or for a number of steps."""
+    if config.target_psnr is not None:
+        most = config.warmup_steps or MOST_STEPS
+        return seconds_to_psnr(bench.take_step, bench.system, bench.batches, config.target_psnr, most)
+    for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
+        bench.take_step()
+    return None
+
+
+def _prepare(config: DictConfig) -> Bench:
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    scene = build(config.scene).read()
+    progress = Progress()
+    num_steps = max(1, config.warmup_steps)
+    system = build_system(config, settings, scene, progress, num_steps, {}).to(settings.device)
+    settings.prepare(system.model)
+    system.initialize()
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    data.settle(settings.device)
+    if settings.measures_tile:
+        settings.tile_points = system.tile_points = measured_tile(settings, system, data.batches)
+    optimizer, plain = system.configure_optimizers(), torch.optim.Adam(system.model.parameters(), lr=1e-6)
+    # Stand-ins for what Lightning's trainer provides.
+    setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
+    setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
+    return Bench(settings, system, data, optimizer, plain)
+
+
+def _interleaved(kinds: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
+    seconds: dict[str, list[float]] = {name: [] for name in kinds}
+    for number in range(rounds + 1):
+        for name, work in kinds.items():
+            taken = seconds_of(work)
+            if number:  # the first round warms up
+                seconds[name].append(taken)
+    return seconds
+
+
+def _round(
+    seconds: dict[str, list[float]], i: int, batch_rays: int, steps: int, render_rays: int, flops: float
+) -> dict[str, float]:
+    train_rays = batch_rays * steps
+    matrix_rate = MATRIX_FLOPS / seconds["matrix"][i]
+    rate = train_rays * flops / seconds["train"][i]
+    return {
+        "training rays/s": train_rays / seconds["train"][i],
+        "training, times plain float32": seconds["train_plain"][i] / seconds["train"][i],
+        "training GFLOP/s": rate / 1e9,
+        "matrix GFLOP/s": matrix_rate / 1e9,
+        "training, share of the matrix rate": rate / matrix_rate,
+        "making a batch, milliseconds": 1e3 * seconds["load"][i],
+        "waiting for a batch, milliseconds": 1e3 * seconds["wait"][i],
+        "waiting, share of a step": seconds["wait"][i] * steps / seconds["train"][i],
+        "rendering rays/s": render_rays / seconds["render"][i],
+        "rendering, times plain float32": seconds["render_plain"][i] / seconds["render"][i],
+    }
+
+
+def _train(bench: Bench, steps: int, plain: bool) -> None:
+    with _plainly(bench) if plain else nullcontext():
+        for _ in range(steps):
+            bench.train_on(bench.batch, plain)
+    bench.system.tile_points = bench.settings.tile_points
+
+
+@contextmanager
+def _plainly(bench: Bench) -> Iterator[None]:
+    """Compute as one would first write it; our kernel of the hash grid stays."""
+    samplers = [level.sampler for level in bench.system.model.modules() if isinstance(level, PackedLevel)]
+    former = [sampler.opaque_below for sampler in samplers]
+    bench.system.tile_points = None
+    bench.system.model.multiply_in("float32")
+    for sampler in samplers:
+        sampler.opaque_below = 0.0
+    _release_gradients(bench)
+    with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu"):
+        yield
+    bench.settings.prepare(bench.system.model)
+    for sampler, value in zip(samplers, former, strict=True):
+        sampler.opaque_below = value
+    _release_gradients(bench)
+
+
+def _release_gradients(bench: Bench) -> None:
+    for parameter in bench.system.model.parameters():
+        parameter.grad = None
+        parameter.grad_in_place = False  # type: ignore[attr-defined]
+
+
+def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[float]]:
+    """Return the share of a step's time that each stage takes, where the model has stages."""
+    result: dict[str, list[float]] = {}
+    for one in seconds:
+        for name, value in stage_seconds(bench.system, bench.batch, bench.optimizer).items():
+            result.setdefault(f"{name}, share of a step", []).append(value * steps / one)
+    return result
+
+
+def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
+    """Return the seconds per step that go into TensorBoard, in all and by what is shown."""
+    watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
+    system, data = bench.system, bench.data
+    bench.take_step()  # losses to look at
+    seconds = watching_seconds(watchers, system, data, bench.batch)
+    return {"watching, share of a step": sum(seconds.values())} | {
+        f"watching: {name}, share of a step": value for name, value in seconds.items()
+    }
+
+
+def _render(bench: Bench, num_rays: int, plain: bool) -> None:
+    rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
+    size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
+    with torch.no_grad(), _plainly(bench) if plain else nullcontext():
+        for part in tiles(num_rays, size):
+            _render_tile(bench.system.model, rays[part], bench)
+
+
+def _render_tile(model: RadianceModel, rays: RayBundle, bench: Bench) -> None:
+    behind = background_colors(bench.system.background, rays.near.numel(), rays.near.device, random=None)
+    model(rays, behind, random=None)

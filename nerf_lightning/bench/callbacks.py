@@ -1,0 +1,65 @@
+"""`nerf bench`: what it costs that a run can be watched in TensorBoard."""
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.machine import seconds_of
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.callbacks.watcher import Watcher
+from nerf_lightning.training.system import RadianceFieldSystem
+
+# A first look may have to load or compile something. A long one is not repeated: it counts for little there.
+LONG_SECONDS = 5.0
+
+
+def watching_seconds(
+    watchers: Iterable[Watcher],
+    system: RadianceFieldSystem,
+    data: RayDataModule,
+    batch: Batch,
+) -> dict[str, float]:
+    """Return the seconds that each watcher adds to a step: those of one look, spread over the steps between two.
+
+    Args:
+        watchers: those of a run's callbacks that look every few steps.
+        system: the model in training.
+        data: its scene and rays.
+        batch: the rays of a step.
+    """
+    seconds = {}
+    with _trainer(data) as trainer:
+        for watcher in watchers:
+            look = partial(_look, watcher, trainer, system, batch)
+            first = seconds_of(look)
+            seconds[type(watcher).__name__] = (
+                first if first > LONG_SECONDS else seconds_of(look)
+            ) / watcher.every_steps
+    return seconds
+
+
+def _look(watcher: Watcher, trainer: Any, system: RadianceFieldSystem, batch: Batch) -> None:
+    system.gradient_norms = system.model.gradient_norms()  # a step measures them for the look that follows
+    watcher.watch(trainer, system, batch)
+
+
+@contextmanager
+def _trainer(data: RayDataModule) -> Iterator[Any]:
+    """Stand in for Lightning's trainer, with what watchers ask of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        logger = TensorBoardLogger(folder)
+        yield SimpleNamespace(
+            global_step=1,
+            max_steps=1,
+            is_global_zero=True,
+            default_root_dir=folder,
+            datamodule=data,
+            loggers=[logger],
+        )
+        logger.finalize("success")

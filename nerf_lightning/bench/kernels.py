@@ -1,0 +1,73 @@
+"""`nerf bench`: the compiled kernels against the same mathematics in torch, eager and compiled."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.machine import seconds_of
+from nerf_lightning.nerf.kernels.backends import can_compile
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
+
+POINTS, RAY_SAMPLES = 65_536, 32
+
+
+def kernel_ratios(device: torch.device, rounds: int) -> dict[str, list[float]]:
+    """Return seconds of our kernels, and how many times longer torch takes, round by round (forward and backward)."""
+    result: dict[str, list[float]] = {}
+    for name, kinds in {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device)}.items():
+        seconds = {kind: [seconds_of(work) for _ in range(2)][1:] for kind, work in kinds.items()}
+        for _ in range(rounds):
+            for kind, work in kinds.items():
+                seconds[kind].append(seconds_of(work))
+        ours = seconds["ours"][1:]
+        result[f"{name}, milliseconds"] = [1e3 * value for value in ours]
+        for kind in kinds:
+            if kind != "ours":
+                result[f"{name}, times torch {kind}"] = [
+                    theirs / mine for theirs, mine in zip(seconds[kind][1:], ours, strict=True)
+                ]
+    return result
+
+
+def points_along_rays(device: torch.device) -> Tensor:
+    """Return points of the unit cube as rays meet them: neighbours lie close together."""
+    start = torch.rand(POINTS // RAY_SAMPLES, 1, 3)
+    along = 0.003 * torch.nn.functional.normalize(torch.randn_like(start), dim=-1)
+    points = start + along * torch.arange(RAY_SAMPLES)[:, None]
+    return points.reshape(-1, 3).clamp(0, 1).to(device)
+
+
+def _hash_grid(device: torch.device) -> dict[str, Callable[[], None]]:
+    layout = hash_grid_layout(8, 18, 16, 512)
+    table = torch.randn(layout.offsets[-1], 4, device=device, requires_grad=True)
+    points, grad = points_along_rays(device), torch.randn(POINTS, 32, device=device)
+    return _kinds(lambda fn: fn(table, points, layout), interpolate, interpolate_torch, [table], grad)
+
+
+def _mlp(device: torch.device) -> dict[str, Callable[[], None]]:
+    weights = [torch.randn(b, a, device=device, requires_grad=True) for a, b in ((32, 64), (64, 64), (64, 3))]
+    points = torch.randn(POINTS, 32, device=device, requires_grad=True)
+    return _kinds(
+        lambda fn: fn(points, weights), mlp, mlp_torch, [points, *weights], torch.randn(POINTS, 3, device=device)
+    )
+
+
+def _kinds(
+    call: Callable[[Callable], Tensor], ours: Callable, reference: Callable, leaves: list[Tensor], grad: Tensor
+) -> dict[str, Callable[[], None]]:
+    def both_ways(fn: Callable) -> Callable[[], None]:
+        def run() -> None:
+            for leaf in leaves:
+                leaf.grad = None
+            call(fn).backward(grad)
+
+        return run
+
+    kinds = {"ours": both_ways(ours), "eager": both_ways(reference)}
+    if can_compile(grad.device):
+        kinds["compiled"] = both_ways(torch.compile(reference))
+    return kinds

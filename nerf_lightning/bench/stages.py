@@ -1,0 +1,117 @@
+"""`nerf bench`: where the time of a step goes: its stages, waiting for the batch, arithmetic, seconds to a PSNR."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.machine import seconds_of
+from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.rendering.packed import positions_of
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+
+LOOK_EVERY = 25
+VALIDATION_RAYS = 8192
+
+
+def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+    """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing."""
+    level = list(system.model.levels.values())[-1]
+    if not isinstance(level, PackedLevel):
+        return {}
+    rays, sampler = batch.rays, level.sampler
+    found: list[Tensor] = []
+    optimizer.zero_grad()
+    whole = seconds_of(lambda: system.accumulate_gradients(batch, lambda loss: loss.backward()))
+    update = seconds_of(optimizer.step)
+
+    def walk() -> None:
+        samples, _ = march(rays, sampler.start(rays, None), sampler.lattice, sampler.grid)
+        found.append(positions_of(rays, samples))
+
+    with torch.no_grad():
+        walking, screening = seconds_of(walk), seconds_of(lambda: level.field.screen(found[0]))
+    rest = whole - walking - screening
+    return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
+
+
+def seconds_to_psnr(
+    take_step: Callable[[], None], system: RadianceFieldSystem, batches: RayBatches, target: float, most_steps: int
+) -> tuple[float, int] | None:
+    """Train until the validation rays reach a PSNR; return training seconds and steps, or None where they never do."""
+    rays = FixedRays(batches.scene, "val", VALIDATION_RAYS, VALIDATION_RAYS)
+    used = 0.0
+    for step in range(1, most_steps + 1):
+        used += seconds_of(take_step)
+        if step % LOOK_EVERY == 0 and _psnr(system, rays) >= target:
+            return used, step
+    return None
+
+
+@torch.no_grad()
+def _psnr(system: RadianceFieldSystem, rays: FixedRays) -> float:
+    for number, batch in enumerate(rays):
+        system.validation_step(batch.to(system.device), number)
+    return system.val_errors.summary()["val/psnr"]
+
+
+class LoadedSteps:
+    """Take steps whose batches come from the loader, as in training, and note how long each was waited for.
+
+    Args:
+        batches: the loader.
+        train_on: takes one step.
+        steps: how many at a time.
+    """
+
+    def __init__(self, batches: RayBatches, train_on: Callable[[Batch], None], steps: int):
+        self.batches, self.train_on, self.steps = batches, train_on, steps
+        self.stream = iter(batches)
+        self.waits: list[float] = []
+        """Seconds per step, one number for each call."""
+
+    def __call__(self) -> None:
+        """Take the steps."""
+        waited = 0.0
+        for _ in range(self.steps):
+            waited += seconds_of(self._load)
+            self.train_on(self.batch)
+            self.batches.progress.advance(self.batches.progress.batch_rays)
+        self.waits.append(waited / self.steps)
+
+    def _load(self) -> None:
+        self.batch = next(self.stream)
+
+
+_ROWS, _WIDTH, _REPEATS = 4096, 256, 20
+MATRIX_FLOPS = 2 * _ROWS * _WIDTH**2 * _REPEATS
+
+
+def multiplication(settings: TrainerSettings) -> Callable[[], None]:
+    """Return work of `MATRIX_FLOPS`, in the precision of training."""
+    dtype = torch.bfloat16 if settings.precision.startswith("bf16") else torch.float32
+    left = torch.randn(_ROWS, _WIDTH, device=settings.device).to(dtype)
+    right = torch.randn(_WIDTH, _WIDTH, device=settings.device).to(dtype)
+    out = torch.empty_like(left)
+
+    def multiply() -> None:
+        for _ in range(_REPEATS):
+            torch.mm(left, right, out=out)
+
+    return multiply
+
+
+def flops_per_ray(system: RadianceFieldSystem, batch: Batch) -> float:
+    """Count the operations that training takes per ray, forward and backward, in matrix products."""
+    # Where rays differ in their samples, many make the mean.
+    few = 8 if system.model.points_per_ray(training=True) > 64 else min(1024, batch.rays.near.numel())
+    rays = batch[:few]
+    with FlopCounterMode(display=False) as counter, without("mlp.cpu"):  # it counts one thread's
+        system.accumulate_gradients(rays, lambda loss: loss.backward())
+    return counter.get_total_flops() / few

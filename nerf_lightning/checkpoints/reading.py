@@ -1,0 +1,211 @@
+"""What a checkpoint holds beside weights and optimizer, and how it is read back: the file is enough on its own.
+
+A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
+Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
+config group), scene (cameras, bounds, splits, frame), and the run's state that the system adds.
+"""
+
+import contextlib
+import logging
+import pickle
+import zipfile
+import zlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning import __version__
+from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
+from nerf_lightning.checkpoints.format import scene as scene_format
+from nerf_lightning.checkpoints.possible_scenes import require_possible_scene
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.files.schema import Unfit, shown
+from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.nerf.geometry.near_far import near_and_far
+from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, Space
+
+LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+DAMAGED = "damaged.ckpt"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What outlives the pictures: enough to render, and to place what is rendered in the user's frame."""
+
+    name: str
+    cameras: Cameras
+    near: Float[Tensor, "views"]
+    far: Float[Tensor, "views"]
+    aabb: Float[Tensor, "2 3"]
+    splits: dict[str, tuple[int, ...]]
+    view_names: tuple[str, ...]
+    background: Background
+    to_user: Float[Tensor, "4 4"]
+    space: Space = "bounded"
+
+    def near_and_far(self, eyes: Float[Tensor, "frames 3"]) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
+        """Return between which distances cameras that stand anywhere see the content (scene units)."""
+        if self.space != "bounded" or self.cameras.ndc is not None:
+            return self.near.min().expand(len(eyes)), self.far.max().expand(len(eyes))
+        return near_and_far(eyes, self.cameras.c2w[:, :, 3], self.aabb.mean(dim=0), self.near, self.far)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as read."""
+
+    path: Path
+    config: str
+    """The run's resolved config, yaml text from a stranger."""
+    choices: dict[str, str]
+    scene: SceneRecord
+    weights: dict[str, Tensor]
+    """The model's state dict."""
+    step: int
+    """Optimizer steps of the run."""
+    precision: str
+    tile_points: int | None
+    good: bool
+    """Saved while all was finite, and no step was being left out."""
+
+
+def scene_record(scene: Scene) -> SceneRecord:
+    """Return what outlives the pictures of a scene."""
+    return SceneRecord(**{field.name: getattr(scene, field.name) for field in fields(SceneRecord)})
+
+
+def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str, Any]:
+    """Return the part of a checkpoint that does not change during a run.
+
+    Raises:
+        InputError: the scene is one that no checkpoint could keep, which is better said before training than after.
+    """
+    kept = dict(vars(scene_record(scene)))
+    kept["cameras"] = dict(vars(scene.cameras))
+    try:
+        scene_format().require(kept, "scene", {})
+        require_possible_scene(kept, "The scene")
+    except Unfit as error:
+        raise InputError(
+            f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Mend the capture, or "
+            "the settings (scene.*, budgets.*)."
+        ) from error
+    return {"format": FORMAT, "version": __version__, "config": config, "choices": choices, "scene": kept}
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint onto the CPU.
+
+    Raises:
+        InputError: the file is missing, damaged, not a checkpoint of this program, or of another format.
+    """
+    path = Path(path)
+    content = read_content(path, resumable=False)
+    record, prefix = content[KEY], "model."
+    scene = record["scene"]
+    return Checkpoint(
+        path=path,
+        config=record["config"],
+        choices=record["choices"],
+        scene=SceneRecord(**scene | {"cameras": Cameras(**scene["cameras"])}),
+        weights={key[len(prefix) :]: value for key, value in content["state_dict"].items()},
+        step=content["global_step"],
+        precision=record["precision"],
+        tile_points=record["tile_points"],
+        good=record.get("bad_steps", [0, 0])[1] == 0,
+    )
+
+
+def read_content(path: Path, resumable: bool) -> dict[str, Any]:
+    """Return a checkpoint as it lies in its file, of which everything is as `format.checkpoint` says.
+
+    Args:
+        path: the file.
+        resumable: whether it must have what training goes on from.
+
+    Raises:
+        InputError: as `read_checkpoint`.
+    """
+    content = _load(path)
+    record = content.get(KEY)
+    if not isinstance(record, dict) or "state_dict" not in content:
+        raise InputError(
+            f"{path} is a file of PyTorch's, but not a checkpoint of nerf_lightning. "
+            "Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
+        )
+    written, version = record.get("format"), shown(record.get("version")).strip("'")
+    if type(written) is not int or written != FORMAT:
+        raise InputError(
+            f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
+            f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
+        )
+    try:
+        require_checkpoint(content, resumable)
+        require_possible_scene(record["scene"], str(path))
+    except Unfit as problem:
+        raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
+    return content
+
+
+def newest_checkpoint(folder: Path) -> Checkpoint | None:
+    """Read `last.ckpt`, or where it is damaged or missing `previous.ckpt`, and say so; None where nothing was saved.
+
+    Raises:
+        InputError: neither can be read.
+    """
+    last, previous = folder / LAST, folder / PREVIOUS
+    if not last.is_file() and not previous.is_file():
+        return None
+    try:
+        return read_checkpoint(last)
+    except InputError as error:
+        try:
+            found = read_checkpoint(previous)
+        except InputError:
+            raise error from None
+    reason = "is damaged" if last.exists() else "is missing"
+    log.warning("%s %s; the one before is used instead: %s, of step %d.", last, reason, previous, found.step)
+    return found
+
+
+def last_good_checkpoint(folder: Path) -> Path | None:
+    """Return the newest of a run's checkpoints that is whole and was saved while all was finite, if there is one."""
+    for path in (folder / LAST, folder / PREVIOUS):
+        with contextlib.suppress(InputError):
+            if read_checkpoint(path).good:
+                return path
+    return None
+
+
+def _load(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(
+            f"There is no checkpoint at {path}. A run keeps its checkpoints in RUN_FOLDER/checkpoints/; "
+            "look there for last.ckpt or best.ckpt."
+        )
+    try:
+        content = load_tensors(path)
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and nothing "
+            "from a file is executed. Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
+        ) from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"{path} cannot be read ({path.stat().st_size} bytes; damaged, cut off, empty, or not a checkpoint). "
+            f"{_instead_of(path)}"
+        ) from error
+    return content if isinstance(content, dict) else {}
+
+
+def _instead_of(path: Path) -> str:
+    """Return the advice to use another checkpoint, by name."""
+    others = [path.with_name(name) for name in (LAST, PREVIOUS, BEST) if name != path.name]
+    names = " or ".join(str(other) for other in others if other.is_file())
+    return f"Use another checkpoint of the run ({names})." if names else "The run has no other one: train again."

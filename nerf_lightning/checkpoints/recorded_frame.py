@@ -1,0 +1,45 @@
+"""A scene as the model of a checkpoint knows it: in the frame that the model was trained in."""
+
+from dataclasses import replace
+
+import torch
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
+from nerf_lightning.nerf.types.scene import Scene
+
+
+def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:
+    """Return the scene with its poses in the frame that a model was trained in.
+
+    The working frame of a capture follows from the views and the sizes that are read, so a scene that is read with
+    other settings (`scene.frames`, `scene.downscale`) has another one, and the model would be looked at from elsewhere.
+    Both frames know their way to the user's.
+
+    Raises:
+        InputError: the model was trained in another kind of space.
+    """
+    if scene.space != record.space:
+        raise InputError(
+            f"The scene {scene.name} was read with space={scene.space}, but the checkpoint was trained on "
+            f"{record.name} with space={record.space}. Give scene.space={record.space}."
+        )
+    if record.cameras.ndc is not None:
+        views = len(scene.view_names)
+        ndc, far = record.cameras.ndc[:1].expand(views, 2), record.far.max().expand(views)
+        scene = replace(scene, cameras=replace(scene.cameras, ndc=ndc), far=far)
+    if torch.equal(scene.to_user, record.to_user):
+        return scene
+    # The model's frame as this scene's sees it: theirs to the user's, and the user's to this one.
+    apart = torch.linalg.inv(scene.to_user.double()) @ record.to_user.double()
+    ratio = 1.0 if record.cameras.ndc is not None else 1.0 / unit_of(apart)
+    return replace(
+        scene,
+        cameras=replace(scene.cameras, c2w=poses_from_user(scene.cameras.c2w.double(), apart).float()),
+        near=ratio * scene.near,
+        far=ratio * scene.far,
+        aabb=record.aabb,
+        points=points_from_user(scene.points.double(), apart).float(),
+        to_user=record.to_user,
+    )

@@ -1,0 +1,78 @@
+"""Checkpoint files that are whole at every moment: a crash leaves the old one or the new one, never half of one."""
+
+import contextlib
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
+from nerf_lightning.errors import InputError
+
+
+def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
+    """Write to a temporary file in the same folder, force it to the disk, then rename.
+
+    `last.ckpt` becomes `previous.ckpt` before the new one takes its name. Lightning's own way goes through the system's
+    temporary folder, and a move across file systems is not atomic.
+
+    Raises:
+        InputError: the disk is full or the folder cannot be written; the former checkpoint is as it was.
+    """
+    part = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
+        with part.open("wb") as file:
+            torch.save(checkpoint, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if target.name == LAST and target.exists():
+            _keep(target, target.with_name(PREVIOUS))
+        os.replace(part, target)
+        _sync_folder(target.parent)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, (OSError, RuntimeError)):
+            raise _cannot_save(target, error) from error
+        raise
+
+
+def sweep_leftovers(folder: Path) -> None:
+    """Remove the temporary files that a killed process left in a checkpoint folder."""
+    for leftover in folder.glob(".*.ckpt.*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
+def _keep(last: Path, previous: Path) -> None:
+    """Give a checkpoint a second name, so that it has one at every moment; `previous` is replaced."""
+    previous.unlink(missing_ok=True)
+    try:
+        os.link(last, previous)
+    except OSError:
+        # A file system without links. A crash right now leaves `previous` alone, which readers take then.
+        os.replace(last, previous)
+
+
+def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
+    if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
+        error = error.__context__  # torch closes what it could not write, and complains of that
+    kept = f"The former checkpoint {target} is unharmed. " if target.exists() else ""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    cure = "Free some space" if full else f"See that there is space and that {target.parent} can be written"
+    return InputError(
+        f"The checkpoint {target} could not be saved: {error}. {kept}{cure}, "
+        f"then go on with resume={target.parent.parent}."
+    )
+
+
+def _sync_folder(folder: Path) -> None:
+    # A rename is safe against a power cut only once the folder is on the disk; Windows cannot open folders.
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

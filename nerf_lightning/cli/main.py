@@ -1,0 +1,159 @@
+"""The console command: `nerf COMMAND ...` hands its arguments to one Hydra application per command.
+
+Nothing heavy is imported here, so that `nerf --help` answers at once.
+"""
+
+import ast
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerf_lightning.budgets import Budgets, allow, allow_as_typed
+from nerf_lightning.cli.broken_pipe import ends_quietly
+from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.files.folders import conf_folder
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+PACKAGE = Path(__file__).parents[1]
+USAGE_ERROR = 2
+MOST_LETTERS = 5000
+
+
+def main() -> None:
+    """Run the command line."""
+    with explained("COMMAND"):
+        _answer(sys.argv[1:])
+
+
+def _answer(arguments: list[str]) -> None:
+    commands = find_commands()
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_help(commands))
+        return
+    if arguments[0] in ("-V", "--version"):
+        from nerf_lightning import __version__
+
+        print(__version__)
+        return
+    if arguments[0] not in commands:
+        _complain(f"There is no command '{arguments[0]}'.{_near(arguments[0], list(commands))} See nerf --help.")
+    _run(arguments[0], arguments[1:])
+
+
+def find_commands() -> dict[str, str]:
+    """Return each command with its one-line description: a file in commands/ that has a yaml of its name in conf/."""
+    files = sorted((PACKAGE / "commands").glob("*.py"))
+    return {file.stem: _summary(file) for file in files if (conf_folder() / f"{file.stem}.yaml").is_file()}
+
+
+def _summary(file: Path) -> str:
+    # Read, not imported: an import would cost seconds.
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    return docstring.partition("\n")[0]
+
+
+def _help(commands: dict[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in commands.items()]
+    return "\n".join(
+        [
+            "nerf: learn a radiance field from photographs with known cameras, and render new views.",
+            "",
+            "usage: nerf COMMAND [-m] [key=value ...]",
+            "",
+            *lines,
+            "",
+            "nerf COMMAND --help lists the groups, the settings and examples of a command.",
+            "python -m nerf_lightning is the same.",
+        ]
+    )
+
+
+def _run(command: str, arguments: list[str]) -> None:
+    """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
+    # Read by GNU's OpenMP when torch is loaded.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    # Hydra would print its own short traceback and exit with 1; we want the exceptions.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    def task(config: "DictConfig") -> Any:
+        # torch and Lightning take seconds, and --help needs neither.
+        with quick_imports():
+            module = importlib.import_module(f"nerf_lightning.commands.{command}")
+        # A job of a sweep may be in another process than the command line was read in.
+        allow(Budgets(**config.budgets))
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            from nerf_lightning.runs.sweep_job import run_job
+
+            return run_job(ends_quietly()(module.run), config, command)
+        # Caught inside the job as well: Hydra would print the overrides first.
+        with explained(command):
+            _require_sections(config, command)
+            return module.run(config)
+
+    with explained(command):
+        from nerf_lightning.cli.arguments import options_first
+
+        arguments = options_first(arguments)
+        allow_as_typed(arguments)
+        sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
+        run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
+        if is_sweep(arguments):
+            from nerf_lightning.runs.sweep import watched
+
+            watched(run)
+        else:
+            run()
+
+
+def _require_sections(config: "DictConfig", command: str) -> None:
+    from omegaconf import OmegaConf
+
+    from nerf_lightning.config.instantiate import require_sections
+
+    require_sections(config, OmegaConf.load(conf_folder() / f"{command}.yaml"))  # type: ignore[arg-type]
+
+
+@contextmanager
+def explained(command: str) -> Iterator[None]:
+    """Turn bad input into one paragraph and exit code 2; end quietly where nobody reads what is printed."""
+    try:
+        with ends_quietly():
+            yield
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        from nerf_lightning.config.messages import paragraph
+
+        message = paragraph(error, command, conf_folder())
+        if message is None:
+            raise
+        _complain(message)
+
+
+def _near(word: str, known: list[str]) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(word, known, n=3)
+    return f" Did you mean {' or '.join(close)}?" if close else ""
+
+
+def _complain(message: str) -> None:
+    # Names from files may hold anything: no escape sequence of theirs reaches the terminal, no line looks like ours.
+    # Libraries say some things in several lines.
+    shown = for_terminal(message[:MOST_LETTERS].replace("\n", " "))
+    print(f"nerf: {shown}{'...' if len(message) > MOST_LETTERS else ''}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)

@@ -1,0 +1,111 @@
+"""What a command adds to its arguments before Hydra composes them: what a run or a checkpoint remembers.
+
+Everything heavy is imported late: `--help` needs none of it.
+"""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from nerf_lightning.cli.bare_paths import named_paths
+from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.errors import InputError
+from nerf_lightning.slurm import was_requeued
+
+log = logging.getLogger(__name__)
+
+
+def prepared(command: str, arguments: list[str]) -> list[str]:
+    """Return a command's arguments with what belongs before them; the user's own come last, and win.
+
+    Raises:
+        InputError: what they name cannot be read, or a sweep would begin where one has been.
+    """
+    prepare = PREPARED.get(command)
+    return arguments if prepare is None else prepare(arguments)
+
+
+def _train(arguments: list[str]) -> list[str]:
+    """Repeat the overrides that a run was started with where it is resumed by name."""
+    _refuse_second_sweep(arguments)
+    resumed = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
+    if not resumed or resumed[-1] in ("auto", "null"):
+        return arguments
+    path = Path(resumed[-1].strip("'\""))
+    folder = path.parent.parent if path.suffix == ".ckpt" else path
+    from nerf_lightning.runs.saved_overrides import former_overrides
+
+    return [*former_overrides(folder, arguments), *arguments]
+
+
+def _refuse_second_sweep(arguments: list[str]) -> None:
+    values = dict(argument.partition("=")[::2] for argument in arguments)
+    folder = Path(values.get("hydra.sweep.dir", "").strip("'\""))
+    goes_on = values.get("sweep.resume", "").lower() == "true" or was_requeued()
+    if "hydra.sweep.dir" in values and not goes_on and next(folder.glob("*/run.json"), None) is not None:
+        raise InputError(
+            f"{folder} already holds runs of a sweep. Add sweep.resume=true to go on with it or to add to it, or give "
+            "another folder with paths.output_dir=DIR."
+        )
+
+
+def _eval(arguments: list[str]) -> list[str]:
+    """Name the run's own scene where the user names none, so that the checkpoint is enough.
+
+    The scene's class comes from our conf/, by the name that the checkpoint recorded; only plain values (paths, sizes,
+    background) are taken from the file.
+    """
+    given = [argument.partition("=") for argument in arguments]
+    checkpoints = [value for key, _, value in given if key == "ckpt"]
+    if not checkpoints or any(key in ("scene", "--help") for key, _, _ in given):
+        return arguments
+    if "," in checkpoints[-1]:
+        raise InputError("A sweep over checkpoints needs the scene by name: add scene=... and its settings.")
+    with quick_imports():
+        from nerf_lightning.config.scene_overrides import scene_overrides
+
+    return [*scene_overrides(checkpoints[-1]), *arguments]
+
+
+def _view(arguments: list[str]) -> list[str]:
+    """Name the run's own scene as for `eval`; without it, cameras are shown without photographs, unless wished for."""
+    try:
+        return _eval(arguments)
+    except InputError as error:
+        from nerf_lightning.config.scene_overrides import UnknownScene
+
+        wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
+        if not isinstance(error, UnknownScene) or "true" in map(str.lower, wished[-1:]):
+            raise
+        if not wished:
+            log.warning("The cameras are shown without their photographs: %s", error)
+        return ["photographs=false", *arguments]
+
+
+def _table(arguments: list[str]) -> list[str]:
+    """Take paths that stand alone for the runs."""
+    return named_paths(arguments, "runs", several=True)
+
+
+def _report(arguments: list[str]) -> list[str]:
+    """Take a path that stands alone for the run, and name the run's own scene where the user names none."""
+    arguments = named_paths(arguments, "run", several=False)
+    given = dict(argument.partition("=")[::2] for argument in arguments)
+    if "run" not in given or "scene" in given or given.get("doctor", "").lower() == "false":
+        return arguments
+    from nerf_lightning.config.scene_overrides import scene_overrides
+
+    try:
+        recorded = scene_overrides(str(Path(given["run"].strip("'\"")) / "checkpoints" / "last.ckpt"))
+    except InputError:
+        return arguments  # the page says so
+    return [*recorded, *arguments]
+
+
+PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
+    "train": _train,
+    "eval": _eval,
+    "view": _view,
+    "table": _table,
+    "report": _report,
+}

@@ -1,0 +1,120 @@
+"""The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
+
+if TYPE_CHECKING:
+    from nerf_lightning.runs.sweep_record import SweepRecord
+
+FLAGS = ("-m", "--multirun")
+FOLDER_KEYS = ("paths.output_dir", "hydra.sweep.dir")
+
+
+def is_sweep(arguments: list[str]) -> bool:
+    """Tell whether the arguments ask for many runs."""
+    return bool(set(FLAGS) & set(arguments))
+
+
+def sweep_arguments(arguments: list[str]) -> list[str]:
+    """Return the arguments of a sweep with its folders named; those of a single run come back as they are.
+
+    `paths.output_dir` names the folder of the whole sweep, and each job's folder says the values that are swept.
+    With `sweep.resume=true` what the sweep was started with comes first.
+
+    Raises:
+        InputError: it is not said which sweep to go on with, or its folder holds what is not taken from files.
+
+    >>> sweep_arguments(["-m", "seed=0,1", "paths.output_dir=out"])
+    ['-m', 'seed=0,1', 'hydra.sweep.dir=out', "hydra.sweep.subdir='${hydra.job.num}_seed=${seed}'"]
+    """
+    resuming = (_value(arguments, "sweep.resume") or "").lower() == "true"
+    if not is_sweep(arguments):
+        if resuming:
+            raise InputError("sweep.resume=true goes on with a sweep: add -m. A single run goes on with resume=auto.")
+        return arguments
+    from nerf_lightning.runs.sweep_record import JOB_NUMBER
+
+    # Hydra reads -m only before the overrides.
+    arguments = ["-m", *_with_former([word for word in arguments if word not in FLAGS], resuming)]
+    renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
+    if any(argument.startswith("hydra.sweep.subdir=") for argument in arguments):
+        return renamed
+    parts = [JOB_NUMBER, *(f"{key}={_current_value(key)}" for key in _swept(arguments))]
+    return [*renamed, f"hydra.sweep.subdir='{'_'.join(parts)}'"]
+
+
+def _with_former(arguments: list[str], resuming: bool) -> list[str]:
+    """Put what the sweep was started with before the user's own."""
+    from nerf_lightning.files.links import require_no_way_out
+    from nerf_lightning.slurm import was_requeued
+
+    folder = _value(arguments, *FOLDER_KEYS)
+    if folder is None and was_requeued() and not resuming:
+        found = _folder_of_this_slurm_job(arguments)
+        folder = None if found is None else str(found)
+        arguments = arguments if found is None else [*arguments, f"paths.output_dir='{found}'"]
+    if folder is not None:
+        require_no_way_out(Path(folder))
+    return _resumed(arguments, folder) if resuming else arguments
+
+
+def _resumed(arguments: list[str], folder: str | None) -> list[str]:
+    from nerf_lightning.runs.saved_overrides import former_sweep
+
+    if folder is None:
+        newest = next((str(folder) for folder, _ in _sweeps(arguments)), "DIR")
+        raise InputError(
+            "sweep.resume=true needs the folder of the sweep that it goes on with. Add paths.output_dir=DIR; the "
+            f"newest is paths.output_dir={newest}."
+        )
+    former = former_sweep(Path(folder), arguments)
+    if not former and not _swept(arguments):
+        raise InputError(
+            f"sweep.resume=true: {folder} holds no sweep (no .hydra/sweep.yaml). Give the folder of one, or the whole "
+            "command with the values that are swept to begin one there."
+        )
+    return [*former, *arguments]
+
+
+def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
+    from nerf_lightning.slurm import slurm_job
+
+    asked = {argument for argument in arguments if not argument.startswith("-")}
+    same = (f for f, record in _sweeps(arguments) if record.slurm_job == slurm_job() and set(record.typed()) == asked)
+    return next(same, None)
+
+
+def _sweeps(arguments: list[str]) -> Iterator[tuple[Path, "SweepRecord"]]:
+    """Yield the folders of former sweeps, the newest first, each with its record; damaged ones are left out."""
+    from nerf_lightning.runs.sweep_record import read_sweep
+
+    root = Path(_value(arguments, "paths.root_dir") or "outputs") / "sweeps"
+    records = root.glob("*/.hydra/sweep.yaml")
+    for file in sorted(records, key=lambda file: file.stat().st_mtime, reverse=True):
+        with suppress(InputError):
+            record = read_sweep(file.parent.parent)
+            if record is not None:
+                yield file.parent.parent, record
+
+
+def _value(arguments: list[str], *keys: str) -> str | None:
+    pairs = [argument.partition("=") for argument in arguments]
+    values = [value.strip("'\"") for key, _, value in pairs if key in keys]
+    return values[-1] if values else None
+
+
+def _swept(arguments: list[str]) -> list[str]:
+    pairs = [argument.partition("=") for argument in arguments]
+    return [
+        key for key, _, values in pairs if ("," in values or "(" in values) and not set("/[{@~+") & set(key + values)
+    ]
+
+
+def _current_value(key: str) -> str:
+    is_group = (conf_folder() / key).is_dir()
+    return f"${{hydra.runtime.choices.{key}}}" if is_group else f"${{{key}}}"

@@ -1,0 +1,46 @@
+"""One of several processes that `nerf` has started: `python -m nerf_lightning.cli.worker COMMAND FOLDER`.
+
+The folder holds the config that the first process composed, and Hydra's; the command line is not repeated.
+"""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+from nerf_lightning.budgets import Budgets, allow
+from nerf_lightning.cli.main import explained
+
+
+def main() -> None:
+    """Join the other workers and run the command."""
+    command, folder = sys.argv[1], Path(sys.argv[2])
+    with explained(command):
+        _run(command, folder)
+
+
+def _run(command: str, folder: Path) -> None:
+    from hydra.conf import HydraConf
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.core.utils import configure_log, setup_globals
+    from omegaconf import OmegaConf
+
+    from nerf_lightning import ranks
+    from nerf_lightning.training.launch.devices import choose_device
+    from nerf_lightning.training.launch.processes import joined
+
+    setup_globals()
+    config = OmegaConf.load(folder / "config.yaml")
+    allow(Budgets(**config.budgets))
+    hydra = OmegaConf.merge(OmegaConf.structured(HydraConf), OmegaConf.load(folder / "hydra.yaml"))
+    HydraConfig.instance().set_config(OmegaConf.create({"hydra": hydra}))
+    configure_log(hydra.job_logging)
+    module = importlib.import_module(f"nerf_lightning.commands.{command}")
+    with joined(choose_device(config.trainer.accelerator)[0]):
+        result = module.run(config)
+        if ranks.is_first():
+            (folder / "result.json").write_text(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""The constructor's signature is the schema: values of the wrong kind are named before anything is built."""
+
+import inspect
+import types
+from typing import Any, Literal, Union, get_args, get_origin
+
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.errors import InputError
+
+OURS = "nerf_lightning."
+PLAIN = (bool, int, float, str, type(None))
+
+
+def require_fitting_values(node: Any, path: str = "") -> None:
+    """Hold a config against the signatures of the classes that it names, nested ones included.
+
+    Raises:
+        InputError: a number, word or switch where the signature wants another.
+    """
+    if OmegaConf.is_config(node):
+        node = OmegaConf.to_container(node, resolve=True)
+    if isinstance(node, list):
+        for index, child in enumerate(node):
+            require_fitting_values(child, f"{path}[{index}]")
+    elif isinstance(node, dict):
+        parameters = _parameters(node.get("_target_"))
+        for key, value in node.items():
+            here = f"{path}.{key}" if path else str(key)
+            if key in parameters:
+                _require(value, parameters[key].annotation, here)
+            require_fitting_values(value, here)
+
+
+def required_path(key: str, value: object) -> str:
+    """Return a setting that names a file or folder.
+
+    Raises:
+        InputError: it is no text.
+    """
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{key}={value} does not fit: it must be a path.")
+    return value
+
+
+def require_sections(config: DictConfig, primary: DictConfig) -> None:
+    """Refuse a word or number in the place of a whole section of settings.
+
+    Args:
+        config: as composed.
+        primary: the command's own yaml, whose sections are meant.
+
+    Raises:
+        InputError: with the first of them.
+    """
+    sections = OmegaConf.to_container(primary, resolve=False)
+    assert isinstance(sections, dict)
+    for key, section in ((str(key), section) for key, section in sections.items()):
+        if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
+            raise InputError(
+                f"{key}={config[key]} does not fit: it holds settings, such as {key}.{next(iter(section))}=VALUE."
+            )
+
+
+def _parameters(target: object) -> dict[str, inspect.Parameter]:
+    # Only our own: other people's annotations promise less.
+    if not isinstance(target, str) or not target.startswith(OURS):
+        return {}
+    return dict(inspect.signature(get_object(target)).parameters)
+
+
+def _require(value: Any, annotation: Any, path: str) -> None:
+    options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
+    known = [option for option in options if option in PLAIN or get_origin(option) is Literal]
+    ours = [option for option in options if inspect.isclass(option) and option.__module__.startswith(OURS)]
+    if ours and len(known) + len(ours) == len(options) and not isinstance(value, dict):
+        if any(_fits(value, option) for option in known):
+            return
+        shown = str(value)[:80]
+        raise InputError(f"{path}={shown} does not fit: it must be a {ours[0].__name__}, chosen by its group.")
+    if len(known) < len(options) or any(_fits(value, option) for option in options):
+        return
+    raise InputError(f"{path}={value} does not fit: it must be {' or '.join(map(_words, options))}.")
+
+
+def _fits(value: Any, option: Any) -> bool:
+    if get_origin(option) is Literal:
+        return value in get_args(option)
+    if option is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if option is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, option)
+
+
+def _words(option: Any) -> str:
+    if get_origin(option) is Literal:
+        return ", ".join(str(choice) for choice in get_args(option))
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
+    return names[option]
+
+
+def build(node: DictConfig) -> Any:
+    """Build one node of the user's own config.
+
+    Raises:
+        InputError: a value of the wrong kind.
+    """
+    require_fitting_values(node, node._get_full_key(None))
+    return instantiate(node, _convert_="all")

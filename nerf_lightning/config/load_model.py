@@ -1,0 +1,117 @@
+"""Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
+
+import math
+from typing import Any
+
+import torch
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+
+from nerf_lightning.budgets import allowed, require_within
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.trusted_classes import require_trusted
+from nerf_lightning.config.instantiate import require_fitting_values
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.yaml_files import plain_yaml
+from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.base import AnySampler
+
+SPARE_NUMBERS = 1 << 24
+"""What a model may hold beside its weights."""
+
+
+def load_model(checkpoint: Checkpoint) -> RadianceModel:
+    """Build the model that a checkpoint describes, with its weights, in evaluation mode.
+
+    The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
+    defined in our own rooms and follow one of our contracts are built.
+
+    Raises:
+        InputError: the config names anything else, or the weights do not fit.
+    """
+    config = plain_yaml(checkpoint.config, f"The config in {checkpoint.path}")
+    if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
+        raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part. Use another one.")
+    config = config["model"]
+    require_trusted(config, str(checkpoint.path))
+    # First without memory: sizes from a stranger must be those of the weights beside them.
+    with torch.device("meta"):
+        shapes = _built(config, checkpoint)
+    _require_fitting(shapes, checkpoint)
+    model = _built(config, checkpoint)
+    load_weights(model, checkpoint)
+    hold_to_budgets(model, f"The model of {checkpoint.path}")
+    require_within("layer_width", _widest(model), f"The model of {checkpoint.path}", "features of one point in a layer")
+    return model.eval()
+
+
+def hold_to_budgets(model: RadianceModel, where: str) -> None:
+    """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
+
+    Args:
+        model: the model.
+        where: it comes from, for the message.
+
+    Raises:
+        InputError: it has no level, or more samples than `budgets.samples_per_ray`.
+    """
+    for part in model.modules():
+        if isinstance(part, AnySampler):
+            part.max_intervals = allowed().intervals
+    if not model.levels:
+        raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
+    require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
+
+
+def _widest(model: RadianceModel) -> int:
+    """Return how many features of a point there are at most, in any layer or at the end of any encoder."""
+    sides = [max(matrix.shape) for matrix in matrices_of(model)]
+    encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
+    return max([*sides, *encoded], default=0)
+
+
+def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
+    try:
+        require_fitting_values(config, "model")
+        model = instantiate(config, _convert_="all")
+    except HydraException as error:
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise InputError(f"{checkpoint.path}: its model part cannot be built: {reason}. Use another one.") from error
+    if not isinstance(model, RadianceModel):
+        raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
+    return model
+
+
+def _require_fitting(model: RadianceModel, checkpoint: Checkpoint) -> None:
+    """Refuse a model that would take much more memory than its weights do."""
+    asked = sum(tensor.numel() for tensor in (*model.parameters(), *model.buffers()))
+    held = sum(tensor.numel() for tensor in checkpoint.weights.values())
+    if asked > held + SPARE_NUMBERS:
+        raise InputError(
+            f"{checkpoint.path} is damaged: its config describes a model of {asked:,} numbers, and its weights are "
+            f"{held:,}. Use another checkpoint."
+        )
+
+
+def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
+    """Put a checkpoint's weights into a model.
+
+    Raises:
+        InputError: the model has another shape than the checkpoint's.
+    """
+    known = model.state_dict()
+    other = [name for name, tensor in checkpoint.weights.items() if name in known and tensor.dtype != known[name].dtype]
+    if other:
+        raise InputError(
+            f"{checkpoint.path} is damaged: its {other[0]} holds {checkpoint.weights[other[0]].dtype}, and the model "
+            f"{known[other[0]].dtype}. Use another checkpoint."
+        )
+    try:
+        model.load_state_dict(checkpoint.weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:400]
+        raise InputError(
+            f"The weights of {checkpoint.path} do not fit this model: {reason}. Give the model, field and encoder "
+            "settings that they were trained with (.hydra/overrides.yaml of that run)."
+        ) from error

@@ -1,0 +1,123 @@
+"""Hydra's and OmegaConf's errors as one paragraph, with near matches for a mistyped key."""
+
+import difflib
+import os
+import re
+from pathlib import Path
+from traceback import extract_tb
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, InstantiationException
+from hydra.initialize import initialize_config_dir
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from nerf_lightning.config.overrides import flatten, to_type
+from nerf_lightning.errors import InputError
+
+OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
+"""How Hydra's complaints about its own options begin: plain ValueErrors."""
+
+
+def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | None:
+    """Return what a person is told of an error that bad input causes, or None for any other."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return _missing_plugin(str(error)) or explain(error, command, conf_folder)
+    if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
+        return str(error)
+    if isinstance(error, (ValueError, TypeError)) and _while_choosing(error):
+        return (
+            f"A group was given something else than the name of one of its options: {error}. nerf {command} --help "
+            "lists the groups and what they offer."
+        )
+    if isinstance(error, RuntimeError) and _is_out_of_memory(error):
+        reason = " ".join(str(error).split()).partition(". ")[0]
+        return (
+            f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
+            "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."
+        )
+    if isinstance(error, OSError):
+        # What is closed because of bad input may fail for the same cause, and be raised in the place of it.
+        cause = next((link for link in _chain(error) if isinstance(link, InputError)), None)
+        if cause is not None:
+            return str(cause)
+        where = f"{os.fsdecode(error.filename)}: " if error.filename else ""
+        return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
+    return None
+
+
+def _while_choosing(error: BaseException) -> bool:
+    # Hydra looks at what groups are given without asking first whether it is text.
+    return any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
+
+
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    # Imported late: it brings torch, which a config is composed without.
+    from nerf_lightning.nerf.models.tiles import is_out_of_memory
+
+    return is_out_of_memory(error)
+
+
+def _missing_plugin(message: str) -> str | None:
+    # Packages that are installed have told Hydra their names.
+    unknown = re.search(r"'hydra/(launcher|sweeper)/(joblib|submitit|optuna)(_local|_slurm)?'", message)
+    if unknown is None:
+        return None
+    kind, name = unknown.groups()[:2]
+    extra = "slurm" if name == "submitit" else "sweep"
+    return f"This {kind} needs {name}, which is not installed: pip install 'nerf-lightning[{extra}]'."
+
+
+def explain(error: BaseException, command: str, conf_folder: Path) -> str:
+    """Return what to tell the user about a bad override, an unknown name or a missing value."""
+    chain = list(_chain(error))
+    for link in chain:
+        if isinstance(link, InputError):
+            return str(link)
+        if isinstance(link, MissingMandatoryValue):
+            key = getattr(link, "full_key", None) or str(link)
+            return f"{key} has no value. Give one on the command line: {key}=VALUE."
+    if isinstance(error, InstantiationException):
+        where = re.search(r"full_key: (\S+)", str(error))
+        reason = str(chain[-1]).splitlines()[0]
+        return f"{where.group(1) if where else 'The config'} cannot be built: {reason}. See nerf {command} --help."
+    message = " ".join(str(error).split())
+    unread = re.match(r"LexerNoViableAltException: ([^=\s]+)=(.*) \^ See https", message)
+    unread = unread or re.match(r"Error parsing override '([^=\s]+)=(.*)' HydraException while evaluating", message)
+    if unread:
+        key, value = unread.groups()
+        return (
+            f"{key}={value} cannot be read: spaces, brackets and other special characters need quotes for Hydra and "
+            f"for the shell. Type {to_type(key, value)}."
+        )
+    key = _mistyped_key([str(link) for link in chain])
+    close = difflib.get_close_matches(key, _known_keys(command, conf_folder), n=3, cutoff=0.6) if key else []
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
+    return f"{message}{hint} nerf {command} --help lists the groups, --cfg job the settings."
+
+
+def _chain(error: BaseException | None) -> list[BaseException]:
+    links: list[BaseException] = []
+    while error is not None and error not in links:  # one that is raised again may follow from itself
+        links.append(error)
+        error = error.__cause__ or error.__context__
+    return links
+
+
+def _mistyped_key(messages: list[str]) -> str | None:
+    for pattern in (r"full_key: (\S+)", r"Could not override '([^']+)'", r"Could not find '([^']+)'"):
+        for message in messages:
+            if found := re.search(pattern, message):
+                return found.group(1)
+    return None
+
+
+def _known_keys(command: str, conf_folder: Path) -> list[str]:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(conf_folder), version_base="1.3"):
+        config = compose(command)
+    return list(flatten(config)) + [
+        f"{group.name}/{option.stem}" for group in conf_folder.iterdir() for option in group.glob("*.yaml")
+    ]

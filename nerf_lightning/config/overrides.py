@@ -1,0 +1,61 @@
+"""Values as they are written on the command line, for Hydra and for the shell."""
+
+import re
+import shlex
+from typing import Any
+
+from hydra.core.override_parser.types import Quote, QuotedString
+from omegaconf import DictConfig, OmegaConf
+
+# What Hydra takes without quotes wherever it stands.
+PLAIN = re.compile(r"[\w./:@%+-]+", re.ASCII)
+
+
+def quoted(value: Any) -> str:
+    """Return a plain value as Hydra reads it back.
+
+    >>> quoted("it's"), quoted(None), quoted(True)
+    ("'it\\\\'s'", 'null', 'true')
+    """
+    if value is None:
+        return "null"
+    if isinstance(value, str):
+        # OmegaConf takes ${ for an interpolation, and backslashes before it for escapes; elsewhere they are plain.
+        text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+        return QuotedString(text=text, quote=Quote.single).with_quotes()
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def to_type(key: str, text: str) -> str:
+    """Return an override as a person types it in a shell, with quotes where the shell or Hydra needs them.
+
+    >>> to_type("scene.root", "data/fox")
+    'scene.root=data/fox'
+    >>> to_type("scene.root", "my fox (1)")
+    '"scene.root=\\'my fox (1)\\'"'
+    """
+    override = f"{key}={text if PLAIN.fullmatch(text) else quoted(text)}"
+    # Where single quotes are in it, double ones around it are easier to read than what shlex makes.
+    if "'" in override and not re.search(r'["$`\\!]', override):
+        return f'"{override}"'
+    return shlex.quote(override)
+
+
+def flatten(config: DictConfig) -> dict[str, object]:
+    """Return the leaves of a config by their dotted keys; interpolations stay text.
+
+    >>> flatten(OmegaConf.create({"a": {"b": 1}, "c": [2]}))
+    {'a.b': 1, 'c': [2]}
+    """
+    plain = OmegaConf.to_container(config, resolve=False)
+    leaves: dict[str, object] = {}
+
+    def visit(node: object, path: str) -> None:
+        if isinstance(node, dict) and node:
+            for key, value in node.items():
+                visit(value, f"{path}.{key}" if path else str(key))
+        else:
+            leaves[path] = node
+
+    visit(plain, "")
+    return leaves

@@ -1,0 +1,63 @@
+"""What a person sees in the terminal: lines on stdout, progress bars on stderr."""
+
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn
+
+from nerf_lightning import ranks
+from nerf_lightning.escaping import for_terminal
+
+
+def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
+    """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
+    console = Console(stderr=True)
+    shown = shown and console.is_terminal and ranks.is_first()
+    return Progress(*columns, console=console, transient=True, disable=not shown)
+
+
+class StageProgress:
+    """One bar over stages of unequal cost, with the time left; one stage at a time goes from 0 to 1.
+
+    Args:
+        costs: each stage's expected cost in any one unit, in the order of the stages.
+    """
+
+    def __init__(self, costs: Mapping[str, float]):
+        self.costs = dict(costs)
+        columns = ("{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        self.bar = progress_bar(*columns)
+        self.task = self.bar.add_task(next(iter(costs)), total=sum(costs.values()))
+
+    def __enter__(self) -> "StageProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.stop()
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Say that `stage` is done to this fraction, and all before it wholly."""
+        names = list(self.costs)
+        before = sum(self.costs[name] for name in names[: names.index(stage)])
+        self.bar.update(self.task, description=stage, completed=before + min(fraction, 1.0) * self.costs[stage])
+
+
+def say(*lines: str) -> None:
+    """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
+    print("\n".join(map(for_terminal, lines)), flush=True)
+
+
+class StdoutConsole(Console):
+    """A console on stdout. Where that is a closed pipe, rich would exit with 1; closed_pipe.py decides here."""
+
+    def on_broken_pipe(self) -> None:
+        """Pass on the error that is being handled."""
+        raise
+
+
+def stderr_console() -> Console:
+    """Return a console on stderr, silent where that is not a terminal, and in all processes of a run but the first."""
+    console = Console(stderr=True)
+    console.quiet = not (console.is_terminal and ranks.is_first())
+    return console

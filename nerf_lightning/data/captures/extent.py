@@ -1,0 +1,250 @@
+"""The working frame of a capture, and where along its rays content may lie."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.checks import FARTHEST
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.boxes import center_and_half
+from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.frames import (
+    LARGEST_UNIT,
+    LEAST_UNIT,
+    average_pose,
+    focus_point,
+    points_from_user,
+    poses_from_user,
+    similarity,
+    unit_of,
+    up_direction,
+    upright_rotation,
+)
+from nerf_lightning.nerf.types.scene import Cameras, Space
+
+# The near plane lies at this share of the least depth (LLFF's bound factor).
+NEAR_SHARE = 0.75
+# Sparse points beyond these quantiles of the depths in a picture are taken for mistakes; fewer points tell nothing.
+QUANTILES, FEWEST_POINTS = (0.01, 0.99), 20
+# Of more sparse points an even part is looked at in each view.
+MOST_POINTS = 20_000
+# Of those quantiles: content may begin before the nearest point, and go on behind the farthest.
+NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
+# Room around the sparse points on each side of their box, as a share of it.
+BOX_MARGIN = 0.1
+# Without sparse points, in units of the farthest camera's distance from the middle.
+NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
+# Cameras that stand closer together than this share of their coordinates stand at one place.
+ONE_PLACE = 1e-6
+# Of the cube that the ball of the cameras just holds.
+UNIT_BALL_HALF = 3**-0.5
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where content may lie."""
+
+    to_user: Float[Tensor, "4 4"]
+    """The working frame, float64."""
+    near: Float[Tensor, "views"]
+    far: Float[Tensor, "views"]
+    aabb: Float[Tensor, "2 3"]
+    ndc: Float[Tensor, "views 2"] | None
+
+
+def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | None, far: float | None) -> Extent:
+    """Return the frame and the extent that suit a space.
+
+    Args:
+        capture: in the user's frame, as are `cameras`.
+        cameras: at the size of the pixels.
+        space: which one.
+        near: in the user's units, where the user knows better.
+        far: likewise.
+
+    Raises:
+        InputError: all cameras stand at one place, near and far leave nothing, or the space does not suit the cameras.
+    """
+    _check_places(capture, cameras)
+    if space == "ndc":
+        return _forward_facing(capture, cameras, near, far)
+    focus = focus_point(cameras.c2w)
+    # The farthest camera stands at distance 1.
+    unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max())
+    to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)
+    nearest, farthest = _from_points(capture, cameras, to_user)
+    aabb = _cube(UNIT_BALL_HALF)
+    if space == "bounded":
+        aabb = _box(capture, cameras, to_user)
+        nearest, farthest = _around_box(cameras, to_user, aabb, nearest)
+    if near is not None:
+        nearest = torch.full_like(nearest, near / unit)
+    if far is not None:
+        farthest = torch.full_like(farthest, far / unit)
+    # What was found yields to what the user says.
+    nearest = nearest if near is not None else torch.minimum(nearest, 0.5 * farthest)
+    if near is not None and not bool((nearest < farthest).all()):
+        raise InputError(
+            f"scene.near={near:g} lies behind all content of {capture.source}, which ends at "
+            f"{float(farthest.min()) * unit:.4g} in the capture's units. Give a smaller one, or scene.far too."
+        )
+    return Extent(to_user, nearest.float(), farthest.float(), aabb, None)
+
+
+def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Capture) -> None:
+    """Refuse an extent that no checkpoint could keep: it follows from numbers of the capture that are mistakes.
+
+    Args:
+        extent: in the working frame.
+        to_user: from there to the frame that the capture's maker knows.
+        capture: where they come from.
+
+    Raises:
+        InputError: content reaches beyond all digits, its box has no inside, or the frame's unit is none.
+    """
+    reach = torch.cat([extent.near, extent.far, extent.aabb.flatten()]).abs().max()
+    if not float(reach) <= FARTHEST:  # NaN, too
+        raise InputError(
+            f"{capture.source}: the content (its depths, its sparse points or its box) would reach {float(reach):g} "
+            "times the cameras' distance from the middle, which is a mistake of the reconstruction. Find and remove "
+            "what lies so far away, or export the capture again."
+        )
+    if not bool((extent.aabb[0] < extent.aabb[1]).all() and (extent.near < extent.far).all()):
+        raise InputError(
+            f"{capture.source}: all of the content lies in one plane or at one distance, so there is no room for a "
+            "scene. Add scene.space=contracted, or remove what describes the content (sparse points, aabb_scale)."
+        )
+    unit = unit_of(to_user.double())
+    if not (LEAST_UNIT <= unit <= LARGEST_UNIT and bool(torch.isfinite(to_user).all())):
+        raise InputError(
+            f"{capture.source} describes its cameras in a frame whose unit is {unit:g} of its maker's, and no capture "
+            "is so small or so large. Mend applied_scale and applied_transform, or the cameras' distances."
+        )
+
+
+def depths_of(capture: Capture, cameras: Cameras, view: int) -> Float[Tensor, "points"]:
+    """Return how far in front of a view the sparse points lie that fall into its picture, in the user's units."""
+    c2w = cameras.c2w[view]
+    points = capture.points[:: 1 + len(capture.points) // MOST_POINTS]
+    local = (points - c2w[:, 3]) @ c2w[:, :3]
+    depth = -local[:, 2]
+    plane = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / depth[:, None]
+    at = plane * cameras.focal[view] + cameras.center[view]
+    size = torch.stack([cameras.width[view], cameras.height[view]])
+    return depth[(depth > 0) & ((at > 0) & (at < size)).all(dim=-1)]
+
+
+def _check_places(capture: Capture, cameras: Cameras) -> None:
+    centers = cameras.c2w[:, :, 3]
+    spread = (centers - centers.mean(dim=0)).abs().max()
+    if float(spread) <= ONE_PLACE * float(centers.abs().max()):
+        raise InputError(
+            f"All {len(capture.views)} cameras of {capture.source} stand at one place, and without different places "
+            "nothing is known of depth. Photograph from several, or estimate the poses anew."
+        )
+
+
+def _cube(half: float) -> Float[Tensor, "2 3"]:
+    return torch.tensor([[-half] * 3, [half] * 3])
+
+
+def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[Tensor, Tensor]:
+    # Distances of content per view, in scene units: from the sparse points where they are, else a guess that is wide.
+    unit, views = unit_of(to_user), len(capture.views)
+    near = torch.full((views,), NEAR_BLIND, dtype=torch.float64)
+    far = torch.full((views,), FAR_CONTRACTED, dtype=torch.float64)
+    if capture.bounds is not None:
+        near, far = NEAR_MARGIN * capture.bounds[:, 0] / unit, FAR_MARGIN * capture.bounds[:, 1] / unit
+    for view in range(views):
+        depths = depths_of(capture, cameras, view)
+        if len(depths) >= FEWEST_POINTS:
+            ends = torch.quantile(depths, depths.new_tensor(QUANTILES)) / unit
+            near[view], far[view] = NEAR_MARGIN * ends[0], FAR_MARGIN * ends[1]
+    return near.clamp(min=LEAST_NEAR), far.clamp(min=FAR_CONTRACTED)
+
+
+def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "2 3"]:
+    """Return the box that the format names, or that holds the sparse points, or that the cameras have in view."""
+    if capture.box is not None:
+        corners = torch.cartesian_prod(*capture.box.mT)
+        return _around(points_from_user(corners, to_user))
+    if len(capture.points) >= FEWEST_POINTS:
+        points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
+        # Alike towards all sides, so that it does not depend on where the user's x axis points.
+        level = (1.0 + BOX_MARGIN) * torch.quantile(points[:, :2].norm(dim=-1), QUANTILES[1])
+        low, high = torch.quantile(points[:, 2], points.new_tensor(QUANTILES))
+        room = BOX_MARGIN * (high - low)
+        return torch.stack(
+            [torch.stack([-level, -level, low - room]), torch.stack([level, level, high + room])]
+        ).float()
+    # A ball around the middle that fills the longer side of the closest picture.
+    distance = poses_from_user(cameras.c2w, to_user)[:, :, 3].norm(dim=-1)
+    half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
+    tangent = (half_size / cameras.focal).amax(dim=-1).double()
+    radius = float((distance * tangent / (1.0 + tangent.square()).sqrt()).min())
+    return _cube(min(radius, 0.95 * float(distance.min())))
+
+
+def _around(points: Float[Tensor, "points 3"]) -> Float[Tensor, "2 3"]:
+    return torch.stack([points.amin(dim=0), points.amax(dim=0)]).float()
+
+
+def _around_box(cameras: Cameras, to_user: Tensor, aabb: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    # Near and far of rays that begin before the box and end behind it.
+    center, half = center_and_half(aabb.double())
+    distance = (poses_from_user(cameras.c2w, to_user)[:, :, 3] - center).norm(dim=-1)
+    return torch.maximum(near, distance - half.norm()), distance + half.norm()
+
+
+def _forward_facing(capture: Capture, cameras: Cameras, near: float | None, far: float | None) -> Extent:
+    # LLFF's frame: the average camera looks along -z; the unit is such that the near plane lies at z = -1.
+    if far is not None:
+        raise InputError(
+            f"scene.far={far:g} cannot be kept with scene.space=ndc, which reaches to infinity. Leave it out, or use "
+            "scene.space=contracted or bounded."
+        )
+    mean = average_pose(cameras.c2w)
+    plane = near if near is not None else NEAR_SHARE * _nearest_depth(capture, cameras)
+    ahead = -(cameras.c2w[:, :, 3] - mean[:, 3]) @ mean[:, 2]
+    if float(ahead.max()) >= plane:
+        view = capture.views[int(ahead.argmax())].name
+        raise InputError(
+            f"scene.space=ndc: the view {view} of {capture.source} stands {float(ahead.max()):.4g} ahead of the "
+            f"cameras' middle, behind the near plane at {plane:.4g}, so what is in front of it would be lost. Use "
+            "scene.space=contracted, or give a larger scene.near."
+        )
+    to_user = similarity(mean[:, :3], mean[:, 3], plane)
+    half_size = torch.stack([cameras.width, cameras.height], dim=-1) / 2
+    scale = (cameras.focal / half_size).median(dim=0).values.float()
+    ndc = scale.expand(len(capture.views), 2).contiguous()
+    moved = replace(cameras, c2w=poses_from_user(cameras.c2w, to_user).float(), ndc=ndc)
+    corners, length = _corners(moved)
+    margin = torch.tensor([0.01, 0.01, 0.0])
+    aabb = torch.stack([corners.amin(dim=0) - margin, corners.amax(dim=0) + margin])
+    aabb[:, 2] = torch.tensor([-1.0, 1.0])
+    views = len(capture.views)
+    return Extent(to_user, torch.zeros(views), length.expand(views).clone(), aabb, ndc)
+
+
+def _nearest_depth(capture: Capture, cameras: Cameras) -> float:
+    if capture.bounds is not None:
+        return float(capture.bounds.min())
+    depths = [depths_of(capture, cameras, view) for view in range(len(capture.views))]
+    found = [float(torch.quantile(each, QUANTILES[0])) for each in depths if len(each) >= FEWEST_POINTS]
+    if not found:
+        raise InputError(
+            f"scene.space=ndc needs the depth at which content begins, and {capture.source} has neither "
+            "bounds nor enough sparse points in its pictures. Give scene.near in the capture's units, or use "
+            "scene.space=contracted."
+        )
+    return min(found)
+
+
+def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor, ""]]:
+    # Where the rays of all pictures begin and end in the cube, and the longest way between.
+    zeros = torch.zeros(cameras.c2w.shape[0])
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros + 1.0).map(lambda x: x.flatten(0, 1))
+    return torch.cat([rays.origins, rays.origins + rays.far[:, None] * rays.directions]), rays.far.max()

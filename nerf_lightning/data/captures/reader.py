@@ -1,0 +1,206 @@
+"""What all captures share: from a format's views to a scene in a working frame."""
+
+import logging
+import math
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from nerf_lightning.data.captures.capture import Capture, cameras_of, check_capture, filtered
+from nerf_lightning.data.captures.checks import check_step, is_folder, known_background
+from nerf_lightning.data.captures.extent import extent_of, require_possible
+from nerf_lightning.data.captures.space import choose_space
+from nerf_lightning.data.captures.splits import every_kth
+from nerf_lightning.data.pixels.images import ENDINGS, image_size
+from nerf_lightning.data.pixels.photographs import read_photographs
+from nerf_lightning.data.readers.base import Reader
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.files.links import is_there, require_inside
+from nerf_lightning.files.walk import walk
+from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user
+from nerf_lightning.nerf.geometry.lens_checks import require_invertible
+from nerf_lightning.nerf.types.scene import Background, Scene
+
+Spaces = Literal["auto", "bounded", "ndc", "contracted"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class CaptureReader(Reader):
+    """Read photographs with poses; a subclass says what its format holds.
+
+    Args:
+        root: the capture's folder.
+        downscale: whole factor by which the photographs shrink; focal lengths follow.
+        hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
+        frames: keep the views whose names fit this pattern of * and ?; null keeps all.
+        masks: a folder below root with a mask for each photograph, of the same name below it (or with .png added, or
+            with .png for its ending); white is kept. null: no masks, or those that the format names.
+        space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
+        near: distance at which content may begin, in the user's units; null: from the capture.
+        far: distance at which content ends; null: from the capture.
+        background: what lies behind transparent pixels or the end of the scene.
+        cache_dir: where decoded photographs are kept; null: the user's cache folder.
+        allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
+        verify: compare the contents of all files with what was decoded, not their times alone.
+        name: the scene's name in reports.
+    """
+
+    root: str
+    downscale: int = 1
+    hold_every: int = 8
+    frames: str | None = None
+    masks: str | None = None
+    space: Spaces = "auto"
+    near: float | None = None
+    far: float | None = None
+    background: str = "black"
+    cache_dir: str | None = None
+    allow_outside: bool = False
+    verify: bool = False
+    name: str = "capture"
+
+    @abstractmethod
+    def capture(self) -> Capture:
+        """Return what the format says, before any pixel is read.
+
+        Raises:
+            InputError: anything wrong with the files.
+        """
+
+    def read(self) -> Scene:
+        """Return the capture as a scene in a working frame: upright, centred, of a handy size.
+
+        Raises:
+            InputError: a setting that makes no sense, or anything wrong with the files.
+        """
+        self._check_settings()
+        background: Background = known_background(self.background)
+        capture = filtered(self.capture(), self.frames)
+        check_capture(capture)
+        splits = self._splits(capture)
+        files = [image_size(view.photograph.path) for view in capture.views]
+        pixels = read_photographs(
+            [view.photograph for view in capture.views],
+            self.downscale,
+            Path(self.cache_dir) if self.cache_dir else None,
+            self.verify,
+            f"Reading {Path(self.root).name}",
+        )
+        cameras = cameras_of(capture, files, pixels, self.downscale)
+        names = tuple(view.name for view in capture.views)
+        require_invertible(cameras, names)
+        space, reason = choose_space(self.space, cameras, capture, pixels.has_transparency)
+        log.info("%s: space=%s, %s", self.name, space, reason)
+        if capture.left_out:
+            log.warning(
+                "%d photographs have no pose and are left out: %s", len(capture.left_out), listed(capture.left_out, 5)
+            )
+        extent = extent_of(capture, cameras, space, self.near, self.far)
+        to_user = (capture.undo @ extent.to_user).float()
+        require_possible(extent, to_user, capture)
+        return Scene(
+            name=self.name,
+            cameras=replace(cameras, c2w=poses_from_user(cameras.c2w, extent.to_user).float(), ndc=extent.ndc),
+            pixels=pixels,
+            near=extent.near,
+            far=extent.far,
+            aabb=extent.aabb,
+            splits=splits,
+            view_names=names,
+            background=background,
+            space=space,
+            points=points_from_user(capture.points, extent.to_user).float(),
+            to_user=to_user,
+            protocol=self._protocol(),
+            truth=None,
+            left_out=capture.left_out,
+        )
+
+    def folder(self) -> Path:
+        """Return the capture's folder.
+
+        Raises:
+            InputError: it does not exist.
+        """
+        try:
+            folder = Path(self.root).expanduser()
+        except RuntimeError as error:
+            raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
+        if not is_folder(folder):
+            where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
+            raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
+        return folder
+
+    def require_inside(self, path: Path, setting: str | None = None) -> None:
+        """Refuse what is really outside of the capture's folder, and of the one that a setting names, unless allowed.
+
+        Raises:
+            InputError: with where it leads, and the cure.
+        """
+        if not self.allow_outside:
+            require_inside(path, self.folder(), setting)
+
+    def mask_of(self, name: str) -> Path | None:
+        """Return the mask of the photograph `name`, where masks are used.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.masks is None:
+            return None
+        beside = self.folder() / self.masks / name
+        candidates = (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png"))
+        for candidate in candidates:
+            if is_there(candidate):
+                self.require_inside(candidate, self.masks)
+                return candidate
+        raise InputError(
+            f"scene.masks={self.masks} holds no mask for {name}: neither {listed(candidates)} exists. Add it "
+            "(all white keeps the whole photograph), or leave the view out with scene.frames."
+        )
+
+    def _check_settings(self) -> None:
+        check_step("downscale", self.downscale)
+        if self.hold_every < 2:
+            raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
+        if self.space not in get_args(Spaces):
+            raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
+        near, far = self.near, self.far
+        if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
+            raise InputError(
+                f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units."
+            )
+
+    def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
+        if capture.splits is None:
+            train, held = every_kth(range(len(capture.views)), self.hold_every)
+            return {"train": train, "val": held, "test": held}
+        splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
+        held = splits["val"] or splits["test"]
+        if not splits["train"] or not held:
+            raise InputError(
+                f"{capture.source} splits its views into {len(splits['train'])} to learn from and {len(held)} to judge "
+                "by; each needs at least one. Mend its lists, or remove them so that every "
+                f"{self.hold_every}th view is held out."
+            )
+        return {"train": splits["train"], "val": held, "test": splits["test"] or held}
+
+    def _protocol(self) -> dict[str, str]:
+        return {
+            "downscale": str(self.downscale),
+            "filter": "none" if self.downscale == 1 else "area, premultiplied",
+            "hold_every": str(self.hold_every),
+            "frames": self.frames or "all",
+        }
+
+
+def picture_files(folder: Path) -> list[str]:
+    """Return the names of the pictures in a folder and its subfolders, sorted as text."""
+    found = []
+    for base, _, names in walk(folder):
+        found += [(base / name).relative_to(folder).as_posix() for name in names if name.lower().endswith(ENDINGS)]
+    return sorted(name for name in found if not Path(name).name.startswith("."))

@@ -1,0 +1,62 @@
+"""How much of space is modelled: a box, what lies in front of a near plane, or everything."""
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.types.scene import Cameras, Space
+
+# Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees).
+FORWARD_FACING = 0.82
+# The same of all pixels' rays, one of which would never reach infinity in normalised device coordinates at 0.
+LEAST_AHEAD = 0.1
+
+
+def choose_space(
+    asked: Space | Literal["auto"], cameras: Cameras, capture: Capture, has_transparency: bool
+) -> tuple[Space, str]:
+    """Return the space, and why.
+
+    Raises:
+        InputError: NDC was asked for and cannot work.
+    """
+    cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
+    if asked == "ndc" and not ahead:
+        raise InputError(
+            f"scene.space=ndc needs cameras that all look the same way, but some pixels of {capture.source} look "
+            "sideways or back. Use scene.space=contracted, or auto."
+        )
+    if asked != "auto":
+        return asked, "as asked"
+    if has_transparency:
+        return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
+    if ahead and cosine > FORWARD_FACING and capture.bounds is not None:
+        return "ndc", "since all cameras look the same way and the capture gives depths"
+    if ahead and cosine > FORWARD_FACING and len(capture.points):
+        return "ndc", "since all cameras look the same way and sparse points give depths"
+    return "contracted", "since the photographs show whatever lies behind the content"
+
+
+def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
+    """Return the cosine between the mean direction of the cameras and the camera that is farthest from it.
+
+    >>> least_agreement(torch.eye(4)[:3].repeat(2, 1, 1))
+    1.0
+    """
+    back = c2w[:, :, 2]
+    return float((back @ functional.normalize(back.mean(dim=0), dim=0)).min())
+
+
+def least_ahead(cameras: Cameras) -> float:
+    """Return the least cosine between a pixel's ray and the cameras' mean direction, over a coarse grid of pixels."""
+    cameras = replace(cameras, c2w=cameras.c2w.float())
+    zeros = torch.zeros(cameras.c2w.shape[0])
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
+    return float((rays.directions @ -functional.normalize(cameras.c2w[:, :, 2].mean(dim=0), dim=0)).min())

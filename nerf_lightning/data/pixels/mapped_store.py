@@ -1,0 +1,232 @@
+"""Pixel stores as files that are mapped into memory: they may be larger than it, and processes share one copy.
+
+KEY.pixels holds the RGBA of every view and then, where there are masks, a byte per pixel. KEY.json is written last and
+says what the other file is: without it, or where the two disagree, nothing is believed.
+"""
+
+import json
+import logging
+import mmap
+import os
+import platform
+import shutil
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock
+from jaxtyping import UInt8
+from torch import Tensor
+
+from nerf_lightning.data.pixels.store import layout
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.nerf.types.scene import PixelStore
+
+FORMAT = 2
+SPOTS, SPOT_BYTES = 64, 4096
+CHECKED_WHOLE = 1 << 32
+"""Bytes of a file that is compared with its checksum at each start (0.4 s a gigabyte of what memory holds); of larger
+ones, which may be more than it holds, only spots are, unless contents are to be compared."""
+PIECE = 1 << 24
+LONGEST_SIDE = 1 << 24
+MOST_HEADER_BYTES = 1 << 26
+"""A million views take less."""
+GIGABYTE = 1e9
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file of pixels holds."""
+
+    format: int
+    sizes: list[list[int]]
+    """Width and height of each view."""
+    has_transparency: bool
+    masked: bool
+    contents: str | None
+    """Hash of the pictures that it was made from, where they were hashed."""
+    spots: int
+    """Checksum of a few evenly spread spots: finds what a crash of the machine left unwritten."""
+    checksum: int
+    """Of all bytes (CRC-32): finds what a failing disk has changed."""
+
+    @property
+    def num_pixels(self) -> int:
+        """Pixels of all views."""
+        return sum(width * height for width, height in self.sizes)
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the file."""
+        return self.num_pixels * (5 if self.masked else 4)
+
+
+@dataclass(frozen=True)
+class MappedPixelStore(PixelStore):
+    """A store whose arrays are a file's. Pickled, it is a name: another process maps the same file."""
+
+    path: Path = field(kw_only=True)
+    header: Header = field(kw_only=True)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send the path, not the pixels, which may be more than memory holds."""
+        return _mapped, (self.path, self.header)
+
+
+def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> PixelStore:
+    """Return the store at `base`, or make it there first.
+
+    Of several processes that ask at once, one makes and the others wait. A damaged store is made again.
+
+    Args:
+        base: the files without their endings.
+        contents: hash of the pictures; a store made from others, or never hashed, is made again. None: not compared.
+        make: writes the pixels to the path it is given and describes them; the checksums are filled in here.
+
+    Raises:
+        InputError: the folder cannot be written, or others can write there, too.
+    """
+    try:
+        make_own_folder(base.parent)
+        header = _sound_header(base, contents)
+        if header is None:
+            with FileLock(base.with_suffix(".lock")):
+                # Another process may have made it meanwhile.
+                header = _sound_header(base, contents) or _make(base, make)
+    except OSError as error:
+        raise InputError(
+            f"The pixels of the photographs cannot be kept in {base.parent}: {error.strerror or error}. Make room "
+            "or name another folder with NERF_LIGHTNING_CACHE or scene.cache_dir."
+        ) from error
+    return _mapped(base.with_suffix(".pixels"), header)
+
+
+def check_room(folder: Path, num_bytes: int) -> None:
+    """Refuse to start what the disk cannot hold.
+
+    Raises:
+        InputError: with what is needed and what is free.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise InputError(
+            f"The pixels of the photographs need {num_bytes / GIGABYTE:.2f} GB in {folder}, where "
+            f"{free / GIGABYTE:.2f} GB are free. Make room, name a folder on another disk with NERF_LIGHTNING_CACHE "
+            "or scene.cache_dir, or shrink the pictures with scene.downscale."
+        )
+
+
+def _make(base: Path, make: Callable[[Path], Header]) -> Header:
+    """Write the pixels under another name, and the header once they have theirs."""
+    part, note = base.with_suffix(".part"), base.with_suffix(".json.part")
+    try:
+        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
+        part.unlink(missing_ok=True)
+        note.unlink(missing_ok=True)
+        header = make(part)
+        header = Header(**(asdict(header) | {"spots": _spots(part), "checksum": _checksum(part)}))
+        note.touch(mode=0o600)
+        note.write_text(json.dumps(asdict(header)), encoding="utf-8")
+        base.with_suffix(".json").unlink(missing_ok=True)
+        os.replace(part, base.with_suffix(".pixels"))
+        os.replace(note, base.with_suffix(".json"))
+    finally:
+        part.unlink(missing_ok=True)
+        note.unlink(missing_ok=True)
+    log.info("Kept %d pictures in %s.pixels (%.2f GB).", len(header.sizes), base, header.num_bytes / GIGABYTE)
+    return header
+
+
+def _sound_header(base: Path, contents: str | None) -> Header | None:
+    """Return the header of a store that is whole and up to date, else None."""
+    path = base.with_suffix(".pixels")
+    try:
+        with open_own(base.with_suffix(".json"), MOST_HEADER_BYTES) as file:
+            header = Header(**json.load(file))
+        _require_numbers(header)
+        sound = header.format == FORMAT and header.num_bytes == path.stat().st_size and header.spots == _spots(path)
+        if sound and (contents is not None or header.num_bytes <= CHECKED_WHOLE):
+            sound = header.checksum == _checksum(path)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, InputError) as error:
+        log.warning("%s is not used (%s); the photographs are read anew.", base, error)
+        return None
+    if not sound:
+        log.warning("%s is damaged; the photographs are read anew.", path)
+        return None
+    if contents is not None and contents != header.contents:
+        log.info("%s was made from other contents, or they were not compared then; it is made anew.", path)
+        return None
+    return header
+
+
+def _require_numbers(header: Header) -> None:
+    """Refuse sizes that are none: offsets into the file follow from them."""
+    sizes_fit = all(
+        len(size) == 2 and all(type(side) is int and 0 < side < LONGEST_SIDE for side in size) for size in header.sizes
+    )
+    if not sizes_fit or type(header.masked) is not bool or type(header.has_transparency) is not bool:
+        raise ValueError("sizes or switches that are none")
+
+
+def _spots(path: Path) -> int:
+    """Return the checksum of evenly spread spots of a file, its first and last bytes among them."""
+    checksum = 0
+    last = max(0, path.stat().st_size - SPOT_BYTES)
+    with open_own(path, None) as file:
+        for number in range(SPOTS):
+            file.seek(last * number // (SPOTS - 1))
+            checksum = zlib.crc32(file.read(SPOT_BYTES), checksum)
+    return checksum
+
+
+def _checksum(path: Path) -> int:
+    """Return the checksum of a whole file."""
+    checksum = 0
+    with open_own(path, None) as file:
+        while piece := file.read(PIECE):
+            checksum = zlib.crc32(piece, checksum)
+    return checksum
+
+
+def _mapped(path: Path, header: Header) -> MappedPixelStore:
+    """Return the store as views of the file; what is written to them stays in this process."""
+    bytes_ = _mapped_bytes(path)
+    rgba = bytes_[: 4 * header.num_pixels].view(-1, 4)
+    sizes = [(width, height) for width, height in header.sizes]
+    mask = bytes_[4 * header.num_pixels :] if header.masked else None
+    offset, width, height = layout(sizes)
+    return MappedPixelStore(
+        rgba=rgba,
+        offset=offset,
+        width=width,
+        height=height,
+        has_transparency=header.has_transparency,
+        mask=mask,
+        path=path,
+        header=header,
+    )
+
+
+def _mapped_bytes(path: Path) -> UInt8[Tensor, "bytes"]:
+    with open_own(path, None) as file:
+        if sys.platform == "linux":
+            # A private mapping counts as memory that might be written, all of it, and a file larger than the machine's
+            # memory would be refused. Nobody writes, so none is reserved. Python knows the flag's number from 3.13 on.
+            generic = 0x4000 if platform.machine() in ("x86_64", "aarch64") else 0
+            flags = mmap.MAP_PRIVATE | getattr(mmap, "MAP_NORESERVE", generic)
+            mapping = mmap.mmap(file.fileno(), 0, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+        else:
+            mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    if hasattr(mmap, "MADV_RANDOM"):
+        # Batches take single pixels from all over the file: reading ahead would only push others out.
+        mapping.madvise(mmap.MADV_RANDOM)
+    return torch.frombuffer(mapping, dtype=torch.uint8)

@@ -1,0 +1,189 @@
+"""Photographs, with masks, to a pixel store that is decoded once and mapped into memory from then on."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from nerf_lightning.data.captures.checks import check_step
+from nerf_lightning.data.pixels.images import (
+    area_downscale,
+    crop_to_multiple,
+    downscaled_size,
+    image_size,
+    read_mask,
+    read_rgba,
+    whole_blocks,
+)
+from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, check_room, stored
+from nerf_lightning.data.pixels.store import in_threads
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import default_folder
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.nerf.types.scene import PixelStore
+
+# Megapixels that take a few seconds: from here on there is a progress bar.
+NOTICEABLE_PIXELS = 50_000_000
+NOTICEABLE_FILES = 1000
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A picture file, and perhaps one that says which of its pixels count."""
+
+    path: Path
+    mask: Path | None = None
+    """A grey picture of the same size; brighter than 127 is kept."""
+
+
+def read_photographs(
+    photographs: Sequence[Photograph], downscale: int, cache_dir: Path | None, verify: bool, label: str
+) -> PixelStore:
+    """Return the photographs, in order; they may differ in size.
+
+    Decoded pixels are kept in the cache folder as one file, which every later call maps into memory at once. It
+    belongs to the files' names, sizes and times of change, and to `downscale`; where one of them changes, another is
+    made. Shrunk photographs lose what `downscale` leaves over at the right and the bottom; a shrunk pixel is kept if
+    its mask keeps its whole block.
+
+    Args:
+        photographs: the files, at least one.
+        downscale: whole factor of the area filter; 1 keeps the pixels as they are.
+        cache_dir: where the decoded pixels are kept; None: in the user's cache folder
+            (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
+        verify: read all files to see whether their contents are still those that were decoded.
+        label: what is read, for the progress bar.
+
+    Raises:
+        InputError: a file is absent, cannot be decoded or is refused by `images.read_rgba`; a mask is of another
+            size or keeps nothing; or the cache folder has no room.
+    """
+    check_step("downscale", downscale)
+    if not photographs:
+        raise InputError(f"{label}: there is no photograph to read. Check the capture's folder.")
+    folder = default_folder("photographs") if cache_dir is None else cache_dir.expanduser()
+    base = folder / _key(photographs, downscale)
+    contents = _hash_of_contents(photographs, label) if verify else None
+    store = stored(base, contents, partial(_write, list(photographs), downscale, contents, label))
+    if len(store.width) != len(photographs):
+        raise InputError(
+            f"{base}.pixels holds {len(store.width)} photographs where {len(photographs)} belong: somebody else wrote "
+            f"it. Remove {base}.json, and the photographs are read anew."
+        )
+    return store
+
+
+def _key(photographs: Sequence[Photograph], downscale: int) -> str:
+    """Return what the kept pixels are found by."""
+    files = [
+        [None if path is None else _identity(path) for path in (photograph.path, photograph.mask)]
+        for photograph in photographs
+    ]
+    settings = {"format": FORMAT, "downscale": downscale, "files": files}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _identity(path: Path) -> tuple[str, int, int]:
+    """Return name, size and time of change."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}. Copy it there, or leave it out.") from error
+    return str(path.resolve()), state.st_size, state.st_mtime_ns
+
+
+def _hash_of_contents(photographs: Sequence[Photograph], label: str) -> str:
+    """Return one hash of all files."""
+    paths = [path for photograph in photographs for path in (photograph.path, photograph.mask) if path is not None]
+
+    def digest(index: int) -> bytes:
+        try:
+            with open_regular(paths[index], None) as file:  # a piece at a time
+                return hashlib.file_digest(file, "sha256").digest()
+        except OSError as error:
+            raise InputError(f"{paths[index]} cannot be read: {error.strerror}. Check its permissions.") from error
+
+    digests = in_threads(digest, len(paths), f"{label}: comparing", shown=len(paths) > NOTICEABLE_FILES)
+    return hashlib.sha256(b"".join(digests)).hexdigest()
+
+
+def _write(photographs: list[Photograph], downscale: int, contents: str | None, label: str, target: Path) -> Header:
+    """Decode everything into the file `target`.
+
+    The threads write to the file and not through a mapping of it, so no picture stays in this process's memory.
+    """
+    sizes = _sizes(photographs, downscale, label)
+    masked = any(photograph.mask is not None for photograph in photographs)
+    ends = np.cumsum([width * height for width, height in sizes])
+    num_pixels = int(ends[-1])
+    check_room(target.parent, num_pixels * (5 if masked else 4))
+    target.touch(mode=0o600)
+
+    def decode(index: int) -> bool:
+        rgba = _picture(photographs[index], sizes[index], downscale)
+        start = int(ends[index]) - rgba.shape[0] * rgba.shape[1]
+        with target.open("r+b") as file:
+            file.seek(4 * start)
+            file.write(np.ascontiguousarray(rgba).data)
+            if masked:
+                file.seek(4 * num_pixels + start)
+                file.write(_mask(photographs[index], sizes[index], downscale).data)
+        return bool((rgba[..., 3] < 255).any())
+
+    transparent = in_threads(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
+    return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0, checksum=0)
+
+
+def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tuple[int, int]]:
+    """Return the shrunk (width, height) of each, from the headers; masks are compared on the way."""
+
+    def size(index: int) -> tuple[int, int]:
+        path, mask = photographs[index].path, photographs[index].mask
+        width, height = image_size(path)
+        if mask is not None and image_size(mask) != (width, height):
+            across, down = image_size(mask)
+            raise InputError(
+                f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}. "
+                "Give the mask the photograph's own size; it is shrunk together with it."
+            )
+        return downscaled_size(width, height, downscale)
+
+    return in_threads(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
+
+
+def _picture(
+    photograph: Photograph, size: tuple[int, int], downscale: int
+) -> UInt8[np.ndarray, "small_height small_width 4"]:
+    """Return one photograph, shrunk."""
+    rgba = area_downscale(crop_to_multiple(read_rgba(photograph.path), downscale), downscale)
+    _check_unchanged(rgba.shape, size, photograph.path)
+    return rgba
+
+
+def _mask(
+    photograph: Photograph, size: tuple[int, int], downscale: int
+) -> Bool[np.ndarray, "small_height small_width"]:
+    """Return which of its pixels count."""
+    width, height = size
+    if photograph.mask is None:
+        return np.ones((height, width), dtype=np.bool_)
+    kept = whole_blocks(read_mask(photograph.mask), downscale)
+    _check_unchanged(kept.shape, size, photograph.mask)
+    if not kept.any():
+        shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""
+        raise InputError(
+            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is brighter than 127 of "
+            "255 is kept, so 0 and 1 are both black. Mend the mask, or leave this view out."
+        )
+    return kept
+
+
+def _check_unchanged(shape: tuple[int, ...], size: tuple[int, int], path: Path) -> None:
+    """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbour."""
+    if (shape[1], shape[0]) != size:
+        raise InputError(f"{path} changed while it was read. Start again when it is no longer written to.")

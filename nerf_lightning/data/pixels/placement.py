@@ -1,0 +1,64 @@
+"""Where the pixels lie while training: in memory, in a mapped file, or on the device where they fit."""
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from jaxtyping import Shaped
+from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
+from torch import Tensor
+
+from nerf_lightning.console import progress_bar
+from nerf_lightning.machine import free_memory
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
+
+GIGABYTE = 1e9
+AUTO_SHARE = 0.5
+"""Of the device's free memory: the rest is for tables, activations and evaluation."""
+CHUNK_BYTES = 1 << 26
+
+
+def num_bytes(pixels: PixelStore) -> int:
+    """Return how much room the pixels take, with their masks."""
+    return pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
+
+
+def budget_bytes(budget: int | float | Literal["auto"], device: torch.device) -> int:
+    """Return how much of the device's memory the pixels may take: gigabytes, or half of what is free."""
+    if budget != "auto":
+        return int(budget * GIGABYTE)
+    return int(AUTO_SHARE * free_memory(device)) if device.type == "cuda" else 0
+
+
+def on_device(scene: Scene, device: torch.device) -> Scene:
+    """Return the scene with pixels, cameras, near and far on the device; a mapped file is read once, part by part."""
+    pixels = scene.pixels
+    columns = ("{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with progress_bar(*columns, shown=num_bytes(pixels) > 16 * CHUNK_BYTES) as bar:
+        task = bar.add_task(f"pixels to {device}", total=num_bytes(pixels))
+
+        def copied(flat: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
+            out = torch.empty_like(flat, device=device)
+            size = max(1, CHUNK_BYTES * len(flat) // flat.nbytes)
+            for target, source in zip(out.split(size), flat.split(size), strict=True):
+                target.copy_(source)
+                bar.advance(task, source.nbytes)
+            return out
+
+        store = PixelStore(
+            rgba=copied(pixels.rgba),
+            offset=pixels.offset.to(device),
+            width=pixels.width.to(device),
+            height=pixels.height.to(device),
+            has_transparency=pixels.has_transparency,
+            mask=None if pixels.mask is None else copied(pixels.mask),
+        )
+    near, far = scene.near.to(device), scene.far.to(device)
+    return replace(scene, cameras=scene.cameras.to(device), pixels=store, near=near, far=far)
+
+
+def sent(tensor: Shaped[Tensor, "..."], device: torch.device) -> Shaped[Tensor, "..."]:
+    """Return the tensor on the device; to a GPU by way of pinned memory, so that the host need not wait for it."""
+    if device.type == "cuda":
+        return tensor.pin_memory().to(device, non_blocking=True)
+    return tensor.to(device)

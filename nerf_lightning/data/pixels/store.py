@@ -1,0 +1,86 @@
+"""Fill the pixel store from picture files: one array for all of them, decoded straight into place."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from jaxtyping import Int
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+from torch import Tensor
+
+from nerf_lightning.console import progress_bar
+from nerf_lightning.cores import num_cores
+from nerf_lightning.data.pixels.images import area_downscale, read_rgba
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.machine import free_memory
+from nerf_lightning.nerf.types.scene import PixelStore
+
+# Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.
+MAX_THREADS = 4
+NOTICEABLE = 50
+
+Result = TypeVar("Result")
+
+
+def layout(
+    sizes: Sequence[tuple[int, int]],
+) -> tuple[Int[Tensor, "views"], Int[Tensor, "views"], Int[Tensor, "views"]]:
+    """Return offset, width and height of pictures that lie one after the other; sizes are (width, height)."""
+    width, height = torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2).unbind(dim=1)
+    area = width * height
+    return area.cumsum(dim=0) - area, width, height
+
+
+def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
+    """Return a store with room for opaque pictures of these sizes (width, height), its pixels not yet written."""
+    num_pixels = sum(width * height for width, height in sizes)
+    free = free_memory()
+    if 4 * num_pixels > free:
+        raise InputError(
+            f"{len(sizes)} pictures of {num_pixels / 1e6:,.0f} megapixels in all need {4 * num_pixels / 1e9:.1f} GB of "
+            f"memory, and {free / 1e9:.1f} GB are free. Shrink them with scene.downscale, or read fewer."
+        )
+    return PixelStore(torch.empty((num_pixels, 4), dtype=torch.uint8), *layout(sizes), has_transparency=False)
+
+
+def in_threads(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
+    """Return work(0), work(1), ... up to `count`, done by a few threads under a progress bar.
+
+    Args:
+        work: takes the number of a picture.
+        count: how many there are.
+        label: what is done, for the bar.
+        shown: whether there is a bar at all.
+    """
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    threads = min(MAX_THREADS, num_cores())
+    with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
+        return list(bar.track(pool.map(work, range(count)), total=count, description=escape(for_terminal(label))))
+
+
+def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:
+    """Return the pictures, each shrunk by `downscale`.
+
+    Args:
+        paths: the files, in the order of the views.
+        sizes: (width, height) of each file, multiples of `downscale`.
+        downscale: whole factor of the area filter; 1 keeps the pixels as they are.
+        label: what is read, for the progress bar.
+
+    Raises:
+        InputError: a file cannot be decoded.
+    """
+    store = empty_store([(width // downscale, height // downscale) for width, height in sizes])
+
+    def decode(index: int) -> bool:
+        picture = area_downscale(read_rgba(paths[index]), downscale)
+        store.view(index).numpy()[...] = picture
+        return bool((picture[..., 3] < 255).any())
+
+    transparent = in_threads(decode, len(paths), label, shown=len(paths) > NOTICEABLE)
+    return replace(store, has_transparency=any(transparent))

@@ -1,0 +1,125 @@
+"""COLMAP reconstructions: `sparse/0` (or `sparse`) beside a folder of photographs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.checks import is_folder
+from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.pixels.photographs import Photograph
+from nerf_lightning.data.readers.colmap.model import find_model, model_files, read_model
+from nerf_lightning.data.readers.colmap.records import ColmapCamera, ColmapImage
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.types.scene import LensModel
+
+# Which of its parameters are fx, fy, cx, cy, and which k1, k2, k3, k4, p1, p2; -1: none.
+LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {
+    "SIMPLE_PINHOLE": ("pinhole", (0, 0, 1, 2), (-1, -1, -1, -1, -1, -1)),
+    "PINHOLE": ("pinhole", (0, 1, 2, 3), (-1, -1, -1, -1, -1, -1)),
+    "SIMPLE_RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
+    "RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
+    "OPENCV": ("radial_tangential", (0, 1, 2, 3), (4, 5, -1, -1, 6, 7)),
+    "OPENCV_FISHEYE": ("fisheye", (0, 1, 2, 3), (4, 5, 6, 7, -1, -1)),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
+    "RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
+}
+
+
+@dataclass
+class ColmapReader(CaptureReader):
+    """Read a COLMAP model, binary or text, with one camera for all photographs or one for each.
+
+    Args:
+        images: the folder of the photographs below root; a shrunk copy such as images_4 will do.
+    """
+
+    name: str = "colmap"
+    images: str = "images"
+
+    def capture(self) -> Capture:
+        """Return the registered photographs, in order of their names."""
+        root = self.folder()
+        folder = find_model(root)
+        for path in model_files(folder):
+            self.require_inside(path)
+        model = read_model(folder)
+        pictures = root / self.images
+        if not is_folder(pictures):
+            raise InputError(
+                f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
+                f"their folder below {root}."
+            )
+        self.require_inside(pictures, self.images)
+        lost = [image.name for image in model.images if not is_there(pictures / image.name)]
+        if lost:
+            raise InputError(_absent(lost, pictures, folder, len(model.images)))
+        lens_model = _lens_model({model.cameras[image.camera].model for image in model.images}, folder)
+        registered = {image.name for image in model.images}
+        return Capture(
+            views=tuple(self._view(image, model.cameras[image.camera], pictures) for image in model.images),
+            source=folder,
+            lens_model=lens_model,
+            points=torch.from_numpy(model.points),
+            left_out=tuple(name for name in picture_files(pictures) if name not in registered),
+        )
+
+    def _view(self, image: ColmapImage, camera: ColmapCamera, pictures: Path) -> View:
+        _, pinhole, lens = LAYOUTS[camera.model]
+        fx, fy, cx, cy = (camera.params[place] for place in pinhole)
+        k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
+        path = pictures / image.name
+        self.require_inside(path, self.images)
+        return View(
+            name=image.name,
+            photograph=Photograph(path, self.mask_of(image.name)),
+            c2w=_c2w(image),
+            focal=(fx, fy),
+            center=(cx, cy),
+            size=(float(camera.width), float(camera.height)),
+            lens=(k1, k2, k3, k4, p1, p2),
+        )
+
+
+def _absent(lost: list[str], pictures: Path, folder: Path, count: int) -> str:
+    if any(is_absolute(name) for name in lost):
+        return (
+            f"The model in {folder} names photographs by absolute paths of another machine: {listed(lost, cap=3)}. "
+            "Make the names relative to the folder of the photographs (reconstruct with that folder as COLMAP's "
+            "image_path)."
+        )
+    return (
+        f"{pictures} lacks {len(lost)} of the {count} photographs of the model in {folder}: {listed(lost)}. Copy them "
+        "there, or set scene.images to the folder that has them."
+    )
+
+
+def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
+    """Invert world-to-camera with axes right, down, forward into camera-to-world with axes right, up, back."""
+    rotation = rotation_from_quaternion(torch.tensor(image.rotation, dtype=torch.float64))
+    translation = torch.tensor(image.translation, dtype=torch.float64)
+    center = -rotation.mT @ translation
+    return torch.cat([rotation.mT * torch.tensor([1.0, -1.0, -1.0]), center[:, None]], dim=-1)
+
+
+def _lens_model(used: set[str], folder: Path) -> LensModel:
+    unknown = sorted(used - LAYOUTS.keys())
+    if unknown:
+        raise InputError(
+            f"{folder} uses the camera model {listed(unknown)}, whose lens is not known here; known are "
+            f"{listed(LAYOUTS)}. Undistort the photographs with `colmap image_undistorter`, or reconstruct with "
+            "OPENCV (or OPENCV_FISHEYE)."
+        )
+    lens_model = common_lens_model({LAYOUTS[name][0] for name in used})
+    if lens_model is None:
+        raise InputError(
+            f"{folder} mixes fisheye lenses with others ({listed(sorted(used))}), and a scene has one kind. Undistort "
+            "the photographs with `colmap image_undistorter`, or split the capture."
+        )
+    return lens_model

@@ -1,0 +1,53 @@
+"""What a check says, and what it may look at."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.doctor.view_statistics import Looks
+from nerf_lightning.escaping import listed
+from nerf_lightning.nerf.types.scene import Scene
+
+Verdict = Literal["ok", "look", "wrong"]
+"""`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """The outcome of one check."""
+
+    name: str
+    verdict: Verdict
+    message: str
+    """What was found, in numbers."""
+    cure: str = ""
+    """What to do about it; empty where all is well."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that checks look at."""
+
+    scene: Scene
+    looks: Looks
+    """What each photograph looks like."""
+    matches: Matches
+    """Places that photographs have in common, found without their poses."""
+    agrees: Bool[Tensor, "matches"]
+    """Which of them lie where the cameras say."""
+
+    @property
+    def agreement(self) -> float:
+        """Share of the matches that agree; 0 where there are none."""
+        return float(self.agrees.float().mean()) if len(self.agrees) else 0.0
+
+    def named(self, views: Iterable[int]) -> str:
+        """Return the names of views, the first few of them."""
+        return listed((self.scene.view_names[view] for view in views), cap=5)
+
+
+CheckFn = Callable[[Evidence], Check]

@@ -1,0 +1,155 @@
+"""Other readings of the same numbers: what a capture's poses or photographs may have been meant as."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.nerf.types.scene import Cameras, Scene
+
+FLIP_YZ = (1.0, -1.0, -1.0)
+SHIFT = "Shift the list of photographs against the poses by one; one end may lack a picture."
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another way to read a capture."""
+
+    says: str
+    """What the capture looks like, as the rest of "the poses look ..."."""
+    cure: str
+    change: Callable[[Scene, Matches], tuple[Float[Tensor, "views 3 4"], Matches]]
+
+
+def user_poses(scene: Scene) -> Float[Tensor, "views 3 4"]:
+    """Return the poses in the user's own frame (float64): what an inversion must be done in."""
+    to_user = scene.to_user.double()
+    unit = torch.linalg.det(to_user[:3, :3]) ** (1 / 3)
+    c2w = scene.cameras.c2w.double()
+    centers = c2w[:, :, 3] @ to_user[:3, :3].T + to_user[:3, 3]
+    return torch.cat([to_user[:3, :3] / unit @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
+
+
+def inverted(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the inverse poses.
+
+    >>> turn = torch.tensor([[[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0]]])
+    >>> bool((inverted(inverted(turn)) == turn).all())
+    True
+    """
+    turned = c2w[:, :, :3].mT
+    return torch.cat([turned, -turned @ c2w[:, :, 3:]], dim=-1)
+
+
+def axes(c2w: Float[Tensor, "views 3 4"], signs: tuple[float, float, float]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses with the signs of the columns right, up, back changed."""
+    return torch.cat([c2w[:, :, :3] * c2w.new_tensor(signs), c2w[:, :, 3:]], dim=-1)
+
+
+def transposed(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses with their rotations alone transposed."""
+    return torch.cat([c2w[:, :, :3].mT, c2w[:, :, 3:]], dim=-1)
+
+
+def numeric_order(cameras: Cameras, names: tuple[str, ...]) -> Tensor:
+    """Return where each view's row stands when rows follow the numbers in the names, not the names as text."""
+    digits = ["".join(c for c in name.rsplit("/", 1)[-1] if c.isdigit()) for name in names]
+    by_number = sorted(range(len(names)), key=lambda view: (int(digits[view] or 0), names[view]))
+    by_text = sorted(range(len(names)), key=lambda view: names[view])
+    order = torch.arange(len(names), device=cameras.c2w.device)
+    order[by_number] = torch.tensor(by_text)
+    return order
+
+
+def _poses(change: Callable[[Tensor], Tensor]) -> Callable[[Scene, Matches], tuple[Tensor, Matches]]:
+    return lambda scene, matches: (change(user_poses(scene)), matches)
+
+
+def _pictures(x: float, y: float) -> Callable[[Scene, Matches], tuple[Tensor, Matches]]:
+    # Mirrored about the principal point: good enough to tell.
+    return lambda scene, matches: (
+        user_poses(scene),
+        replace(matches, plane=matches.plane * matches.plane.new_tensor([x, y])),
+    )
+
+
+def _in_numeric_order(scene: Scene, matches: Matches) -> tuple[Tensor, Matches]:
+    return user_poses(scene)[numeric_order(scene.cameras, scene.view_names)], matches
+
+
+AXES = (
+    Reading(
+        "like OpenCV's or COLMAP's (right, down, forward) rather than OpenGL's (right, up, back)",
+        "Negate the second and third column of every rotation.",
+        _poses(lambda c2w: axes(c2w, FLIP_YZ)),
+    ),
+    Reading(
+        "like world-to-camera rather than camera-to-world",
+        "Invert every pose matrix.",
+        _poses(inverted),
+    ),
+    Reading(
+        "like world-to-camera with OpenCV's axes (as COLMAP writes them)",
+        "Invert every pose matrix, then negate the second and third column of its rotation.",
+        _poses(lambda c2w: axes(inverted(c2w), FLIP_YZ)),
+    ),
+    Reading(
+        "like world-to-camera of cameras whose y and z axes were negated",
+        "Negate the second and third column of every rotation, then invert every pose matrix.",
+        _poses(lambda c2w: inverted(axes(c2w, FLIP_YZ))),
+    ),
+    Reading(
+        "as if their rotations were transposed", "Transpose every rotation, leave the centres.", _poses(transposed)
+    ),
+    Reading(
+        "as if their rotations were transposed, with OpenCV's axes",
+        "Transpose every rotation, then negate its second and third column.",
+        _poses(lambda c2w: axes(transposed(c2w), FLIP_YZ)),
+    ),
+    Reading(
+        "as if the axes x and y of the cameras had the other sign",
+        "Negate columns 1 and 2 of every rotation.",
+        _poses(lambda c2w: axes(c2w, (-1.0, -1.0, 1.0))),
+    ),
+    Reading(
+        "as if the axes x and z of the cameras had the other sign",
+        "Negate columns 1 and 3 of every rotation.",
+        _poses(lambda c2w: axes(c2w, (-1.0, 1.0, -1.0))),
+    ),
+)
+"""Of the poses."""
+PHOTOGRAPHS = (
+    Reading("as if the photographs were mirrored, left to right", "Mirror them back.", _pictures(-1.0, 1.0)),
+    Reading(
+        "as if the photographs were mirrored, top to bottom",
+        "Turn the rows of the photographs over.",
+        _pictures(1.0, -1.0),
+    ),
+)
+"""Of the photographs."""
+ORDERS = (
+    Reading(
+        "as if they followed the numbers in the photographs' names, and not the names sorted as text",
+        "Pair photographs and poses in numeric order (rename 1.jpg to 0001.jpg and so on).",
+        _in_numeric_order,
+    ),
+    Reading(
+        "as if each photograph had the pose of the next one",
+        SHIFT,
+        _poses(lambda c2w: c2w.roll(-1, 0)),
+    ),
+    Reading(
+        "as if each photograph had the pose of the previous one",
+        SHIFT,
+        _poses(lambda c2w: c2w.roll(1, 0)),
+    ),
+    Reading(
+        "as if the photographs' order were reversed",
+        "Reverse the list of photographs.",
+        _poses(lambda c2w: c2w.flip(0)),
+    ),
+)
+"""Of which photograph has which pose."""

@@ -1,0 +1,78 @@
+"""Do poses agree with matched places: each must lie on the line that the other's ray draws into its picture."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.doctor.matches import Matches
+
+TOLERANCE = 1.5
+"""Pixels of the shrunk pictures."""
+
+
+def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:
+    """Tell which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
+
+    With D, E the rays and b the way between the centres, the plane of b and E cuts the other picture in a line (the
+    epipolar line); counted is the distance to it in pixels, both ways. Hartley and Zisserman, "Multiple View
+    Geometry", 2004, chapter 9.
+
+    Args:
+        matches: places in both pictures.
+        c2w: the poses to judge.
+        zoom: what the focal lengths are multiplied by.
+    """
+    rays, between = _rays(matches, c2w, zoom)
+    good = (_nearest(rays, between) > 0).all(dim=-1)
+    for here, there in ((0, 1), (1, 0)):
+        normal = functional.normalize(torch.linalg.cross(between, rays[:, there]), dim=-1)
+        # The line in the axes of the picture: its first two numbers lie along the picture.
+        right, up, back = c2w[matches.view[:, here], :, :3].double().unbind(dim=-1)
+        slope = ((normal * right).sum(dim=-1).square() + (normal * up).sum(dim=-1).square()).sqrt()
+        depth = -(rays[:, here] * back).sum(dim=-1)
+        off = (normal * rays[:, here]).sum(dim=-1).abs() / (depth * slope).clamp(min=1e-6)
+        good &= off * matches.focal[:, here] * zoom < TOLERANCE
+    return good
+
+
+def distances(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 2"]:
+    """Return how far along both rays each match lies, where the rays come nearest to each other (scene units).
+
+    Worth little where the rays are nearly parallel: see `parallax`.
+    """
+    return _nearest(*_rays(matches, c2w)).float()
+
+
+def places(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 3"]:
+    """Return where in the world each match lies, on the first ray (scene units)."""
+    rays, between = _rays(matches, c2w)
+    first = c2w[matches.view[:, 0], :, 3].double()
+    return (first + _nearest(rays, between)[:, :1] * rays[:, 0]).float()
+
+
+def parallax(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches"]:
+    """Return the angle between both rays of each match, in radians."""
+    rays, _ = _rays(matches, c2w)
+    return torch.linalg.cross(rays[:, 0], rays[:, 1]).norm(dim=-1).clamp(max=1).asin().float()
+
+
+def _rays(
+    matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0
+) -> tuple[Float[Tensor, "matches 2 3"], Float[Tensor, "matches 3"]]:
+    # Unit rays of both ends, and the way from the first camera to the second.
+    plane = matches.plane.double() / zoom
+    local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
+    poses = c2w[matches.view].double()
+    # Written out: a matrix product for each of many matches is slow.
+    rays = functional.normalize((poses[..., :3] * local[..., None, :]).sum(dim=-1), dim=-1)
+    return rays, poses[:, 1, :, 3] - poses[:, 0, :, 3]
+
+
+def _nearest(rays: Float[Tensor, "matches 2 3"], between: Float[Tensor, "matches 3"]) -> Float[Tensor, "matches 2"]:
+    # s, t that minimise |s first - t second - between|.
+    first, second = rays.unbind(dim=1)
+    cosine = (first * second).sum(dim=-1)
+    along, across = (first * between).sum(dim=-1), (second * between).sum(dim=-1)
+    sine = (1.0 - cosine.square()).clamp(min=1e-12)
+    return torch.stack([along - cosine * across, cosine * along - across], dim=-1) / sine[:, None]

@@ -1,0 +1,66 @@
+"""All checks of a capture, and what they look at. A new check is a function, named in CHECKS of its file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from nerf_lightning.data.pixels.store import in_threads
+from nerf_lightning.doctor import cameras, extent, photographs, poses, views
+from nerf_lightning.doctor import memory as cost
+from nerf_lightning.doctor.check import Check, CheckFn, Evidence
+from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
+from nerf_lightning.doctor.matches import find_matches
+from nerf_lightning.doctor.view_statistics import look_at_view, stacked
+from nerf_lightning.nerf.types.scene import Scene
+
+CHECKS: tuple[CheckFn, ...] = (
+    *cameras.CHECKS,
+    *poses.CHECKS,
+    *extent.CHECKS,
+    *views.CHECKS,
+    *photographs.CHECKS,
+    *cost.CHECKS,
+)
+
+
+def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
+    """Return the outcome of every check, and what they looked at; takes seconds."""
+    with _one_thread_each():
+        evidence = gather_evidence(scene)
+        return evidence, [check(evidence) for check in CHECKS]
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    # Pictures are spread over our own threads; torch's would only stand in their way.
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+# More views than these are thinned out evenly to be compared with each other; that costs the square.
+MOST_COMPARED = 160
+NOTICEABLE = 30
+
+
+def gather_evidence(scene: Scene) -> Evidence:
+    """Return what the checks need to know of a scene; takes seconds."""
+    total = len(scene.view_names)
+    compared = {total * number // min(total, MOST_COMPARED) for number in range(min(total, MOST_COMPARED))}
+    cameras = shrunk_cameras(scene.cameras)
+    corners: dict[int, Corners] = {}
+
+    def look(view: int) -> tuple[torch.Tensor, ...]:
+        picture = small_picture(scene.pixels, view, int(cameras.width[view]), int(cameras.height[view]))
+        if view in compared:
+            corners[view] = find_corners(picture)
+        return look_at_view(scene.pixels, view, picture)
+
+    rows = in_threads(look, total, "Looking at photographs", shown=total > NOTICEABLE)
+    matches = find_matches(cameras, corners, shown=total > NOTICEABLE)
+    return Evidence(scene, stacked(rows), matches, agreeing(matches, scene.cameras.c2w))

@@ -1,0 +1,162 @@
+"""Checks of where content is looked for: near, far and the box, against cameras and content."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.epipolar import distances, parallax, places
+from nerf_lightning.nerf.geometry.boxes import distances_in_box
+from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.scene import Scene
+
+# Rays that meet at a smaller angle (radians) say little of distances.
+LEAST_PARALLAX = 0.04
+FEWEST = 50
+# Share of the content that may be cut off: a few matches and points are mistakes.
+FEW, MANY = 0.03, 0.15
+# Of the views' pixels, a grid of so many places a side.
+GRID = 12
+INCHES, FEET, CENTIMETRES = 39.37, 3.281, 100.0
+
+
+def near_and_far(evidence: Evidence) -> Check:
+    """Judge whether content lies between near and far."""
+    name, scene = "near and far", evidence.scene
+    found = content_distances(evidence)
+    if found is None:
+        return Check(name, "ok", "not judged: no sparse points, and too few details were found again")
+    view, distance = found
+    unit = unit_of(scene.to_user.double())
+    if scene.space == "ndc":
+        before = float((distance < 1.0).float().mean())
+        if before <= FEW:
+            return Check(name, "ok", f"{100 * (1 - before):.0f} % of the content lies beyond the near plane (NDC)")
+        return Check(
+            name,
+            "wrong" if before > MANY else "look",
+            f"{100 * before:.0f} % of the content lies before the near plane of the normalised device coordinates",
+            f"Set scene.near to about {0.9 * float(distance.quantile(0.01)) * unit:.3g} (it is {unit:.3g}).",
+        )
+    before = float((distance < scene.near[view]).float().mean())
+    beyond = float((distance > scene.far[view]).float().mean())
+    low, high = (unit * float(distance.quantile(share)) for share in (0.01, 0.99))
+    near, far = unit * float(scene.near.median()), unit * float(scene.far.median())
+    message = f"content lies {low:.3g} to {high:.3g} from the cameras; near is {near:.3g} and far {far:.3g}"
+    if max(before, beyond) <= FEW:
+        return Check(name, "ok", message)
+    cut = f"{100 * before:.0f} % of it in front of near and {100 * beyond:.0f} % behind far"
+    cure = f"Set scene.near={0.8 * low:.2g} scene.far={1.3 * high:.3g}.{_units(low, high, near, far)}"
+    return Check(name, "wrong" if max(before, beyond) > MANY else "look", f"{message}: {cut}", cure)
+
+
+def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "content"]] | None:
+    """Return views, and how far from them content lies that they show (scene units; in NDC: depth before bending).
+
+    From matched details, and where these are few from the sparse points.
+    """
+    scene, matches = evidence.scene, evidence.matches
+    good = clear_matches(evidence)
+    if int(good.sum()) >= FEWEST and evidence.agreement > 0.3:
+        if scene.space == "ndc":
+            return matches.view[good, 0], -places(matches, scene.cameras.c2w)[good, 2]
+        return matches.view[good].flatten(), distances(matches, scene.cameras.c2w)[good].flatten()
+    if len(scene.points) < FEWEST:
+        return None
+    if scene.space == "ndc":
+        return torch.zeros(len(scene.points), dtype=torch.long), -scene.points[:, 2]
+    apart = torch.cdist(scene.cameras.c2w[:, :, 3], scene.points)
+    nearest = apart.min(dim=0)
+    return nearest.indices, nearest.values
+
+
+def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
+    """Tell which matches say where in the world they lie."""
+    return evidence.agrees & (parallax(evidence.matches, evidence.scene.cameras.c2w) > LEAST_PARALLAX)
+
+
+def box_in_view(evidence: Evidence) -> Check:
+    """Judge whether every view's rays meet the box that is modelled, between near and far."""
+    scene, name = evidence.scene, "box in view"
+    if scene.space != "bounded":
+        return Check(name, "ok", f"space is {scene.space}: no box bounds the content")
+    shares = torch.stack([_share_in_box(scene, view) for view in range(len(scene.view_names))])
+    blind = (shares < 0.02).nonzero()[:, 0].tolist()
+    message = f"{100 * float(shares.median()):.0f} % of a view's rays pass the box (median)"
+    if not blind:
+        return Check(name, "ok", message)
+    cure = (
+        "The cameras do not look at the box, or near and far miss it: check the axes of the poses, centre the capture "
+        "on its content, or set near, far and the box (scene.aabb_half)."
+    )
+    many = len(blind) > 0.3 * len(shares)
+    return Check(
+        name,
+        "wrong" if many else "look",
+        f"{message}; {len(blind)} views miss it, such as {evidence.named(blind[:3])}",
+        cure,
+    )
+
+
+def scale(evidence: Evidence) -> Check:
+    """Judge the size of the capture against what is modelled."""
+    scene, name = evidence.scene, "scale"
+    centers = scene.cameras.c2w[:, :, 3]
+    middle = scene.aabb.mean(dim=0)
+    away = float((centers - middle).norm(dim=-1).median())
+    half = float((scene.aabb[1] - scene.aabb[0]).max()) / 2
+    if scene.space != "bounded":
+        return Check(
+            name, "ok", f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours"
+        )
+    inside = ((centers > scene.aabb[0]) & (centers < scene.aabb[1])).all(dim=-1)
+    message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
+    if bool(inside.float().mean() > 0.3):
+        cure = "Make the scene larger than the box or the box smaller (scene.aabb_half), or use scene.space=contracted."
+        return Check(name, "wrong", message + ": they stand within it", cure)
+    if away > 30 * half:
+        cure = "Scale the camera centres down, or make the box larger (scene.aabb_half), with near and far to match."
+        return Check(name, "wrong", message + ": the content would be a dot in their pictures", cure)
+    return _content_in_box(evidence, message)
+
+
+def _content_in_box(evidence: Evidence, message: str) -> Check:
+    scene = evidence.scene
+    good = clear_matches(evidence)
+    if int(good.sum()) < FEWEST:
+        return Check("scale", "ok", message)
+    found = places(evidence.matches, scene.cameras.c2w)[good]
+    inside = float(((found > scene.aabb[0]) & (found < scene.aabb[1])).all(dim=-1).float().mean())
+    message += f"; {100 * inside:.0f} % of the matched details lie in it"
+    if inside > 1 - MANY:
+        return Check("scale", "ok", message)
+    reach = float(found.abs().quantile(0.98))
+    cure = f"Content reaches {reach:.2g} from the origin: enlarge the box (scene.aabb_half), or scene.space=contracted."
+    return Check("scale", "wrong" if inside < 0.5 else "look", message, cure)
+
+
+def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
+    steps = (torch.arange(GRID) + 0.5) / GRID
+    y, x = torch.meshgrid(
+        (steps * scene.cameras.height[view]).long(), (steps * scene.cameras.width[view]).long(), indexing="ij"
+    )
+    rays = rays_through_pixels(scene.cameras, PixelIndex(torch.full_like(x, view), x, y), scene.near, scene.far)
+    enter, leave = distances_in_box(rays, scene.aabb)
+    return (leave > enter).float().mean()
+
+
+def _units(low: float, high: float, near: float, far: float) -> str:
+    # near and far in another unit than the poses.
+    factor = ((near * far) / (low * high)) ** 0.5 if near > 0 else far / high
+    off = f"they are {max(factor, 1 / factor):.3g} times too {'large' if factor > 1 else 'small'}."
+    for name, size in (("inches", INCHES), ("feet", FEET), ("centimetres", CENTIMETRES), ("millimetres", 1000.0)):
+        if abs(factor / size - 1) < 0.35:
+            return f" Near and far may be in {name} and the poses in metres: {off}"
+        if abs(factor * size - 1) < 0.35:
+            return f" Near and far may be in metres and the poses in {name}: {off}"
+    return ""
+
+
+CHECKS = (near_and_far, box_in_view, scale)

@@ -1,0 +1,90 @@
+"""Which places of different photographs show the same thing, found from the pixels alone, without any pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf_lightning.data.pixels.store import in_threads
+from nerf_lightning.doctor.features import Corners, match
+from nerf_lightning.nerf.geometry.lenses import unproject
+from nerf_lightning.nerf.types.scene import Cameras
+
+# So many corners of each tell which pictures show the same.
+FEW_CORNERS = 64
+# Each view is compared with so many others.
+PARTNERS = 6
+ALIKE = 0.8
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched places, of all pairs one after the other."""
+
+    view: Int[Tensor, "matches 2"]
+    """Which two views of the scene."""
+    plane: Float[Tensor, "matches 2 2"]
+    """Place in each, in focal lengths from the principal point, x right, y down, the lens undone."""
+    focal: Float[Tensor, "matches 2"]
+    """Focal length of each, in pixels of the shrunk pictures."""
+    rgb: Float[Tensor, "matches 2 3"]
+    """Colour around the place in each."""
+    views: tuple[int, ...]
+    """The views that were looked at: all, or of very many some."""
+
+    def where(self, rows: Bool[Tensor, "matches"] | slice) -> "Matches":
+        """Return some of the matches."""
+        return Matches(self.view[rows], self.plane[rows], self.focal[rows], self.rgb[rows], self.views)
+
+
+def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> Matches:
+    """Return places that are matched between each view and those that look most like it.
+
+    Args:
+        cameras: of all views, at the size of the shrunk pictures.
+        corners: of the views to look at.
+        shown: whether to show a progress bar.
+    """
+    views = sorted(corners)
+    pairs = likely_pairs([corners[view] for view in views])
+
+    def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        both = [views[place] for place in pairs[number]]
+        found = match(*(corners[view] for view in both))
+        plane = [_plane(cameras, view, corners[view].at[found[:, side]]) for side, view in enumerate(both)]
+        rgb = [corners[view].rgb[found[:, side]] for side, view in enumerate(both)]
+        focal = cameras.focal[both].mean(dim=-1).expand(len(found), 2)
+        return torch.tensor(both).expand(len(found), 2), torch.stack(plane, 1), focal, torch.stack(rgb, 1)
+
+    parts = in_threads(matched, len(pairs), "Comparing photographs", shown)
+    none = (torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, 2, 2), torch.zeros(0, 2), torch.zeros(0, 2, 3))
+    view, plane, focal, rgb = (torch.cat(column) for column in zip(none, *parts, strict=True))
+    return Matches(view, plane, focal, rgb, tuple(views))
+
+
+def likely_pairs(corners: Sequence[Corners]) -> list[tuple[int, int]]:
+    """Return pairs of pictures that have most in common, in terms of their clearest corners."""
+    count = len(corners)
+    few = torch.zeros(count, FEW_CORNERS, max((c.descriptor.shape[1] for c in corners), default=0))
+    for number, found in enumerate(corners):
+        kept = found.descriptor[:FEW_CORNERS]
+        few[number, : len(kept)] = kept
+    shared = torch.zeros(count, count)
+    for number in range(count):
+        similar = torch.einsum("cd,vkd->vck", few[number], few)
+        best, there = similar.max(dim=2)
+        mutual = similar.argmax(dim=1).gather(1, there) == torch.arange(FEW_CORNERS)
+        shared[number] = (mutual & (best > ALIKE)).sum(dim=1)
+    shared.fill_diagonal_(-1)
+    ranked = shared.topk(min(PARTNERS, max(count - 1, 0)), dim=1).indices.tolist()
+    return sorted({(min(a, b), max(a, b)) for a in range(count) for b in ranked[a] if shared[a, b] > 0})
+
+
+def _plane(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Float[Tensor, "places 2"]:
+    plane = (at - cameras.center[view]) / cameras.focal[view]
+    if cameras.lens_model == "pinhole":
+        return plane
+    local = unproject(plane, cameras.lens[view], cameras.lens_model)
+    return local[..., :2] / local[..., 2:].clamp(min=0.05)

@@ -1,0 +1,33 @@
+"""What training will take."""
+
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.machine import free_memory
+
+# Bytes that training takes beside the pixels, by measurement of model=fast on a CPU.
+BESIDE_PIXELS = 1.0e9
+MANY_PIXELS = 200e6
+SMALL = 64
+
+
+def memory(evidence: Evidence) -> Check:
+    """Judge the memory that training takes, and the size of the photographs."""
+    pixels = evidence.scene.pixels
+    count = len(pixels.rgba)
+    store = pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
+    needed, free = store + BESIDE_PIXELS, free_memory()
+    message = (
+        f"{count / 1e6:.1f} million pixels take {store / 1e9:.2f} GB; training with model=fast takes about "
+        f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
+    )
+    sides = f"{int(pixels.width.max())} x {int(pixels.height.max())}"
+    if needed > free:
+        return Check("memory", "look", message, "Set scene.downscale=2 (or 4): a quarter (a sixteenth) of the pixels.")
+    if count > MANY_PIXELS:
+        cure = "On a CPU begin with scene.downscale=2 or 4."
+        return Check("memory", "look", f"{message}; photographs of {sides} need many steps", cure)
+    if int(pixels.width.min()) < SMALL or int(pixels.height.min()) < SMALL:
+        return Check("memory", "look", f"{message}; photographs of {sides} show little", "Use larger photographs.")
+    return Check("memory", "ok", message)
+
+
+CHECKS = (memory,)

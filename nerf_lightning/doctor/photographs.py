@@ -1,0 +1,153 @@
+"""Checks of the photographs themselves."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.doctor.view_statistics import THUMBNAIL
+
+# Mean difference of thumbnails, in units of their contrast.
+SAME = 0.012
+# Of the median sharpness.
+BLURRED = 0.4
+# Factors of brightness and of red or blue against green.
+EXPOSURE, TINT = 1.35, 1.2
+# Matches of a pair of photographs that say something of their brightness.
+FEWEST = 20
+EVEN = 0.97
+COLOURS = {"white": 1.0, "black": 0.0}
+
+
+def duplicates(evidence: Evidence) -> Check:
+    """Look for photographs that are there twice."""
+    flat = evidence.looks.thumbnail.flatten(1)
+    flat = flat - flat.mean(dim=1, keepdim=True)
+    contrast = flat.std(dim=1)
+    apart = torch.cdist(flat, flat) / THUMBNAIL / contrast[:, None].clamp(min=1e-3)
+    same = ((apart < SAME) & (contrast[:, None] > 1e-3)).triu(diagonal=1).nonzero()
+    if not len(same):
+        return Check("duplicates", "ok", "no photograph is there twice")
+    scene = evidence.scene
+    held = set(scene.splits["test"]) | set(scene.splits["val"])
+    leak = [pair for pair in same.tolist() if (pair[0] in held) != (pair[1] in held)]
+    pairs = " and ".join(evidence.named([view]) for view in same[0].tolist())
+    message = f"{len(same)} pairs of photographs are all but identical, such as {pairs}"
+    if leak:
+        message += f"; {len(leak)} of them are in training and held out at once, so scores will be too good"
+    return Check("duplicates", "look", message, "Remove one of each (scene.frames, or from the file).")
+
+
+def blur(evidence: Evidence) -> Check:
+    """Look for photographs that are much less sharp than the rest."""
+    sharpness = evidence.looks.sharpness
+    relative = sharpness / sharpness.median().clamp(min=1e-9)
+    bad = (relative < BLURRED).nonzero()[:, 0]
+    if not len(bad):
+        return Check("sharpness", "ok", f"the softest photograph has {100 * float(relative.min()):.0f} % of the usual")
+    worst = bad[relative[bad].argsort()].tolist()
+    message = f"{len(bad)} of {len(relative)} are blurred: {evidence.named(worst)}"
+    return Check("sharpness", "look", message, "Remove them (scene.frames, or from the file), or photograph again.")
+
+
+def exposure(evidence: Evidence) -> Check:
+    """Compare the colours of the same details in different photographs."""
+    matches = evidence.matches
+    if evidence.agreement > 0.3:
+        matches = matches.where(evidence.agrees)
+    gains = gains_of(matches, len(evidence.scene.view_names))
+    if gains is None:
+        return Check("exposure", "ok", "not judged: too few details could be found again")
+    bright = gains.mean(dim=1).exp()
+    tint = (gains - gains[:, 1:2])[:, [0, 2]].abs().amax(dim=1).exp()
+    dark, odd = _jumps(bright, EXPOSURE), _jumps(tint, TINT)
+    if not dark and not odd:
+        spread = float(torch.maximum(bright, 1 / bright).max())
+        return Check("exposure", "ok", f"brightness of the same details differs by {spread:.2f} times at most")
+    words = []
+    if dark:
+        words.append(f"{evidence.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")
+    if odd:
+        words.append(f"{evidence.named(odd)} differ in white balance")
+    cure = "Photograph with fixed exposure and white balance; or even them out, or leave these photographs out."
+    return Check("exposure", "look", "; ".join(words), cure)
+
+
+def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | None:
+    """Return each view's log brightness per channel against the median view, by least squares over pairs."""
+    bright = (matches.rgb > 0.06).all(dim=2).all(dim=1) & (matches.rgb < 0.94).all(dim=2).all(dim=1)
+    view, rgb = matches.view[bright], matches.rgb[bright]
+    keys, number, count = (view[:, 0] * num_views + view[:, 1]).unique(return_inverse=True, return_counts=True)
+    strong = (count >= FEWEST).nonzero()[:, 0].tolist()
+    if len(strong) < 2:
+        return None
+    ratio = (rgb[:, 1] / rgb[:, 0]).log()
+    system, right = 0.05 * torch.eye(num_views), torch.zeros(num_views, 3)
+    for pair in strong:
+        first, second = divmod(int(keys[pair]), num_views)
+        step = ratio[number == pair].median(dim=0).values
+        system[[first, second], [first, second]] += 1.0
+        system[[first, second], [second, first]] -= 1.0
+        right[first] -= step
+        right[second] += step
+    gains = torch.linalg.solve(system, right)
+    return gains - gains.median(dim=0).values
+
+
+def transparency(evidence: Evidence) -> Check:
+    """Judge alpha, and whether colours were multiplied by it already."""
+    scene, looks, name = evidence.scene, evidence.looks, "transparency"
+    if not scene.pixels.has_transparency:
+        return Check(name, "ok", "the photographs are opaque")
+    covered = float(looks.covered.mean())
+    empty = (looks.covered < 0.003).nonzero()[:, 0].tolist()
+    if empty:
+        message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
+        return Check(name, "look", message, "See that alpha was exported, or remove these views.")
+    known = looks.premultiplied
+    if float(known.min()) > 0.995 and scene.background not in ("black", "none"):
+        message = "no half-transparent pixel is brighter than its alpha: colours are multiplied by alpha, it seems"
+        return Check(name, "look", message, "Export straight alpha, or edges get dark seams.")
+    return Check(name, "ok", f"{100 * covered:.0f} % of the pixels show the content, the rest is transparent")
+
+
+def baked_background(evidence: Evidence) -> Check:
+    """Look for a background of one colour that opaque photographs have baked in."""
+    scene, looks, name = evidence.scene, evidence.looks, "background"
+    even = looks.border_even > EVEN
+    if scene.pixels.has_transparency or float(even.float().mean()) < 0.8:
+        return Check(name, "ok", f"{scene.background}, behind what the photographs show")
+    colour = looks.border[even].median(dim=0).values
+    usual = [known for known, level in COLOURS.items() if float((colour - level).abs().max()) < 0.03]
+    words = usual[0] if usual else "of the colour " + ", ".join(f"{255 * float(level):.0f}" for level in colour)
+    if usual == [scene.background]:
+        return Check(name, "ok", f"the photographs are opaque on {words}, and so is the scene's background")
+    cure = (
+        f"Set scene.background={usual[0]}." if usual else "Cut the content out (alpha), or set scene.background=none."
+    )
+    message = f"the photographs are opaque on a background that is {words}, but scene.background is {scene.background}"
+    closed = scene.space == "bounded" and scene.background != "none"
+    return Check(name, "wrong" if closed else "look", message, cure)
+
+
+def masks(evidence: Evidence) -> Check:
+    """Judge how much the masks keep."""
+    if evidence.scene.pixels.mask is None:
+        return Check("masks", "ok", "none")
+    kept = evidence.looks.kept
+    message = f"{100 * float(kept.mean()):.0f} % of the pixels are kept"
+    empty = (kept < 0.02).nonzero()[:, 0].tolist()
+    if float(kept.mean()) < 0.1 or float(kept.min()) < 0.02:
+        message += f"; next to nothing is left of {evidence.named(empty)}" if empty else ""
+        return Check("masks", "look", message, "White is kept: if the masks mean the opposite, invert them.")
+    return Check("masks", "ok", message)
+
+
+def _jumps(factor: Tensor, limit: float) -> list[int]:
+    off = torch.maximum(factor, 1 / factor)
+    order = off.argsort(descending=True)
+    return order[off[order] > limit].tolist()
+
+
+CHECKS = (duplicates, blur, exposure, transparency, baked_background, masks)

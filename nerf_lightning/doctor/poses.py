@@ -1,0 +1,192 @@
+"""Checks of the poses against the pixels: places that photographs share must lie where the cameras say."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
+from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.matches import Matches
+
+FEWEST = 200
+"""Matches below which nothing is said of the whole capture."""
+# More matches than these are thinned out to try other readings.
+ENOUGH = 5000
+# The largest pair of a view, as a share of the usual, from which on a view is judged; and its share of agreeing
+# matches, of the usual, below which its pose is wrong.
+CLEAR_PAIR, ODD = 0.4, 0.45
+# Shares of matches that agree. Right poses reach 0.6 to 0.9; wrong ones 0.03 to 0.3 by chance.
+SOUND, HOPELESS = 0.5, 0.3
+# Another reading must explain so much more.
+BETTER = 0.1
+ZOOMS = (0.25, 0.33, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.4, 1.7, 2.0, 3.0, 4.0)
+# By which the focal length may be off before it is noted, and before it is wrong.
+OFF, FAR_OFF = 1.15, 1.35
+CLEARER = 0.01
+NOT_JUDGED = "not judged: too few details could be found again from one photograph to another"
+
+
+def axes_convention(evidence: Evidence) -> Check:
+    """Judge whether another convention of axes, or the inverse, explains the pixels better."""
+    return _best_reading("axes", evidence, AXES, "the cameras' axes are right, up, back, camera to world")
+
+
+def mirrored(evidence: Evidence) -> Check:
+    """Judge whether the photographs are mirrored."""
+    return _best_reading("mirrored photographs", evidence, PHOTOGRAPHS, "the photographs are not mirrored")
+
+
+def order_of_photographs(evidence: Evidence) -> Check:
+    """Judge whether photographs and poses were paired in another order."""
+    return _best_reading("order of photographs", evidence, ORDERS, "each photograph has its own pose")
+
+
+def poses_and_pixels(evidence: Evidence) -> Check:
+    """Judge whether the poses explain what photographs have in common."""
+    name, matches = "poses and pixels", evidence.matches
+    share, count = evidence.agreement, len(matches.view)
+    if count < FEWEST:
+        return Check(name, "look", NOT_JUDGED, "Look at the poses in doctor.png; larger or sharper photographs help.")
+    message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
+    if share >= SOUND:
+        return Check(name, "ok", message)
+    cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
+    return Check(name, "wrong" if share < HOPELESS else "look", message, cure)
+
+
+def focal_length(evidence: Evidence) -> Check:
+    """Judge whether another focal length explains the pixels better."""
+    name, matches, c2w = "focal length", thinned(evidence.matches, ENOUGH), evidence.scene.cameras.c2w
+    shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
+    if len(matches.view) < FEWEST or max(shares.values()) < HOPELESS:
+        return Check(name, "ok", NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
+    best = max(shares, key=lambda zoom: shares[zoom])
+    off = max(best, 1 / best)
+    focal = float(evidence.scene.cameras.focal.median())
+    if off < OFF or shares[best] < shares[1.0] + CLEARER:
+        return Check(name, "ok", f"{focal:.0f} pixels (median) fits the poses and the pixels best")
+    return Check(
+        name,
+        "wrong" if off >= FAR_OFF else "look",
+        f"the pixels fit the poses better with {best:g} times the focal length: {100 * shares[best]:.0f} % of matched "
+        f"details agree instead of {100 * shares[1.0]:.0f} %",
+        f"Set the focal length to about {best * focal:.0f} pixels (it is {focal:.0f}); often it belongs to photographs "
+        "of another size, or the field of view is that of the other side.",
+    )
+
+
+def single_poses(evidence: Evidence) -> Check:
+    """Judge each view's pose by the views that share most with it."""
+    name, matches, c2w = "single poses", evidence.matches, evidence.scene.cameras.c2w
+    if len(matches.view) < FEWEST or evidence.agreement < SOUND:
+        reason = "too few details" if len(matches.view) < FEWEST else "the poses as a whole do not fit"
+        return Check(name, "ok", f"not judged: {reason}")
+    bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
+    if not bad:
+        return Check(name, "ok", f"{judged} views could be judged, and agree with their neighbours (least {least:.0%})")
+    usual = evidence.agreement
+    fits = {view: fit for view in bad[:10] if (fit := fitting_pose(matches, c2w, view, 0.6 * usual)) is not None}
+    swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items()]
+    return Check(
+        name,
+        "wrong",
+        f"the pose of {evidence.named(bad)} contradicts what its photograph shares with others"
+        + (f"; {'; '.join(swapped)}" if swapped else ""),
+        "Give each photograph its own pose (swap them back), or remove these views (scene.frames, or from the file)."
+        if swapped
+        else "Remove these views (scene.frames, or from the file), or estimate their poses anew.",
+    )
+
+
+def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
+    """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
+
+    One view at a time, without its matches from then on: its neighbours must not suffer for it.
+    """
+    shares, largest = shares_of_views(matches, good, num_views)
+    # From photographs that share little, most matches are mistakes: they accuse nobody.
+    clear = CLEAR_PAIR * largest[largest > 0].median()
+    judged, least = int((largest >= clear).sum()), float(shares[largest >= clear].min())
+    usual, bad = shares[largest >= clear].median(), []
+    for _ in range(num_views):
+        worst = int(torch.where(largest >= clear, shares, 2.0).argmin())
+        if float(largest[worst]) < clear or shares[worst] >= ODD * usual:
+            break
+        bad.append(worst)
+        rows = (matches.view != worst).all(dim=1)
+        matches, good = matches.where(rows), good[rows]
+        shares, largest = shares_of_views(matches, good, num_views)
+    return bad, judged, least
+
+
+def shares_of_views(
+    matches: Matches, good: Bool[Tensor, "matches"], num_views: int
+) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
+    """Return for each view which share of its matches agree, and how many its largest pair has.
+
+    Only the larger pairs of each view count: from pictures that show different things, matches are mistakes.
+    """
+    pair = matches.view[:, 0] * num_views + matches.view[:, 1]
+    _, number, size = pair.unique(return_inverse=True, return_counts=True)
+    size = size[number]
+    most = torch.zeros(num_views, dtype=size.dtype)
+    for side in (0, 1):
+        most.scatter_reduce_(0, matches.view[:, side], size, "amax")
+    shared, agreed = torch.zeros(num_views), torch.zeros(num_views)
+    for side in (0, 1):
+        view = matches.view[:, side]
+        strong = (size >= 0.5 * most[view]).float()
+        shared.index_add_(0, view, strong)
+        agreed.index_add_(0, view, strong * good)
+    return agreed / shared.clamp(min=1), most.float()
+
+
+def thinned(matches: Matches, most: int) -> Matches:
+    """Return at most so many of the matches, evenly."""
+    step = -(-len(matches.view) // most) or 1
+    return matches.where(slice(None, None, step))
+
+
+def fitting_pose(matches: Matches, c2w: Float[Tensor, "views 3 4"], view: int, least: float) -> int | None:
+    """Return the view whose camera fits this view's photograph, if one does."""
+    rows = (matches.view == view).any(dim=1)
+    own = matches.where(rows)
+    best, best_share = None, least
+    for other in range(len(c2w)):
+        if other == view:
+            continue
+        tried = c2w.clone()
+        tried[view] = c2w[other]
+        # A match with the view whose camera is tried says nothing: the centres would coincide.
+        free = ~(own.view == other).any(dim=1)
+        share = float(agreeing(own, tried)[free].float().mean()) if int(free.sum()) >= 20 else 0.0
+        if share > best_share:
+            best, best_share = other, share
+    return best
+
+
+def _share(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> float:
+    return float(agreeing(matches, c2w, zoom).float().mean()) if len(matches.view) else 0.0
+
+
+def _best_reading(name: str, evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
+    scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
+    if len(matches.view) < FEWEST:
+        return Check(name, "ok", NOT_JUDGED)
+    given = _share(matches, scene.cameras.c2w)
+    shares = [_share(changed, poses) for poses, changed in (reading.change(scene, matches) for reading in readings)]
+    best = max(range(len(readings)), key=shares.__getitem__)
+    if shares[best] < max(given + BETTER, HOPELESS):
+        # Where nothing fits, poses_and_pixels says so.
+        return Check(name, "ok", f"{fine}: no other reading fits the pixels better")
+    return Check(
+        name,
+        "wrong",
+        f"the poses look {readings[best].says}: {100 * shares[best]:.0f} % of matched details then agree, instead of "
+        f"{100 * given:.0f} %",
+        readings[best].cure,
+    )
+
+
+CHECKS = (axes_convention, mirrored, order_of_photographs, poses_and_pixels, single_poses, focal_length)

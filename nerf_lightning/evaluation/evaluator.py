@@ -1,0 +1,145 @@
+"""Measure a model on the views of a split: numbers per picture, what they come to, and the protocol of all of them."""
+
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.progress import track
+
+from nerf_lightning import ranks
+from nerf_lightning.console import stderr_console
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
+from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
+from nerf_lightning.evaluation.lpips import load_lpips
+from nerf_lightning.evaluation.metrics import image_metrics, masked_out
+from nerf_lightning.evaluation.metrics_files import summary, write_metrics
+from nerf_lightning.evaluation.protocol import environment, measured_how
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.types.scene import Background, Scene
+
+
+class Scoring:
+    """What is measured and how.
+
+    Args:
+        split: train, val or test.
+        max_views: most views, evenly spread over the split; None for all.
+        quantize: round the render to 8 bits first, as a saved picture would be.
+        num_pictures: how many views keep their pictures, evenly spread.
+        num_worst: how many more, those of the lowest PSNR.
+        lpips_weights: a file with the backbone's weights; None: LPIPS is not computed.
+        lpips_net: the backbone, alex or vgg.
+    """
+
+    def __init__(
+        self,
+        split: Literal["train", "val", "test"] = "test",
+        max_views: int | None = None,
+        quantize: bool = False,
+        num_pictures: int = 5,
+        num_worst: int = 3,
+        lpips_weights: str | None = None,
+        lpips_net: Literal["alex", "vgg"] = "alex",
+    ):
+        if max_views is not None and max_views < 1:
+            raise InputError(f"evaluation.max_views={max_views}: give at least one view, or null for all.")
+        for name, count in (("num_pictures", num_pictures), ("num_worst", num_worst)):
+            if count < 0:
+                raise InputError(f"evaluation.{name}={count}: give 0 or more.")
+        self.split, self.max_views, self.quantize = split, max_views, quantize
+        self.num_pictures, self.num_worst = num_pictures, num_worst
+        self.lpips = load_lpips(lpips_weights, lpips_net)
+
+    def score(
+        self,
+        model: RadianceModel,
+        scene: Scene,
+        background: Background,
+        tile_points: int,
+        folder: Path,
+        origin: dict[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Render the views, write `metrics.json`, `metrics.csv` and pictures into `folder`, and return the metrics.
+
+        Depth errors are in scene units, normal errors in degrees; both only for scenes that know the truth. `origin`
+        says whose numbers these are (`protocol.measured_of`), and is stamped beside them.
+        """
+        views = self._views(scene)
+        shown_views = evenly_spaced_subset(views, self.num_pictures)
+        kept = KeptViews(folder, self.split, self.num_worst)
+        rows: list[dict[str, Any]] = []
+        mine = ranks.every_other(views)
+        for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
+            started = time.perf_counter()
+            picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
+            seconds = time.perf_counter() - started
+            row, shown = self._compare(picture, scene, view, background)
+            rows.append(row | {"seconds": seconds})
+            kept.watch(row["name"], row["psnr"], shown)
+            if view in shown_views:
+                kept.save(row["name"], shown)
+        rows = ranks.in_turn(rows)
+        result = summary(rows) | {
+            "pictures": [scene.view_names[view] for view in shown_views],
+            "worst_views": kept.finish(rows),
+            "protocol": self.protocol(scene, views, background),
+            "origin": origin or {},
+            "environment": environment(),
+        }
+        if ranks.is_first():
+            write_metrics(folder, result)
+        return result
+
+    def protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
+        """Return how these views are measured."""
+        lpips = None if self.lpips is None else self.lpips.net
+        return measured_how(scene, self.split, views, background, self.quantize, lpips)
+
+    def _views(self, scene: Scene) -> list[int]:
+        views = scene.splits.get(self.split, ())
+        if not views:
+            raise InputError(
+                f"The scene {scene.name} has no {self.split} views. Choose another split with evaluation.split=..."
+            )
+        return evenly_spaced_subset(views, len(views) if self.max_views is None else self.max_views)
+
+    def _compare(
+        self, picture: Picture, scene: Scene, view: int, background: Background
+    ) -> tuple[dict[str, Any], ScoredView]:
+        truth = photograph(scene, view, background)
+        if self.quantize:
+            picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
+        kept = scene.pixels.kept(view)
+        row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(picture.rgb, truth, kept)}
+        compared = masked_out(picture.rgb, truth, kept)
+        row["lpips"] = None if self.lpips is None else self.lpips.score(compared, truth)
+        depth = unit_of(scene.to_user) * picture.depth
+        return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
+
+
+def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, float | None]:
+    if scene.truth is None:
+        return {"depth_error": None, "normal_error": None}
+    shape = picture.depth.shape
+    start = int(scene.pixels.offset[view])
+    part = slice(start, start + picture.depth.numel())
+    alpha = (scene.pixels.rgba[part, 3].float() / 255.0).view(shape)
+    kept = scene.pixels.kept(view)
+    if kept is not None:
+        alpha = alpha * kept  # only what is wholly covered is scored
+    true_depth, true_normals = scene.truth.depth[part].view(shape), scene.truth.normals[part].view(*shape, 3)
+    far = scene.far[view].expand(shape)
+    rays = rays_through_pixels(scene.cameras, all_pixels(scene.cameras, view), scene.near, scene.far)
+    surface = surface_depth(picture.depth, picture.opacity, far)
+    normals = normals_from_depth(rays.origins + surface[..., None] * rays.directions)
+    return {
+        "depth_error": depth_error(picture.depth, picture.opacity, far, true_depth, alpha),
+        "normal_error": normal_error(normals, true_normals, alpha),
+    }

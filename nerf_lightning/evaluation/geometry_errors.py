@@ -1,0 +1,64 @@
+"""How close the shape is, for scenes that know theirs: error of the depth and of the normals."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.surfaces import surface_depth
+
+
+def depth_error(
+    depth: Float[Tensor, "*rays"],
+    opacity: Float[Tensor, "*rays"],
+    far: Float[Tensor, "*rays"],
+    truth_depth: Float[Tensor, "*rays"],
+    alpha: Float[Tensor, "*rays"],
+) -> float | None:
+    """Return the mean absolute error of the depth (scene units) over pixels that the scene covers wholly.
+
+    Args:
+        depth: expected distance along the ray, where light that escapes ends at far.
+        opacity: share of the light that was stopped.
+        far: where each ray ends.
+        truth_depth: true distance along the ray; inf where there is none.
+        alpha: true coverage of the pixel, in [0, 1]. At an edge there is no one true depth, so only 1 counts.
+
+    Returns:
+        The error, or None if no pixel can be scored. A hole in the surface counts with depth far.
+    """
+    scored = _opaque(alpha) & truth_depth.isfinite()
+    if not scored.any():
+        return None
+    return float((surface_depth(depth, opacity, far) - truth_depth)[scored].abs().mean())
+
+
+def normal_error(
+    normals: Float[Tensor, "height width 3"],
+    truth_normals: Float[Tensor, "height width 3"],
+    alpha: Float[Tensor, "height width"],
+) -> float | None:
+    """Return the mean angle in degrees between unit normals; None if no pixel can be scored.
+
+    A pixel counts if it and its four neighbours are wholly covered by the scene (`alpha` 1): the differences
+    that make its normal then touch no background. The border, which lacks a neighbour, does not count.
+    """
+    scored = _well_inside(_opaque(alpha)) & (truth_normals.norm(dim=-1) > 0)
+    if not scored.any():
+        return None
+    ours, true = normals[scored], truth_normals[scored]
+    # atan2 keeps its precision at small angles, where acos of a dot product near 1 loses half the digits.
+    angle = torch.atan2(torch.linalg.cross(ours, true).norm(dim=-1), (ours * true).sum(dim=-1))
+    return float(torch.rad2deg(angle).mean())
+
+
+def _well_inside(covered: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    inside = torch.zeros_like(covered)
+    above_and_below = covered[:-2, 1:-1] & covered[2:, 1:-1]
+    beside = covered[1:-1, :-2] & covered[1:-1, 2:]
+    inside[1:-1, 1:-1] = covered[1:-1, 1:-1] & above_and_below & beside
+    return inside
+
+
+def _opaque(alpha: Float[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+    """Tell the pixels that are wholly covered by the scene, where geometry can be scored."""
+    return alpha >= 1.0

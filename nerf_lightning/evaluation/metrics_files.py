@@ -1,0 +1,50 @@
+"""What the rows of all scored views come to, and the files that say it: `metrics.json` and `metrics.csv`."""
+
+import csv
+import statistics
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning import ranks
+from nerf_lightning.escaping import for_csv
+from nerf_lightning.evaluation.lpips import LPIPS_HINT
+from nerf_lightning.evaluation.metrics import mean_over_images, median_over_images, worst_of_images
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import write_json
+from nerf_lightning.machine import peak_memory
+
+METRICS = ("psnr", "ssim", "lpips", "depth_error", "normal_error")
+COLUMNS = ("name", *METRICS, "seconds")
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return mean, median and worst of each metric, the speed of rendering, and the rows themselves.
+
+    `frames_per_second` is that of the median picture in one process; `peak_memory_gigabytes` the most that a process
+    has held since it began, on a GPU the GPU's.
+    """
+    values = [{metric: row[metric] for metric in METRICS} for row in rows]
+    worst = {
+        metric: None if place is None else {"name": rows[place]["name"], "value": rows[place][metric]}
+        for metric, place in worst_of_images(values).items()
+    }
+    seconds = [row["seconds"] for row in rows]
+    result = mean_over_images(values) | {
+        "num_images": len(rows),
+        "median": median_over_images(values),
+        "worst": worst,
+        "seconds_per_image": statistics.fmean(seconds),
+        "frames_per_second": 1.0 / statistics.median(seconds),
+        "peak_memory_gigabytes": round(ranks.largest(peak_memory()), 3),
+        "per_image": rows,
+    }
+    return result if result["lpips"] is not None else result | {"lpips_hint": LPIPS_HINT}
+
+
+def write_metrics(folder: Path, result: dict[str, Any]) -> None:
+    """Write `metrics.json`, and `metrics.csv` with a row per picture."""
+    write_json(folder / "metrics.json", result)
+    with whole_file(folder / "metrics.csv") as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows({key: for_csv(value) for key, value in row.items()} for row in result["per_image"])

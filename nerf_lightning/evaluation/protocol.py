@@ -1,0 +1,197 @@
+"""How a number was measured, and of what: stamped into every result, so that only equals are compared.
+
+`measured_how` is the protocol: two results may stand in one table where theirs agree. `measured_of` names the weights
+and the program; it differs from run to run, and tells where a number came from.
+"""
+
+import hashlib
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+from torch import nn
+
+from nerf_lightning import __version__
+from nerf_lightning.config.identity import UNWATCHED, fingerprint, is_identity
+from nerf_lightning.cores import num_cores
+from nerf_lightning.files.yaml_files import plain_yaml
+from nerf_lightning.nerf.types.scene import Background, Scene
+
+REPOSITORY = Path(__file__).parents[2]
+GIT_SECONDS = 10
+EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras")
+"""What must agree between results of different scenes, too."""
+# Where a capture lies and on what machine a run was made do not make it another setting; its seed is stamped beside.
+NOT_SETTINGS = ("seed", "scene.root", "scene.path", "scene.name", "init_from", "trainer.")
+SETTINGS = ("trainer.max_steps", "trainer.max_epochs", "trainer.clip_norm")
+
+
+def measured_how(
+    scene: Scene, split: str, views: list[int], background: Background, quantize: bool, lpips: str | None
+) -> dict[str, Any]:
+    """Return the protocol of a measurement.
+
+    Args:
+        scene: what was measured on.
+        split: train, val or test.
+        views: which views of it.
+        background: what the pictures were composited over; random means white.
+        quantize: the render was rounded to 8 bits.
+        lpips: the backbone, None where LPIPS is not computed.
+    """
+    sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
+    return {
+        "scene": scene.name,
+        "split": split,
+        "split_hash": split_hash(scene, views),
+        "background": "white" if background == "random" else background,
+        "resolution": [list(size) for size in sizes],
+        "pixels": "8-bit" if quantize else "float",
+        "cameras": "raw",
+        "masks": "none" if scene.pixels.mask is None else "left out",
+        "psnr": "mean of the pictures' own",
+        "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
+        "lpips": None if lpips is None else f"{lpips}, version 0.1",
+        **scene.protocol,
+    }
+
+
+def split_hash(scene: Scene, views: list[int]) -> str:
+    """Return a fingerprint of names, pixels and masks, so that numbers on different pictures are not compared."""
+    digest = hashlib.sha256()
+    for view in views:
+        digest.update(scene.view_names[view].encode("utf-8", "surrogatepass"))
+        digest.update(scene.pixels.view(view).contiguous().numpy().tobytes())
+        kept = scene.pixels.kept(view)
+        if kept is not None:
+            digest.update(kept.numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def measured_of(
+    model: nn.Module, config: str, choices: Mapping[str, str], device: torch.device, precision: str
+) -> dict[str, Any]:
+    """Return what was measured, with what.
+
+    Args:
+        model: with its weights.
+        config: the run's resolved config, as yaml.
+        choices: the names picked from each config group.
+        device: where it is rendered.
+        precision: of the products.
+    """
+    settings = plain_yaml(config, "The run's config")
+    weights = model.state_dict()
+    on_gpu = device.type == "cuda"
+    return {
+        "model": choices.get("model", ""),
+        "scene": choices.get("scene", ""),
+        "seed": settings.get("seed") if isinstance(settings, dict) else None,
+        "config": config_hash(settings),
+        "checkpoint": weights_hash(weights),
+        "version": __version__,
+        "commit": commit(),
+        "device": torch.cuda.get_device_name(device) if on_gpu else device.type,
+        "precision": precision,
+        "parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "megabytes": round(sum(tensor.nbytes for tensor in weights.values()) / 1e6, 3),
+    }
+
+
+def config_hash(settings: Any) -> str:
+    """Return a fingerprint of the settings that decide what is learnt: equal for runs that differ by their seed alone.
+
+    >>> config_hash({"seed": 0, "optimizer": {"lr": 1}}) == config_hash({"seed": 1, "optimizer": {"lr": 1}})
+    True
+    """
+    leaves = _leaves(settings)
+    kept = {
+        key: value
+        for key, value in leaves.items()
+        if key.startswith(SETTINGS) or (is_identity(key) and not key.startswith(NOT_SETTINGS))
+    }
+    return fingerprint(kept | UNWATCHED)
+
+
+def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:
+    """Return a fingerprint of names and values, the same wherever and beside whatever else the weights are kept."""
+    digest = hashlib.sha256()
+    for name in sorted(weights):
+        digest.update(name.encode())
+        digest.update(weights[name].detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def commit() -> str | None:
+    """Return the commit that this program runs from, `-dirty` where files were changed; None where it is installed."""
+    if not (REPOSITORY / ".git").exists():
+        return None
+    command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_SECONDS)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bool = True) -> list[str]:
+    """Return what keeps two results from being compared, in words; LPIPS that one lacks keeps nothing.
+
+    >>> differences({"pixels": "float"}, {"pixels": "8-bit"})
+    ['pixels: float and 8-bit']
+    """
+    keys = [key for key in dict.fromkeys([*one, *other]) if same_scene or key in EVERYWHERE]
+    return [
+        f"{key}: {_said(one, key)} and {_said(other, key)}"
+        for key in keys
+        if one.get(key) != other.get(key) and not (key == "lpips" and None in (one.get(key), other.get(key)))
+    ]
+
+
+def _said(protocol: Mapping[str, Any], key: str) -> str:
+    return str(protocol[key])[:80] if key in protocol else "not said"
+
+
+def _leaves(node: Any, path: str = "") -> dict[str, Any]:
+    if not isinstance(node, dict) or not node:
+        return {path: node}
+    parts = [_leaves(value, f"{path}.{key}" if path else str(key)) for key, value in node.items()]
+    return {key: value for part in parts for key, value in part.items()}
+
+
+LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")
+
+
+def environment() -> dict[str, Any]:
+    """Return what machine this is and which versions are installed; a GPU where there is one."""
+    gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    return {
+        "python": platform.python_version(),
+        **{name: found for name in LIBRARIES if (found := _version(name)) is not None},
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": num_cores(),
+        "memory_gigabytes": round(psutil.virtual_memory().total / 1e9, 1),
+        **({"gpus": gpus, "cuda": torch.version.cuda} if gpus else {}),
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine() or "unknown"

@@ -1,0 +1,158 @@
+"""Which density counts as the surface, and which colour its points have, looked at from the photographs' cameras."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.export.density_grid import Report
+from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.tiles import tiles, weighted_renderings
+from nerf_lightning.nerf.randomness import fold
+from nerf_lightning.nerf.rendering.quadrature import composite
+from nerf_lightning.nerf.rendering.ray_statistics import median_distances
+from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle, RaySamples
+from nerf_lightning.visualization.pictures import to_bytes
+
+# So many rays of the training views are asked.
+RAYS = 1 << 13
+# Rays that stop less light than this have met no surface.
+OPAQUE = 0.9
+# Where four fifths of the rays end it is denser than the level. At the median, thin and grazed surfaces have holes;
+# much lower, surfaces swell.
+QUANTILE = 0.2
+
+
+def surface_level(model: RadianceModel, record: SceneRecord, tile_points: int) -> float | None:
+    """Return the density (per scene unit) at the surface, or None where no ray meets one in the scene's box.
+
+    Rays of the training views are rendered; where each opaque one has half of its light behind it the field is asked
+    for its density. Their first fifth puts the mesh where the pictures see the surface, and leaves few holes.
+    """
+    rays = _some_rays(record)
+    if not rays.near.numel():
+        return None
+    seen = torch.cat(list(_surface_points(model, rays, record, tile_points)))
+    seen = seen[((seen >= record.aabb[0]) & (seen <= record.aabb[1])).all(dim=-1)]
+    if not len(seen):
+        return None
+    device = next(model.parameters()).device
+    density = torch.cat([model.last.density(part.to(device)).cpu() for part in seen.split(tile_points)])
+    density = density[density > 0]  # on the very edge of an empty cell there may be none
+    return float(density.quantile(QUANTILE)) if len(density) else None
+
+
+def _some_rays(record: SceneRecord) -> RayBundle:
+    generator = torch.Generator().manual_seed(0)
+    train = torch.tensor(record.splits["train"])
+    view = train[torch.randint(len(train), (RAYS,), generator=generator)]
+    x, y = (
+        (torch.rand(RAYS, generator=generator, dtype=torch.float64) * size[view]).long()
+        for size in (record.cameras.width, record.cameras.height)
+    )
+    rays = rays_through_pixels(record.cameras, PixelIndex(view, x, y), record.near, record.far)
+    return rays[(rays.far > rays.near).nonzero()[:, 0]]
+
+
+def _surface_points(
+    model: RadianceModel, rays: RayBundle, record: SceneRecord, tile_points: int
+) -> Iterator[Float[Tensor, "points 3"]]:
+    rays, key = rays.to(next(model.parameters()).device), fold(0, "surface")
+    for part, renderings in weighted_renderings(model, rays, record.background, key, tile_points):
+        at = part.origins + median_distances(renderings[-1], part)[:, None] * part.directions
+        yield at[renderings[-1].opacity > OPAQUE].cpu()
+
+
+SeenFrom = Literal["cameras", "normal"]
+# Of a short ray.
+SAMPLES = 8
+
+
+def surface_colors(
+    model: RadianceModel,
+    record: SceneRecord,
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    reach: float,
+    seen_from: SeenFrom,
+    tile_points: int,
+    report: Report,
+    stage: str = "colours",
+) -> UInt8[Tensor, "points 3"]:
+    """Return the colour of each point.
+
+    Args:
+        model: its last level is asked.
+        record: of the scene.
+        points: on the surface, scene frame.
+        normals: unit, outward.
+        reach: half the length of a ray, scene units.
+        seen_from: `normal` looks straight at the surface; `cameras` from the training cameras that face it most
+            squarely, and so along directions that were learnt.
+        tile_points: most points that go through the field at once.
+        report: told how much is done.
+        stage: under this name.
+    """
+    device = next(model.parameters()).device
+    eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    for part in tiles(len(points), max(1, tile_points // SAMPLES)):
+        at, normal = points[part], normals[part]
+        looks = -normal[None] if seen_from == "normal" else looks_from_facing(at, normal, eyes)
+        rgb = [_short_rays(model, at.to(device), look.to(device), reach) for look in looks]
+        colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
+        report(stage, part.stop / max(1, len(points)))
+    return colors
+
+
+def _short_rays(model: RadianceModel, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:
+    # From before the surface to behind it; what light is left then ends there.
+    edges = torch.linspace(0.0, 2.0 * reach, SAMPLES + 1, device=at.device).expand(len(at), SAMPLES + 1)
+    samples, origins = RaySamples(edges), at - reach * look
+    positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
+    output = model.last.field(positions, look[:, None], None)
+    near = torch.zeros(len(at), device=at.device)
+    rays = RayBundle(origins, look, near, near + 2.0 * reach, torch.zeros_like(near, dtype=torch.int64), look)
+    return composite(output, samples, rays, None).rgb
+
+
+# Cameras that are taken of each point.
+NEAREST = 3
+# The ways of all points to all cameras would take gigabytes: so many are held at a time, of 36 bytes.
+PAIRS = 1 << 20
+
+
+def looks_from_nearest(
+    points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
+) -> Float[Tensor, "looks points 3"]:
+    """Return unit directions to each point from the cameras that stand nearest to it."""
+    parts = []
+    for part in _handy(points, eyes):
+        away = points[part, None] - eyes
+        parts.append(_chosen(away, -away.norm(dim=-1)))
+    return functional.normalize(torch.cat(parts, dim=1), dim=-1)
+
+
+def looks_from_facing(
+    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
+) -> Float[Tensor, "looks points 3"]:
+    """Return unit directions to each point from the cameras that its unit normal points at most squarely."""
+    parts = []
+    for part in _handy(points, eyes):
+        away = functional.normalize(points[part, None] - eyes, dim=-1)
+        parts.append(_chosen(away, -(away * normals[part, None]).sum(dim=-1)))
+    return torch.cat(parts, dim=1)
+
+
+def _handy(points: Tensor, eyes: Tensor) -> list[slice]:
+    return list(tiles(len(points), max(1, PAIRS // len(eyes))))
+
+
+def _chosen(away: Float[Tensor, "points cameras 3"], score: Float[Tensor, "points cameras"]) -> Tensor:
+    best = score.topk(min(NEAREST, away.shape[1]), dim=-1).indices
+    return torch.stack([away[torch.arange(len(away)), each] for each in best.T])

@@ -1,0 +1,161 @@
+"""What the photographs show: where the light of each pixel was stopped, whether views agree, which faces are seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.density_grid import Report
+from nerf_lightning.machine import require_memory
+from nerf_lightning.nerf.geometry.cameras import (
+    all_pixels,
+    at_most,
+    camera_coordinates,
+    project,
+    rays_through_pixels,
+)
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.types.scene import Cameras
+
+# Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
+STRAIGHT = 250
+# where rays go through normalised device coordinates.
+BENT = 370
+
+
+@dataclass(frozen=True)
+class SeenView:
+    """One rendered view, world geometry in the working frame, on the CPU."""
+
+    rgb: Float[Tensor, "height width 3"]
+    opacity: Float[Tensor, "height width"]
+    depth: Float[Tensor, "height width"]
+    """Distance along the ray at which the stopped light was stopped."""
+    points: Float[Tensor, "height width 3"]
+    normals: Float[Tensor, "height width 3"]
+    """Unit, facing the camera; zero where the depth has no slope to speak of."""
+
+
+def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
+    """Refuse views whose rays take more memory than can be had, before the first of them is made.
+
+    Raises:
+        InputError: with the largest view, and what would fit.
+    """
+    each = BENT if cameras.ndc is not None else STRAIGHT
+    sizes = {view: int(cameras.width[view]) * int(cameras.height[view]) for view in views}
+    view = max(sizes, key=lambda view: sizes[view])
+    require_memory(
+        f"The view {for_terminal(names[view])} has {int(cameras.width[view])} x {int(cameras.height[view])} pixels and "
+        "is rendered as a whole",
+        sizes[view],
+        lambda pixels: each * pixels,
+        lambda pixels: f"Views of up to {pixels:,} pixels",
+    )
+
+
+def see(model: RadianceModel, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
+    """Render one view; `cameras` are the record's, at whatever size."""
+    picture = render_picture(model, cameras, view, record.near, record.far, record.background, tile_points)
+    depth = picture.depth
+    if cameras.ndc is None:
+        # In normalised device coordinates light that escapes has no distance that could be taken out.
+        depth = surface_depth(depth, picture.opacity, record.far[view].expand(depth.shape))
+    rays = rays_through_pixels(replace(cameras, ndc=None), all_pixels(cameras, view), record.near, record.far)
+    points = rays.origins + depth[..., None] * rays.directions
+    normals = normals_from_depth(points) if min(depth.shape) > 1 else torch.zeros_like(points)
+    return SeenView(picture.rgb, picture.opacity, depth, points, normals)
+
+
+def nearest_views(cameras: Cameras, view: int, others: Sequence[int], count: int) -> list[int]:
+    """Return those of the other views that were taken from nearest."""
+    rest = [other for other in others if other != view]
+    apart = (cameras.c2w[rest, :, 3] - cameras.c2w[view, :, 3]).norm(dim=-1)
+    return [rest[i] for i in apart.argsort()[:count].tolist()]
+
+
+def num_agreeing(
+    points: Float[Tensor, "points 3"],
+    cameras: Cameras,
+    depths: dict[int, Float[Tensor, "_ _"]],
+    views: Sequence[int],
+    tolerance: float,
+) -> Int[Tensor, "points"]:
+    """Return how many of the views see each point as their surface, within a share `tolerance` of the distance.
+
+    Args:
+        points: in the working frame.
+        cameras: of all views.
+        depths: of each view that may be asked; inf where nothing opaque is seen.
+        views: those to ask.
+        tolerance: of the distance.
+    """
+    count = torch.zeros(len(points), dtype=torch.int64)
+    for view in views:
+        count += _sees(points, cameras, view, depths[view], tolerance).long()
+    return count
+
+
+def _sees(points: Tensor, cameras: Cameras, view: int, depth: Tensor, tolerance: float) -> Bool[Tensor, "points"]:
+    local = camera_coordinates(cameras, view, points)
+    distance = local.norm(dim=-1)
+    place = project(cameras, view, points)
+    height, width = depth.shape
+    ahead = (local[:, 2] < 0) & (place >= 0).all(dim=-1) & (place[:, 0] < width) & (place[:, 1] < height)
+    x, y = torch.where(ahead[:, None], place, 0.0).long().unbind(dim=-1)
+    return ahead & ((depth[y, x] - distance).abs() <= tolerance * distance)
+
+
+# Training views that are rendered, and their longer side in pixels.
+VIEWS, LONGEST = 60, 400
+# A vertex is seen where a view's depth is its distance, up to this share of it.
+TOLERANCE = 0.015
+# Pixels that stop less light see no surface.
+OPAQUE = 0.5
+# The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
+RINGS = 2
+
+
+def seen_faces(
+    model: RadianceModel,
+    record: SceneRecord,
+    vertices: Float[ndarray, "vertices 3"],
+    faces: Int[ndarray, "faces 3"],
+    tile_points: int,
+    report: Report,
+    stage: str = "views",
+) -> Int[ndarray, "seen 3"]:
+    """Return the faces that a training view sees, or whose neighbours it does.
+
+    Raises:
+        InputError: there are none.
+    """
+    cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
+    points = torch.from_numpy(vertices).float()
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for number, view in enumerate(views):
+        picture = see(model, record, cameras, view, tile_points)
+        depth = torch.where(picture.opacity > OPAQUE, picture.depth, torch.inf)
+        seen |= num_agreeing(points, cameras, {view: depth}, [view], TOLERANCE) > 0
+        report(stage, (number + 1) / len(views))
+    known = seen.numpy()
+    kept = known[faces].any(axis=1)
+    for _ in range(RINGS):
+        known[faces[kept]] = True
+        kept = known[faces].any(axis=1)
+    if not kept.any():
+        raise InputError(
+            "No training view sees any part of the mesh as its surface: what.threshold is far from the density that "
+            "the views end in. Give another, or what.threshold=null, or what.seen_only=false."
+        )
+    return np.ascontiguousarray(faces[kept])

@@ -1,0 +1,120 @@
+"""Json files: parsed, with their mistakes named, and written."""
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.budgets import allowed, require_within
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.regular import read_text
+
+CURE = "Export it again, or mend it with a json checker."
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a json file.
+
+    Raises:
+        InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
+    """
+    try:
+        text = read_text(path, allowed().json_bytes, CURE, "utf-8-sig")
+        require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
+        content = json.loads(text, object_pairs_hook=_object)
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{path} is not valid json: {error.msg} at {place}. {CURE}") from error
+    except RecursionError as error:
+        raise InputError(f"{path} nests its brackets too deeply to be a capture. {CURE}") from error
+    except ValueError as error:  # a number of thousands of digits
+        raise InputError(f"{path} is not usable json: {error}. {CURE}") from error
+    _require_flat(content, path)
+    return content
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
+        raise ValueError(f"the key {twice[:200]!r} stands twice in one object, and which one holds is not clear")
+    return content
+
+
+def _require_flat(content: object, path: Path) -> None:
+    # What follows walks through the content, and prints parts of it, by recursion.
+    level, most = [content], allowed().json_depth
+    for _ in range(most):
+        level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
+        if not level:
+            return
+    raise InputError(
+        f"{path} nests its brackets too deeply to be a capture (more than budgets.json_depth={most}). {CURE}"
+    )
+
+
+def _children(node: list[Any] | dict[str, Any]) -> Iterable[Any]:
+    return node.values() if isinstance(node, dict) else node
+
+
+def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:
+    """Return the values of keys, all of which must be there.
+
+    Args:
+        content: what the file holds.
+        keys: which.
+        where: file and place, for messages.
+        wanted_by: the format, for messages.
+
+    Raises:
+        InputError: it is no json object, or a key is missing.
+    """
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{where} must be a json object with the keys {listed(keys)}, but it is {type(content).__name__}."
+        )
+    missing = [key for key in keys if key not in content]
+    if missing:
+        raise InputError(
+            f"{where} lacks {listed(missing)}; it has {listed(content) or 'nothing'}. {wanted_by} needs {listed(keys)}."
+        )
+    return [content[key] for key in keys]
+
+
+LARGEST = 1e30
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
+    # Imported late: it brings torch, and Hydra loads this module (of sweeps) before it composes any command's config.
+    from nerf_lightning.files.json_files import read_json
+
+    try:
+        content = read_json(path)
+    except InputError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def number(value: Any) -> float | None:
+    """Return a number from a file, None where it is anything else; NaN is no number."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or abs(value) > LARGEST or value != value:
+        return None
+    return float(value)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a json file, whole or not at all; NaN and infinity, for which json has no word, become null."""
+    with whole_file(path) as part:
+        part.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,49 @@
+"""Sines and cosines of doubling frequencies: the positional encoding of the original NeRF."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.encoders.base import Encoder
+from nerf_lightning.nerf.ranges import require_ranges
+
+MOST_FREQUENCIES = 64
+"""Of higher ones float32 has no digits, and at last no numbers."""
+
+
+class FrequencyEncoder(Encoder):
+    """gamma(x) = (x, sin(2^0 x), cos(2^0 x), ..., sin(2^(L-1) x), cos(2^(L-1) x)), Eq. 4 of arXiv 2003.08934.
+
+    The paper writes a factor pi inside the sines, its released code has none; without it a scene of a few units
+    fits into one period of the lowest frequency. L = 10 for positions and 4 for directions.
+
+    Args:
+        num_frequencies: L.
+        include_input: whether x itself comes first.
+        with_pi: whether the frequencies carry the paper's factor pi.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, num_frequencies: int = 10, include_input: bool = True, with_pi: bool = False):
+        super().__init__()
+        require_ranges({"num_frequencies": num_frequencies}, {"num_frequencies": (0, MOST_FREQUENCIES)})
+        self.include_input = include_input
+        scale = math.pi if with_pi else 1.0
+        self.register_buffer("frequencies", scale * 2.0 ** torch.arange(num_frequencies), persistent=False)
+
+    @property
+    def out_dim(self) -> int:
+        """3 (2 L + 1) with the input, 6 L without."""
+        return self.in_dim * (2 * self.frequencies.numel() + int(self.include_input))
+
+    def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
+        """Return the features, frequency by frequency."""
+        phase = points[..., None, :] * self.frequencies.to(points.dtype)[:, None]
+        waves = torch.stack([phase.sin(), phase.cos()], dim=-2).flatten(-3)
+        return torch.cat([points, waves], dim=-1) if self.include_input else waves
+
+    def reset_parameters(self) -> None:
+        """Nothing is learnt here."""

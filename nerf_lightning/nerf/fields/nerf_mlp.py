@@ -1,0 +1,178 @@
+"""The MLP of the original NeRF (Fig. 7, arXiv 2003.08934)."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
+from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.geometry.boxes import require_box
+from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
+from nerf_lightning.nerf.products import Linear, linear
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.types.renderings import FieldOutput
+from nerf_lightning.nerf.types.scene import Scene
+
+# Keras' momentum 0.99 and epsilon 1e-3 in torch's terms.
+MOMENTUM, EPSILON = 0.01, 1e-3
+MOST_LAYERS = 100
+
+
+class NerfMLP(Field):
+    """Eight layers of 256 with one skip; density before the direction enters; a 128-wide colour head.
+
+    Args:
+        position_encoder: gamma(x).
+        direction_encoder: gamma(d).
+        depth: number of trunk layers.
+        width: width of the trunk and of the feature; the colour head has half of it.
+        skip: index of the trunk layer (counted from 0) whose input is joined by the encoded position again; the
+            paper's is 5, after the layer at index 4. None for no skip.
+        density_activation: relu as in the paper, or softplus, which cannot die.
+        density_bias: added to the raw density before its activation; negative values start from empty space.
+        density_noise: standard deviation of the normal noise added to the raw density while training.
+        batch_norm: normalise each hidden layer over the batch, as the article does; forbids tiles.
+        xavier: Glorot uniform weights and zero biases, as Keras has them; False for torch's own start.
+        contraction: see all space contracted around the scene's box into a ball of radius 2; None: as the scene's
+            space. Otherwise positions enter as they are, as in the paper.
+    """
+
+    aabb: Tensor
+
+    def __init__(
+        self,
+        position_encoder: Encoder,
+        direction_encoder: Encoder,
+        depth: int = 8,
+        width: int = 256,
+        skip: int | None = 5,
+        density_activation: Literal["relu", "softplus"] = "relu",
+        density_bias: float = 0.0,
+        density_noise: float = 0.0,
+        batch_norm: bool = False,
+        xavier: bool = True,
+        contraction: bool | None = None,
+    ):
+        super().__init__()
+        if not 1 <= depth <= MOST_LAYERS:
+            raise ValueError(f"depth={depth}: give 1 to {MOST_LAYERS} layers")
+        require_ranges({"width": width}, {"width": (2, 1 << 20)})
+        if skip is not None and not 0 < skip < depth:
+            raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
+        if position_encoder.needs_unit_cube:
+            raise ValueError(f"{type(position_encoder).__name__} needs a field that knows the scene's box: field=hash")
+        require_direction_encoder(direction_encoder)
+        self.position_encoder = position_encoder
+        self.direction_encoder = direction_encoder
+        self.skip = skip
+        self.density_activation = density_activation
+        self.density_bias = density_bias
+        self.density_noise = density_noise
+        self.needs_whole_batch = batch_norm
+        self.xavier = xavier
+        self.contracted = Contracted(contraction)
+        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        inputs = position_encoder.out_dim
+        sizes = [inputs] + [width] * (depth - 1)
+        if skip is not None:
+            sizes[skip] += inputs
+        self.trunk = nn.ModuleList(_hidden(size, width, batch_norm) for size in sizes)
+        self.density_head = nn.Linear(width, 1)
+        self.feature = Linear(width, width)
+        self.color_hidden = _hidden(width + direction_encoder.out_dim, width // 2, batch_norm)
+        self.color_head = nn.Linear(width // 2, 3)
+        self.reset_parameters()
+
+    @property
+    def needs_random(self) -> bool:  # type: ignore[override]
+        """Where noise is added to the density."""
+        return self.density_noise > 0
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of the scene's space and box."""
+        self.contracted.fit_to(scene)
+        self.aabb.copy_(scene.aabb)
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: a box without inside.
+        """
+        require_box(self.aabb)
+
+    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Return the density per unit length, without paying for colour."""
+        return self._activate(_exactly(self.density_head, self._trunk(positions))[..., 0], None)
+
+    def forward(
+        self,
+        positions: Float[Tensor, "*rays samples 3"],
+        directions: Float[Tensor, "*rays 1 3"],
+        random: RayRandom | None,
+    ) -> FieldOutput:
+        """Return density and colour; density does not depend on the direction."""
+        hidden = self._trunk(positions)
+        raw_density = _exactly(self.density_head, hidden)[..., 0]
+        feature = self.feature(hidden)
+        # Encoded once per ray, not once per sample.
+        direction = self.direction_encoder(directions).to(feature.dtype)
+        direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
+        raw_rgb = _exactly(self.color_head, self.color_hidden(torch.cat([feature, direction], dim=-1)))
+        noise = None
+        if random is not None and self.density_noise > 0:
+            noise = self.density_noise * random.normal("density_noise", raw_density.shape[-1])
+        return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator."""
+        self.position_encoder.reset_parameters()
+        self.direction_encoder.reset_parameters()
+        for module in self.modules():
+            if isinstance(module, nn.BatchNorm1d):
+                module.reset_parameters()
+            elif isinstance(module, nn.Linear):
+                module.reset_parameters()
+                if self.xavier:
+                    nn.init.xavier_uniform_(module.weight)
+                    nn.init.zeros_(module.bias)
+
+    def _trunk(self, positions: Tensor) -> Tensor:
+        if self.contracted.is_on():
+            positions = contract(in_unit_ball(positions, self.aabb))
+        encoded = self.position_encoder(positions)
+        hidden = encoded
+        for index, layer in enumerate(self.trunk):
+            if index == self.skip:
+                hidden = torch.cat([hidden, encoded.to(hidden.dtype)], dim=-1)
+            hidden = layer(hidden)
+        return hidden
+
+    def _activate(self, raw: Tensor, noise: Tensor | None) -> Tensor:
+        # Densities multiply lengths of 1e-3 and enter exponentials: always in float32.
+        raw = raw.float() + self.density_bias
+        if noise is not None:
+            raw = raw + noise
+        return functional.relu(raw) if self.density_activation == "relu" else functional.softplus(raw)
+
+
+class _BatchNorm(nn.BatchNorm1d):
+    """Batch normalisation of the last axis, whatever the leading ones."""
+
+    def forward(self, features: Float[Tensor, "*points width"]) -> Float[Tensor, "*points width"]:
+        return super().forward(features.flatten(0, -2)).view_as(features)
+
+
+def _exactly(head: nn.Linear, features: Tensor) -> Tensor:
+    # With so few outputs float32 costs nothing, and a density or a colour keeps the digits that it has.
+    return linear(features, head.weight, head.bias, "float32")
+
+
+def _hidden(inputs: int, outputs: int, batch_norm: bool) -> nn.Sequential:
+    linear: list[nn.Module] = [Linear(inputs, outputs)]
+    norm: list[nn.Module] = [_BatchNorm(outputs, eps=EPSILON, momentum=MOMENTUM)] if batch_norm else []
+    return nn.Sequential(*linear, *norm, nn.ReLU(inplace=True))

@@ -1,0 +1,140 @@
+"""Cameras and their rays: pixels to rays, rays to pixels, focal lengths that follow the image's size.
+
+Letters: `c2w` camera-to-world, columns right, up, back, centre. A camera looks along -z; pixel centres lie at +0.5.
+`plane` is a place in the image in focal lengths from the principal point, y down: ((x - cx) / fx, (y - cy) / fy).
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
+from nerf_lightning.nerf.geometry.ndc import ndc_rays
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
+from nerf_lightning.nerf.types.scene import Cameras
+
+
+def focal_from_fov(width: int | float, fov: float) -> float:
+    """Return the focal length in pixels of a camera that sees `fov` radians across `width` pixels.
+
+    >>> round(focal_from_fov(800, 0.6911112070083618), 2)
+    1111.11
+    """
+    return 0.5 * width / math.tan(0.5 * fov)
+
+
+def pinhole_cameras(c2w: Float[Tensor, "views 3 4"], focal: float, width: int, height: int) -> Cameras:
+    """Return cameras without a lens that share one focal length (pixels) and one size, centred on the image."""
+    views = c2w.shape[0]
+    return Cameras(
+        c2w=c2w,
+        focal=c2w.new_full((views, 2), focal),
+        center=c2w.new_tensor([width / 2, height / 2]).repeat(views, 1),
+        lens=c2w.new_zeros(views, 6),
+        lens_model="pinhole",
+        width=torch.full((views,), width, dtype=torch.int64, device=c2w.device),
+        height=torch.full((views,), height, dtype=torch.int64, device=c2w.device),
+    )
+
+
+def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, "*views"]) -> Cameras:
+    """Return the same cameras for images of another size: focal length and principal point follow the pixels.
+
+    The lens stays: its coefficients are for lengths in focal lengths.
+    """
+    scale = torch.stack([width / cameras.width, height / cameras.height], dim=-1).to(cameras.focal)
+    return replace(cameras, focal=cameras.focal * scale, center=cameras.center * scale, width=width, height=height)
+
+
+@own_precision
+def rays_through_pixels(
+    cameras: Cameras,
+    pixels: PixelIndex,
+    near: Float[Tensor, "views"],
+    far: Float[Tensor, "views"],
+) -> RayBundle:
+    """Return the rays through the centres of pixels; near and far are given per view (scene units).
+
+    The direction in camera axes is ((x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -1), undistorted by the lens where the
+    camera has one, rotated into the world and brought to unit length. Where the cameras say so, the ray is then bent
+    into normalised device coordinates, and near and far with it.
+    """
+    view = pixels.view
+    at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
+    plane = (at - cameras.center[view]) / cameras.focal[view]
+    if cameras.lens_model == "pinhole":
+        local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
+    else:
+        local = _turned(unproject(plane, cameras.lens[view], cameras.lens_model))
+    c2w = cameras.c2w[view]
+    directions = (c2w[..., :3] @ local[..., None])[..., 0]
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view, view_directions=directions)
+    return rays if cameras.ndc is None else ndc_rays(rays, cameras.ndc[view])
+
+
+def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
+    """Return every pixel of one view as a picture of indices, shape (height, width)."""
+    device = cameras.c2w.device
+    y, x = torch.meshgrid(
+        torch.arange(int(cameras.height[view]), device=device),
+        torch.arange(int(cameras.width[view]), device=device),
+        indexing="ij",
+    )
+    return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
+
+
+def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
+    """Return a coarse grid of pixels in every view, its corners and borders included, shape (views, pixels)."""
+    share = torch.linspace(0.0, 1.0, per_side, dtype=torch.float64, device=cameras.c2w.device)
+    across, down = torch.cartesian_prod(share, share).unbind(dim=-1)
+    x, y = ((size - 1)[:, None] * part for size, part in ((cameras.width, across), (cameras.height, down)))
+    view = torch.arange(cameras.c2w.shape[0], device=x.device)[:, None].expand(x.shape)
+    return PixelIndex(view=view, x=x.round().long(), y=y.round().long())
+
+
+@own_precision
+def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    """Return world points in the axes of one camera: right, up, back."""
+    c2w = cameras.c2w[view]
+    return (points - c2w[:, 3]) @ c2w[:, :3]
+
+
+def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 2"]:
+    """Return where world points appear in one view, in pixels from the upper left corner (x, y).
+
+    Only points that the camera sees have a place: elsewhere (behind a pinhole, far outside the image of a lens that
+    folds back there) the formula gives a number that means nothing.
+    """
+    local = camera_coordinates(cameras, view, points)
+    if cameras.lens_model == "pinhole":
+        plane = torch.stack([local[..., 0], -local[..., 1]], dim=-1) / -local[..., 2:]
+    else:
+        plane = project_plane(_turned(local), cameras.lens[view], cameras.lens_model)
+    return plane * cameras.focal[view] + cameras.center[view]
+
+
+def image_plane(cameras: Cameras, view: int, per_side: int = 33) -> Float[Tensor, "points 2"]:
+    """Return a coarse grid over one image, its border and corners included, as places in the plane."""
+    x, y = (
+        torch.linspace(0.5, float(size[view]) - 0.5, per_side).to(cameras.focal)
+        for size in (cameras.width, cameras.height)
+    )
+    return (torch.cartesian_prod(x, y) - cameras.center[view]) / cameras.focal[view]
+
+
+def _turned(directions: Float[Tensor, "*rays 3"]) -> Float[Tensor, "*rays 3"]:
+    # From a camera's axes (right, up, back) to those of its lens (right, down, forward), or the other way.
+    x, y, z = directions.unbind(dim=-1)
+    return torch.stack([x, -y, -z], dim=-1)
+
+
+def at_most(cameras: Cameras, longest: int) -> Cameras:
+    """Return the cameras for pictures whose longer side has at most `longest` pixels."""
+    share = (longest / torch.maximum(cameras.width, cameras.height)).clamp(max=1.0)
+    width, height = ((share * size).round().long().clamp(min=1) for size in (cameras.width, cameras.height))
+    return resized(cameras, width, height)

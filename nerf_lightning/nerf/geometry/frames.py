@@ -1,0 +1,136 @@
+"""A working frame for a capture: which way is up, where the middle is, and how large a unit should be."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerf_lightning.nerf.products import own_precision
+
+# An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
+CLEAR = 0.05
+
+LEAST_UNIT, LARGEST_UNIT = 1e-12, 1e12
+"""Scene units in the user's own: from atoms to planets."""
+
+
+@own_precision
+def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
+    """Return the point that is nearest to all optical axes, by least squares.
+
+    sum (I - d d^T) x = sum (I - d d^T) o. Where the axes are all but parallel, the cameras' mean is a weak second.
+
+    >>> eyes = torch.tensor([[4.0, 0, 1], [0.0, 4, 1]])
+    >>> from nerf_lightning.nerf.geometry.poses import look_at
+    >>> focus_point(look_at(eyes, torch.tensor([[0.0, 0, 1]] * 2), torch.tensor([0.0, 0, 1]))).round(decimals=3)
+    tensor([0., 0., 1.])
+    """
+    origins, along = c2w[:, :, 3], c2w[:, :, 2]
+    across = torch.eye(3).to(c2w) - along[:, :, None] * along[:, None, :]
+    weak = 1e-6 * torch.eye(3).to(c2w)
+    target = (across @ origins[..., None])[..., 0].mean(dim=0) + weak @ origins.mean(dim=0)
+    return torch.linalg.solve(across.mean(dim=0) + weak, target)
+
+
+@own_precision
+def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
+    """Return the unit vector that points up in the world, as the photographer held the camera.
+
+    Photographs are level: their rows are horizontal, so up is what all right axes are perpendicular to; of photographs
+    that lie on their side, what all up axes are perpendicular to. The clearer of the two counts. Where neither is
+    clear, since all cameras look the same way, it is the mean of their up axes.
+    """
+    right, up, back = c2w[:, :, :3].unbind(dim=-1)
+    mean_up = functional.normalize(up.mean(dim=0), dim=0)
+    best, axis = CLEAR, None
+    for rows in (right, up):
+        values, vectors = torch.linalg.eigh(rows.mT @ rows / len(rows))
+        clear = float(values[1] - values[0])
+        if clear > best and float(values[0]) < 0.5 * float(values[1]):
+            best, axis, upright = clear, vectors[:, 0], rows is right
+    if axis is None:
+        return mean_up
+    # On their side the photographs do not say which end is up: people look down on things.
+    sign = (axis @ mean_up) if upright else (axis @ back.mean(dim=0))
+    return axis if sign >= 0 else -axis
+
+
+@own_precision
+def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Return the smallest rotation that takes `up` (unit) to +z.
+
+    >>> (upright_rotation(torch.tensor([0.0, 1, 0])) @ torch.tensor([0.0, 1, 0])).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    z = torch.tensor([0.0, 0.0, 1.0]).to(up)
+    cross, cosine = torch.linalg.cross(up, z), float(up @ z)
+    if cosine < -1.0 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0]).to(up))
+    skew = torch.zeros(3, 3).to(up)
+    skew[0, 1], skew[0, 2], skew[1, 2] = -cross[2], cross[1], -cross[0]
+    skew = skew - skew.mT
+    return torch.eye(3).to(up) + skew + skew @ skew / (1.0 + cosine)
+
+
+def gaps_around(azimuth: Float[Tensor, "views"]) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:
+    """Return azimuths in degrees in order, and the way from each to the next, the last one's to the first.
+
+    >>> [part.tolist() for part in gaps_around(torch.tensor([90.0, 0.0, -120.0]))]
+    [[-120.0, 0.0, 90.0], [120.0, 90.0, 150.0]]
+    """
+    around = azimuth.sort().values
+    return around, torch.cat([around[1:], around[:1] + 360]) - around
+
+
+def average_pose(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3 4"]:
+    """Return the pose in the middle of cameras that look the same way, as LLFF takes it."""
+    back = functional.normalize(c2w[:, :, 2].sum(dim=0), dim=0)
+    right = functional.normalize(torch.linalg.cross(c2w[:, :, 1].sum(dim=0), back), dim=0)
+    return torch.stack([right, torch.linalg.cross(back, right), back, c2w[:, :, 3].mean(dim=0)], dim=-1)
+
+
+def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit: float) -> Float[Tensor, "4 4"]:
+    """Return `to_user`: x_user = unit * rotation x + center.
+
+    Args:
+        rotation: the working frame's axes, as columns in the user's frame.
+        center: the working frame's origin in the user's frame.
+        unit: how many of the user's units make one of the scene's.
+    """
+    matrix = torch.eye(4, dtype=rotation.dtype)
+    matrix[:3, :3], matrix[:3, 3] = unit * rotation, center
+    return matrix
+
+
+@own_precision
+def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return poses given in the user's frame as the working frame sees them."""
+    centers = points_from_user(c2w[:, :, 3], to_user)
+    rotation = to_user[:3, :3] / unit_of(to_user)
+    return torch.cat([rotation.mT @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
+
+
+@own_precision
+def points_from_user(points: Float[Tensor, "points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "points 3"]:
+    """Return points given in the user's frame as the working frame sees them."""
+    rotation = to_user[:3, :3] / unit_of(to_user)
+    return (points - to_user[:3, 3]) @ rotation / unit_of(to_user)
+
+
+@own_precision
+def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "*points 3"]:
+    """Return points of the working frame in the user's frame."""
+    return points @ to_user[:3, :3].mT + to_user[:3, 3]
+
+
+@own_precision
+def directions_to_user(
+    directions: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]
+) -> Float[Tensor, "*points 3"]:
+    """Return directions of the working frame in the user's frame, of the same length."""
+    return directions @ to_user[:3, :3].mT / unit_of(to_user)
+
+
+def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
+    """Return how many of the user's units make one of the scene's."""
+    return float(torch.linalg.det(to_user[:3, :3]).abs()) ** (1 / 3)

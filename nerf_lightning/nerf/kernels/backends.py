@@ -1,0 +1,155 @@
+"""Which twin of a kernel runs: numba on the CPU, triton on CUDA, plain torch elsewhere and where those are missing."""
+
+import functools
+import importlib
+import logging
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+import torch
+
+log = logging.getLogger(__name__)
+
+
+_reasons: dict[str, str] = {}
+
+
+@functools.cache
+def twin(module: str) -> ModuleType | None:
+    """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible."""
+    library = "triton" if module.endswith(".cuda") else "numba"
+    try:
+        if library == "numba":
+            _configure_numba()
+        found = _imported(module)
+        # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
+        found.trial()
+        return found
+    except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
+        _reasons[module] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        _warn_once(library, _reasons[module])
+        return None
+
+
+def why_not(module: str) -> str:
+    """Return why there is no twin, once `twin` has said so."""
+    return _reasons.get(module, "unknown")
+
+
+def _imported(module: str) -> ModuleType:
+    name = f"nerf_lightning.nerf.kernels.{module}"
+    try:
+        return importlib.import_module(name)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
+            raise
+    _cache_elsewhere(
+        "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
+        "that is set). Set NUMBA_CACHE_DIR to a folder that can be written."
+    )
+    return importlib.import_module(name)
+
+
+@functools.cache
+def _cache_elsewhere(reason: str) -> None:
+    """Let numba keep what it compiles in a folder that lasts as long as this process."""
+    import numba
+
+    folder = tempfile.TemporaryDirectory(prefix="nerf-numba-")
+    _kept.append(folder)
+    numba.config.CACHE_DIR = folder.name  # type: ignore[attr-defined]
+    log.warning("Until then every start compiles the kernels anew, which takes about a minute: %s", reason)
+
+
+_kept: list[tempfile.TemporaryDirectory[str]] = []
+"""Folders that go when the process does."""
+
+
+_switched_off: set[str] = set()
+
+
+@contextmanager
+def without(*modules: str) -> Iterator[None]:
+    """Let the torch twins of some kernels run instead, for comparisons."""
+    former = set(_switched_off)
+    _switched_off.update(modules)
+    try:
+        yield
+    finally:
+        _switched_off.clear()
+        _switched_off.update(former)
+
+
+def is_on(module: str) -> bool:
+    """Tell whether a kernel has not been switched off."""
+    return module not in _switched_off
+
+
+def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
+    """Return a numba module for tensors on the CPU, with its threads set to torch's; else None."""
+    if device.type != "cpu" or not is_on(module):
+        return None
+    found = twin(module)
+    if found is not None:
+        set_threads()
+    return found
+
+
+def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
+    """Return a triton module for tensors on a CUDA device; else None."""
+    return twin(module) if device.type == "cuda" else None
+
+
+def can_compile(device: torch.device) -> bool:
+    """Tell whether torch.compile has what it needs: a C++ compiler on the CPU."""
+    return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
+
+
+def set_threads() -> None:
+    """Give numba as many threads as torch has."""
+    import numba
+
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+
+
+def _configure_numba() -> None:
+    import numba
+
+    # Straight code of four equal operations becomes one of four lanes.
+    numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
+    # The layer that every platform has, and whose threads sleep while torch works.
+    if "NUMBA_THREADING_LAYER" not in os.environ:
+        numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
+    _require_own_cache(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+
+
+def _require_own_cache(folder: str) -> None:
+    """Let numba read nothing of a folder that others can write to: what it keeps there are programs, and pickles."""
+    if not folder:
+        return
+    try:
+        os.makedirs(folder, mode=0o700, exist_ok=True)
+        about = os.stat(folder)
+    except OSError:
+        return  # numba itself notices
+    if hasattr(os, "geteuid") and (about.st_uid != os.geteuid() or stat.S_IMODE(about.st_mode) & 0o022):
+        _cache_elsewhere(
+            f"NUMBA_CACHE_DIR is {folder}, which belongs to somebody else or can be written by others "
+            f"(mode {stat.S_IMODE(about.st_mode):04o}). Name a folder of your own with NUMBA_CACHE_DIR."
+        )
+
+
+@functools.cache
+def _warn_once(library: str, reason: str) -> None:
+    log.warning(
+        "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. "
+        "Reinstall it (pip install --force-reinstall %s), or read its list of supported machines.",
+        library,
+        reason,
+        library,
+    )

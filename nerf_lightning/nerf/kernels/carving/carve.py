@@ -1,0 +1,52 @@
+"""What the photographs' frames and alpha say of space before anything is learnt: seen at all, and not seen through."""
+
+from types import ModuleType
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.kernels.backends import cpu_twin
+from nerf_lightning.nerf.kernels.carving import reference as carving_reference
+from nerf_lightning.nerf.types.scene import Scene
+
+
+def possible_cells(
+    scene: Scene, centers: Float[Tensor, "cells 3"], half_diagonal: float, most_views: int = 48
+) -> Bool[Tensor, "cells"]:
+    """Tell the cells that training views see and through which none of them looks at nothing.
+
+    A cell is left out where no view sees it, and where some view sees it whole and shows only pixels of alpha 0 there:
+    a ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha
+    nothing is carved.
+
+    Args:
+        scene: cameras and pixels.
+        centers: the cells' centres in scene units.
+        half_diagonal: from a cell's centre to its corner.
+        most_views: carving looks at so many views, evenly spread.
+    """
+    views, steps = scene.splits["train"], _steps(scene, centers)
+    centers = centers.t().contiguous().t()  # an axis after the other in memory, as kernels like to read them
+    cells = torch.zeros(centers.shape[0], dtype=torch.bool)
+    for view in views:
+        if bool(cells.all()):
+            break
+        steps.add_seen(cells, scene.cameras, view, centers, half_diagonal)
+    if scene.pixels.has_transparency:
+        for view in evenly_spaced_subset(views, most_views):
+            steps.carve(cells, scene.cameras, view, centers, half_diagonal, _matter(scene, view))
+    return cells
+
+
+def _steps(scene: Scene, centers: Tensor) -> ModuleType:
+    plain = scene.cameras.lens_model == "pinhole" and centers.dtype == scene.cameras.c2w.dtype == torch.float32
+    twin = cpu_twin("carving.cpu", centers.device) if plain else None
+    return carving_reference if twin is None else twin
+
+
+def _matter(scene: Scene, view: int) -> Bool[Tensor, "height width"]:
+    matter = scene.pixels.view(view)[..., 3] > 0
+    kept = scene.pixels.kept(view)
+    return matter if kept is None else matter | ~kept  # what is masked may be anything

@@ -1,0 +1,172 @@
+"""The hash grid for CUDA: a program takes a block of points on one level; the backward pass adds atomically.
+
+Everything is float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
+"""
+
+import functools
+from typing import TYPE_CHECKING, no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+
+if TYPE_CHECKING:
+    from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+
+BLOCK = 128
+
+
+def forward(
+    table: Float[Tensor, "entries features"], points: Float[Tensor, "points 3"], layout: "HashGridLayout"
+) -> Float[Tensor, "points out"]:
+    """Return the features."""
+    levels, features = len(layout.resolutions), table.shape[1]
+    out = torch.empty(points.shape[0], levels * features, device=points.device)
+    if points.shape[0]:
+        grid = (triton.cdiv(points.shape[0], BLOCK), levels)
+        _forward[grid](table, points, *_levels(layout, points.device), out, points.shape[0], levels, features, BLOCK)
+    return out
+
+
+def add_table_gradient(
+    into: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    grad: Float[Tensor, "points out"],
+    layout: "HashGridLayout",
+) -> None:
+    """Add the gradient with respect to the table to `into`."""
+    levels, features = len(layout.resolutions), into.shape[1]
+    if points.shape[0]:
+        grid = (triton.cdiv(points.shape[0], BLOCK), levels)
+        _backward[grid](into, points, *_levels(layout, points.device), grad, points.shape[0], levels, features, BLOCK)
+
+
+def point_gradient(
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    grad: Float[Tensor, "points out"],
+    layout: "HashGridLayout",
+) -> Float[Tensor, "points 3"]:
+    """Return the gradient with respect to the points, by the reference: it is wanted seldom."""
+    with torch.enable_grad():
+        leaf = points.detach().requires_grad_()
+        interpolate_torch(table.float(), leaf, layout).backward(grad)
+    assert leaf.grad is not None
+    return leaf.grad
+
+
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises."""
+    from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+
+    layout, points = hash_grid_layout(2, 6, 2, 8), torch.full((4, 3), 0.3, device=device)
+    table, grad = torch.zeros(layout.offsets[-1], 2, device=device), torch.ones(4, 4, device=device)
+    forward(table, points, layout)
+    add_table_gradient(table, points, grad, layout)
+    if not bool(table.isfinite().all()):  # read, so that a fault in the kernels shows here
+        raise RuntimeError("a trial of its kernels gave numbers that are not finite")
+
+
+# Kept: made anew, these numbers would go from the host to the device in each call, and the host would wait for it.
+@functools.cache
+def _levels(layout: "HashGridLayout", device: torch.device) -> tuple[Tensor, Tensor, Tensor, int]:
+    hashed = [int(layout.is_hashed(level)) for level in range(len(layout.resolutions))]
+    numbers = (layout.resolutions, layout.offsets[:-1], hashed)
+    resolution, offset, hashed_there = (torch.tensor(row, dtype=torch.int32, device=device) for row in numbers)
+    return resolution, offset, hashed_there, layout.table_size - 1
+
+
+@triton.jit
+@no_type_check
+def _cell(points, row, axis, valid, resolution):
+    coordinate = tl.load(points + row * 3 + axis, mask=valid, other=0.0)
+    scaled = tl.minimum(tl.maximum(coordinate, 0.0), 1.0) * resolution.to(tl.float32)
+    cell = tl.minimum(scaled.to(tl.int32), resolution - 1)
+    return cell, scaled - cell.to(tl.float32)
+
+
+@triton.jit
+@no_type_check
+def _entry(x, y, z, resolution, offset, hashed, mask):
+    spread = x.to(tl.uint32) ^ (y.to(tl.uint32) * 2654435761) ^ (z.to(tl.uint32) * 805459861)
+    side = resolution + 1
+    dense = x + side * (y + side * z)
+    return offset + tl.where(hashed != 0, (spread & mask).to(tl.int32), dense)
+
+
+@triton.jit
+@no_type_check
+def _locate(points, row, valid, resolution):
+    x, fx = _cell(points, row, 0, valid, resolution)
+    y, fy = _cell(points, row, 1, valid, resolution)
+    z, fz = _cell(points, row, 2, valid, resolution)
+    return x, y, z, fx, fy, fz
+
+
+@triton.jit
+@no_type_check
+def _corner(corner: tl.constexpr, x, y, z, fx, fy, fz, resolution, offset, hashed, mask):
+    a: tl.constexpr = corner & 1
+    b: tl.constexpr = (corner >> 1) & 1
+    c: tl.constexpr = corner >> 2
+    weight = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy) * (fz if c else 1.0 - fz)
+    return _entry(x + a, y + b, z + c, resolution, offset, hashed, mask), weight
+
+
+@triton.jit
+@no_type_check
+def _forward(
+    table,
+    points,
+    resolutions,
+    offsets,
+    hashed_levels,
+    mask,
+    out,
+    count,
+    levels: tl.constexpr,
+    features: tl.constexpr,
+    block: tl.constexpr,
+):
+    row, level = tl.program_id(0) * block + tl.arange(0, block), tl.program_id(1)
+    valid = row < count
+    resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
+    hashed = tl.load(hashed_levels + level)
+    x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
+    for f in tl.static_range(features):
+        total = tl.zeros([block], tl.float32)
+        for corner in tl.static_range(8):
+            entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
+            total += weight * tl.load(table + entry * features + f, mask=valid, other=0.0).to(tl.float32)
+        tl.store(out + row * (levels * features) + level * features + f, total, mask=valid)
+
+
+@triton.jit
+@no_type_check
+def _backward(
+    into,
+    points,
+    resolutions,
+    offsets,
+    hashed_levels,
+    mask,
+    grad,
+    count,
+    levels: tl.constexpr,
+    features: tl.constexpr,
+    block: tl.constexpr,
+):
+    row, level = tl.program_id(0) * block + tl.arange(0, block), tl.program_id(1)
+    valid = row < count
+    resolution, offset = tl.load(resolutions + level), tl.load(offsets + level)
+    hashed = tl.load(hashed_levels + level)
+    x, y, z, fx, fy, fz = _locate(points, row, valid, resolution)
+    for corner in tl.static_range(8):
+        entry, weight = _corner(corner, x, y, z, fx, fy, fz, resolution, offset, hashed, mask)
+        for f in tl.static_range(features):
+            flowing = tl.load(grad + row * (levels * features) + level * features + f, mask=valid, other=0.0)
+            tl.atomic_add(into + entry * features + f, weight * flowing, mask=valid)

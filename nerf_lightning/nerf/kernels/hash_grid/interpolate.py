@@ -1,0 +1,66 @@
+"""Multiresolution hash grid: features interpolated between the vertices of grids of growing resolution.
+
+Sec. 3 of arXiv 2201.05989. Letters: R_l the cells along a side of level l, T the most entries of a level's table,
+F the features of an entry.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import FunctionCtx
+
+from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+
+
+def interpolate(
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    layout: HashGridLayout,
+    known: Float[Tensor, "points out"] | None = None,
+) -> Float[Tensor, "points out"]:
+    """Return the trilinear features of points in the unit cube, level by level; points outside are moved to its face.
+
+    Gradients go to the table and, where asked for, to the points. Once differentiable.
+
+    Args:
+        table: the entries of all levels.
+        points: in the unit cube.
+        layout: where the levels' entries lie.
+        known: what this function returned for the same arguments without gradients: it is not computed again.
+    """
+    twin = cpu_twin("hash_grid.cpu", points.device) or cuda_twin("hash_grid.cuda", points.device)
+    if twin is None or table.dtype == torch.float64:
+        return interpolate_torch(table, points, layout)
+    return _Interpolate.apply(table, points.float().contiguous(), layout, twin, known)
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, twin: Any, known: Any) -> Tensor:
+        ctx.save_for_backward(table, points)
+        ctx.layout, ctx.twin = layout, twin
+        if known is not None:
+            return known.view_as(known)
+        return twin.forward(table.detach(), points.detach(), layout)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        table, points = ctx.saved_tensors  # type: ignore[attr-defined]
+        layout, twin = ctx.layout, ctx.twin  # type: ignore[attr-defined]
+        wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
+        grad = grad.float().contiguous()
+        grad_table = None
+        if wants_table:
+            # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh
+            # table of zeros for each tile costs more than the gradients themselves.
+            kept = table.grad if getattr(table, "grad_in_place", False) else None
+            into = torch.zeros_like(table, dtype=torch.float32) if kept is None else kept
+            twin.add_table_gradient(into, points, grad, layout)
+            grad_table = into if kept is None else None
+        grad_points = twin.point_gradient(table.detach(), points, grad, layout) if wants_points else None
+        return grad_table, grad_points, None, None, None

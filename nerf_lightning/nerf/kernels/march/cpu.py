@@ -1,0 +1,172 @@
+"""The march for the CPU: whole blocks and cells that are empty are stepped over."""
+
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numba import njit, prange
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.boxes import center_and_half
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+
+HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+FAR_AWAY = np.float32(1e30)
+
+
+def march(
+    rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells, limit: int | None
+) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+    """Return the occupied intervals and where each ray would go on."""
+    count, edges = rays.near.shape[0], lattice.shape[0]
+    most = min(edges, limit if limit is not None else edges)
+    # In coordinates of the box, which is the cube from -1 to 1.
+    center, half = center_and_half(grid.aabb)
+    origins = (rays.origins - center) / half
+    ray = (origins, rays.directions / half, state.enter, state.leave, state.jitter)
+    numbers = torch.empty(count, most, dtype=torch.int16)
+    bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
+    arrays = (*ray, lattice, grid.cells, grid.blocks, grid.floor, state.next, numbers, bounds, following)
+    _find(*(x.contiguous().numpy() for x in arrays))
+    torch.cumsum(bounds, 0, out=bounds)
+    total = int(bounds[-1])
+    out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
+    _pack(*(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
+    return PackedSamples(*out, bounds, bounds[-1]), following
+
+
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
+    one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
+    rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, one.long(), along)
+    cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    grid = OccupancyCells(aabb, cells, blocks_of(cells), cells.float())
+    march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _edge(lattice, jitter, k):
+    return lattice[k] + jitter * (lattice[k + 1] - lattice[k])
+
+
+@njit(fastmath=True)
+@no_type_check
+def _middle(lattice, jitter, k):
+    return HALF * (_edge(lattice, jitter, k) + _edge(lattice, jitter, k + 1))
+
+
+@njit(fastmath=True)
+@no_type_check
+def _first_from(lattice, jitter, k, t):
+    # The first interval, not before k, whose middle is not before t.
+    low, high = k, lattice.shape[0] - 2
+    while low < high:
+        between = (low + high) // 2
+        if _middle(lattice, jitter, between) < t:
+            low = between + 1
+        else:
+            high = between
+    return low
+
+
+@njit(fastmath=True)
+@no_type_check
+def _ahead(unit, speed):
+    # Distance to the end of the cell, of side 1, that `unit` lies in, along one axis.
+    if speed > 0:
+        return (np.floor(unit) + ONE - unit) / speed
+    if speed < 0:
+        return (np.floor(unit) - unit) / speed
+    return FAR_AWAY
+
+
+@njit(fastmath=True)
+@no_type_check
+def _cascade(x, y, z, cascades):
+    # The smallest cascade that holds a point, half its side, and whether any does.
+    reach = max(abs(x), abs(y), abs(z))
+    number, size = 0, ONE
+    while reach > size and number < cascades - 1:
+        number += 1
+        size *= TWO
+    return number, size, reach <= size
+
+
+@njit(fastmath=True)
+@no_type_check
+def _end_of_empty(x, y, z, dx, dy, dz, block_is_empty, scale):
+    # Distance to the end of the empty cell or block that a point, in units of cells, lies in; a hair short.
+    if block_is_empty:
+        shrink = ONE / np.float32(BLOCK)
+        x, y, z, scale = x * shrink, y * shrink, z * shrink, scale * shrink
+    return min(_ahead(x, dx * scale), _ahead(y, dy * scale), _ahead(z, dz * scale)) * np.float32(0.9999)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _skip(lattice, jitter, k, t, ahead):
+    # The first interval after k whose middle, at t, is so far ahead; never one too far.
+    end = lattice.shape[0] - 2
+    longest = lattice[end + 1] - lattice[end]
+    k += max(1, int(ahead / longest))
+    while k < end and _middle(lattice, jitter, k) < t + ahead:
+        k += 1
+    return k
+
+
+@njit(fastmath=True)
+@no_type_check
+def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, blocks, floor, k, numbers):
+    # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
+    end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[1])
+    last, found, optical = resolution - np.int32(1), 0, np.float32(0.0)
+    while k < end and found < numbers.shape[0]:
+        t = _middle(lattice, jitter, k)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        cascade, size, inside = _cascade(x, y, z, cells.shape[0])
+        if t > leave or optical > OPAQUE:
+            return found, end
+        if not inside:
+            k += 1
+            continue
+        scale = HALF * np.float32(resolution) / size
+        x, y, z = (x + size) * scale, (y + size) * scale, (z + size) * scale
+        a, b, c = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
+        if cells[cascade, a, b, c]:
+            optical += floor[cascade, a, b, c] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
+            numbers[found] = k
+            found += 1
+            k += 1
+        else:
+            empty = not blocks[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
+            k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, empty, scale))
+    return found, min(k, end)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _find(o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following):
+    for r in prange(o.shape[0]):
+        found, k = 0, lattice.shape[0] - 2
+        if enter[r] < leave[r]:
+            k = _first_from(lattice, jitters[r], first[r], enter[r])
+            found, k = _walk(
+                *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]),
+                *(leave[r], lattice, jitters[r], cells, blocks, floor, k, numbers[r]),
+            )
+        bounds[r + 1] = found
+        following[r] = k
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+@no_type_check
+def _pack(jitters, lattice, numbers, bounds, index, starts, ends):
+    for r in prange(bounds.shape[0] - 1):
+        for place in range(bounds[r], bounds[r + 1]):
+            k = numbers[r, place - bounds[r]]
+            index[place] = r
+            starts[place] = _edge(lattice, jitters[r], k)
+            ends[place] = _edge(lattice, jitters[r], k + 1)

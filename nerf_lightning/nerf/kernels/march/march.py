@@ -1,0 +1,39 @@
+"""March along rays through a grid of occupied cells, and keep the intervals whose middle lies in one.
+
+The intervals of all rays come from one lattice of distances: interval k of a ray begins at
+e[k] + jitter (e[k+1] - e[k]). Cascade c of the grid is the box, enlarged 2^c times about its centre.
+"""
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.backends import cpu_twin
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+
+
+def march(
+    rays: RayBundle,
+    state: March,
+    lattice: Float[Tensor, "edges"],
+    grid: OccupancyCells,
+    limit: int | None = None,
+    capacity: int | None = None,
+) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+    """Return the occupied intervals, at most `limit` per ray, and where each ray would go on.
+
+    Args:
+        rays: unit directions.
+        state: bounds, jitter and place of each ray.
+        lattice: increasing distances; two more than there are intervals.
+        grid: what is occupied.
+        limit: most samples of a ray; None for all.
+        capacity: size of the arrays returned, read nowhere on the host, and what does not fit is dropped from the
+            last rays; None for as many as there are.
+    """
+    twin = cpu_twin("march.cpu", rays.near.device)
+    if twin is not None and capacity is None:
+        return twin.march(rays, state, lattice, grid, limit)
+    from nerf_lightning.nerf.kernels.march.reference import march_torch
+
+    return march_torch(rays, state, lattice, grid, limit, capacity)

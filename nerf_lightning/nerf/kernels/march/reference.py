@@ -1,0 +1,80 @@
+"""The march in plain torch: every interval of the lattice is looked up. The reference, and what runs on GPUs."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.boxes import center_and_half
+from nerf_lightning.nerf.kernels.march.grid import OPAQUE, March, OccupancyCells
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+
+
+def march_torch(
+    rays: RayBundle,
+    state: March,
+    lattice: Float[Tensor, "edges"],
+    grid: OccupancyCells,
+    limit: int | None,
+    capacity: int | None,
+) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+    """Return the occupied intervals and where each ray would go on."""
+    keep, edges = occupied_intervals(rays, state, lattice, grid)
+    number = torch.arange(keep.shape[1], device=edges.device)
+    following = torch.full_like(state.next, number.numel())
+    if limit is not None:
+        rank = keep.cumsum(dim=-1)
+        keep &= rank <= limit
+        last = torch.where(keep & (rank == limit), number, number.numel() - 1).amin(dim=-1)
+        following = torch.where(keep.sum(dim=-1) == limit, last + 1, following)
+    return _packed(keep, edges, capacity), following
+
+
+def occupied_intervals(
+    rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells
+) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
+    """Tell which intervals of each ray may hold something that can be seen, and return the fenceposts of all.
+
+    The shapes are the same whatever the grid holds.
+    """
+    edges = lattice[:-1] + state.jitter[:, None] * (lattice[1:] - lattice[:-1])
+    midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
+    number = torch.arange(midpoints.shape[1], device=edges.device)
+    keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
+    floor = floor_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
+    keep &= floor >= 0
+    optical = torch.where(keep, floor * (edges[:, 1:] - edges[:, :-1]), 0.0)
+    return keep & (optical.cumsum(dim=-1) - optical <= OPAQUE), edges
+
+
+def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
+    """Look positions up in the smallest cascade that holds them; -1 in empty cells and outside of all."""
+    cascades, resolution = grid.cells.shape[:2]
+    center, half = center_and_half(grid.aabb)
+    scaled = (positions - center) / half
+    reach = scaled.abs().amax(dim=-1)
+    cascade = torch.zeros_like(reach, dtype=torch.long)
+    for number in range(cascades - 1):
+        cascade += (reach > 2.0**number).long()
+    unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
+    cell = (unit * resolution).long().clamp(0, resolution - 1)
+    place = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
+    occupied = (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
+    return torch.where(occupied, grid.floor[place], -1.0)
+
+
+def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:
+    counts = keep.sum(dim=-1)
+    found = counts.sum()
+    bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    if capacity is None:
+        flat = keep.flatten().nonzero()[:, 0]
+        filled = torch.ones_like(flat, dtype=torch.bool)
+    else:
+        # A fixed size, so that nothing is read on the host.
+        flat = torch.nonzero_static(keep.flatten(), size=capacity, fill_value=0)[:, 0]
+        bounds = bounds.clamp(max=capacity)
+        filled = torch.arange(capacity, device=keep.device) < bounds[-1]
+    ray = flat // keep.shape[1]
+    number = flat - ray * keep.shape[1]
+    starts, ends = edges[ray, number], edges[ray, number + 1]
+    return PackedSamples(ray, starts * filled, ends * filled, bounds, found)

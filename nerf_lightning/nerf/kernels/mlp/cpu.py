@@ -1,0 +1,84 @@
+"""The perceptron for the CPU: tiles of rows, one thread of ours for each of torch's, none of torch's own.
+
+The tiles and the order of their sums are fixed, so the result does not depend on the number of threads.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.nerf.products import TILE_ROWS, few_sizes, multiply, own_precision, tiles_of_rows
+
+Result = TypeVar("Result")
+relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
+
+
+@own_precision
+def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, list[list[Tensor]]]:
+    """Return the outputs in float32, and each tile's inputs of every layer where they are to be kept."""
+    out = points.new_empty(points.shape[0], weights[-1].shape[0])
+
+    def tile(rows: slice) -> list[Tensor]:
+        hidden = few_sizes(points[rows], weights[0].dtype)
+        kept = [hidden]
+        for weight in weights[:-1]:
+            hidden = multiply(hidden, weight.t()).relu_()
+            if keep:
+                kept.append(hidden)
+        out[rows] = multiply(hidden, weights[-1].t())[: rows.stop - rows.start]
+        return kept if keep else []
+
+    return out, in_tiles(tile, points.shape[0])
+
+
+@own_precision
+def backward(
+    grad: Tensor, weights: Sequence[Tensor], activations: list[list[Tensor]], wants_points: bool
+) -> tuple[Tensor | None, list[Tensor]]:
+    """Return the gradients of the inputs and, in float32, of the weights; `activations` is what `forward` kept."""
+    grad_points = grad.new_empty(grad.shape[0], weights[0].shape[1]) if wants_points else None
+
+    def tile(rows: slice) -> list[Tensor]:
+        kept = activations[rows.start // TILE_ROWS]
+        flowing = few_sizes(grad[rows], weights[0].dtype)
+        grads: list[Tensor] = []
+        for layer in reversed(range(len(weights))):
+            grads.insert(0, multiply(flowing.t(), kept[layer]))
+            if layer == 0 and grad_points is None:
+                break
+            flowing = multiply(flowing, weights[layer])
+            if layer:
+                relu_backward_(flowing, kept[layer], grad_input=flowing)
+            elif grad_points is not None:
+                grad_points[rows] = flowing[: rows.stop - rows.start]
+        return grads
+
+    parts = in_tiles(tile, grad.shape[0])
+    if not parts:
+        return grad_points, [torch.zeros_like(weight, dtype=torch.float32) for weight in weights]
+    return grad_points, [torch.stack([part[layer].float() for part in parts]).sum(0) for layer in range(len(weights))]
+
+
+def in_tiles(work: Callable[[slice], Result], rows: int) -> list[Result]:
+    """Do the work on each tile of rows, on as many threads as torch has, and return the results in order."""
+    slices = tiles_of_rows(rows)
+    threads = torch.get_num_threads()
+    inference = torch.is_inference_mode_enabled()  # like the gradient mode, a thread's own
+
+    def alone(rows: slice) -> Result:
+        with torch.inference_mode(inference), torch.no_grad():
+            return work(rows)
+
+    if threads == 1 or len(slices) < 2:
+        return [work(rows) for rows in slices]
+    return list(_pool(threads).map(alone, slices))
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    # Each thread of the pool computes alone; the number of threads is a thread's own setting.
+    return ThreadPoolExecutor(threads, "tiles", initializer=torch.set_num_threads, initargs=(1,))

@@ -1,0 +1,17 @@
+"""The photometric loss of the original NeRF (Eq. 6, arXiv 2003.08934)."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.types.renderings import Rendering
+
+
+class MeanSquaredError(Loss):
+    """Mean squared error of the colour, every level alike, so that the coarse level learns where to look."""
+
+    def forward(
+        self, renderings: list[Rendering], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
+    ) -> list[Float[Tensor, ""]]:
+        """Return the weighted mean over rays and channels, per level."""
+        return [((rendering.rgb - target).square() * weight[..., None]).mean() for rendering in renderings]

@@ -1,0 +1,151 @@
+"""A method as named levels of (sampler, field): each level samples where the one before saw something."""
+
+from typing import cast
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
+
+from nerf_lightning.nerf.geometry.contraction import Contracted
+from nerf_lightning.nerf.models.base import Level
+from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.scene import Scene
+
+
+class RadianceModel(nn.Module):
+    """The original NeRF is two levels, coarse (stratified) and fine (importance); the last one is the picture.
+
+    Args:
+        levels: name -> level, in order.
+    """
+
+    def __init__(self, levels: dict[str, Level]):
+        super().__init__()
+        self.levels = nn.ModuleDict(levels)
+        self.most_rays: int | None = None
+        """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
+        self.points_per_ray(training=False)  # levels that do not fit each other are refused here
+        self.register_load_state_dict_post_hook(_look_at_what_was_loaded)
+
+    @property
+    def level_names(self) -> tuple[str, ...]:
+        """The levels' names, first to last."""
+        return tuple(self.levels)
+
+    @property
+    def first_picture(self) -> int | None:
+        """The number of the first level whose rendering is a picture, where it is not the last one."""
+        numbers = [number for number, level in enumerate(self._in_order()) if level.has_color]
+        return numbers[0] if len(numbers) > 1 else None
+
+    @property
+    def needs_whole_batch(self) -> bool:
+        """Whether any field forbids tiles."""
+        return any(level.field.needs_whole_batch for level in self._in_order())
+
+    @property
+    def has_static_shapes(self) -> bool:
+        """Whether no level's shapes depend on what it finds."""
+        return all(level.has_static_shapes for level in self._in_order())
+
+    def points_per_ray(self, training: bool) -> float:
+        """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
+        counts = [0.0]
+        for level in self._in_order():
+            counts.append(level.points_per_ray(counts[-1], training))
+        return max(counts)
+
+    @property
+    def last(self) -> Level:
+        """The level whose picture counts."""
+        return self._in_order()[-1]
+
+    def forward(
+        self,
+        rays: RayBundle,
+        background: Float[Tensor, "*rays 3"] | None,
+        random: RayRandom | None,
+    ) -> list[Rendering]:
+        """Render rays, first level first.
+
+        Args:
+            rays: unit directions, scene units.
+            background: colour behind each ray; None closes the ray.
+            random: the step's numbers for these rays; None for evaluation.
+        """
+        history: list[Rendering] = []
+        for level in self._in_order():
+            history.append(level(rays, background, history, random))
+        return history
+
+    def fit_to(self, scene: Scene) -> None:
+        """Tell the levels where the scene's content lies, once, before training."""
+        for level in self._in_order():
+            level.fit_to(scene)
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded into the parts of the model, where they know what it can be.
+
+        Raises:
+            InputError: a part holds what it never can.
+        """
+        for part in self.modules():
+            look = getattr(part, "require_sound_state", None)
+            if part is not self and look is not None:
+                look()
+
+    def counts(self) -> list[Tensor]:
+        """Return the buffers of all levels in which a training step counts."""
+        return [count for level in self._in_order() for count in level.counts()]
+
+    def measurements(self) -> list[Tensor]:
+        """Return the buffers of all levels that hold means over rays."""
+        return [measured for level in self._in_order() for measured in level.measurements()]
+
+    def multiply_in(self, products: Products) -> None:
+        """Set the precision of the products with the fields' weights; everything else is float32 always."""
+        for level in self._in_order():
+            level.field.multiply_in(products)
+
+    def compile_fields(self) -> list[str]:
+        """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""
+        for module in self.modules():
+            if isinstance(module, Contracted):
+                module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
+        return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
+
+    def update(self, step: int, key: int) -> None:
+        """Do what the levels do between steps of training."""
+        for level in self._in_order():
+            level.update(step, key)
+
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training, of all levels."""
+        return {name: value for level in self._in_order() for name, value in level.statistics().items()}
+
+    def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the Euclidean norm of the gradients of each level."""
+        return {
+            name: get_total_norm([parameter.grad for parameter in level.parameters() if parameter.grad is not None])
+            for name, level in zip(self.levels, self._in_order(), strict=True)
+        }
+
+    def forget_measurements(self) -> None:
+        """Forget what was counted while rendering."""
+        for level in self._in_order():
+            level.forget_measurements()
+
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator."""
+        for level in self._in_order():
+            level.reset_parameters()
+
+    def _in_order(self) -> list[Level]:
+        return cast(list[Level], list(self.levels.values()))
+
+
+def _look_at_what_was_loaded(model: RadianceModel, _: object) -> None:
+    model.require_sound_state()

@@ -1,0 +1,143 @@
+"""Whole views: render every pixel of a camera, a chunk of rays at a time."""
+
+import logging
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.clipping import Clip
+from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
+from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Picture(TensorStruct):
+    """One rendered view, on the CPU."""
+
+    rgb: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    """Expected distance along the ray; light that escapes ends at far."""
+    opacity: Float[Tensor, "height width"]
+    first_rgb: Float[Tensor, "height width 3"] | None = None
+    """What the first level sees that makes pictures, where it is not the last."""
+
+
+@torch.no_grad()
+def render_picture(
+    model: RadianceModel,
+    cameras: Cameras,
+    view: int,
+    near: Float[Tensor, "views"],
+    far: Float[Tensor, "views"],
+    background: Background,
+    tile_points: int,
+    clip: Clip | None = None,
+    seen_from: Cameras | None = None,
+) -> Picture:
+    """Render one view with the last level, as at evaluation (no jitter).
+
+    Args:
+        model: in evaluation mode.
+        cameras: among others the one of this view.
+        view: its number.
+        near: where rays begin, per view.
+        far: where they end.
+        background: what lies behind the scene.
+        tile_points: most points that go through a field at once.
+        clip: what of the scene is shown; None: all.
+        seen_from: cameras from whose directions the colour is looked up, in place of the view's own.
+    """
+    rays, straight = view_rays(cameras, view, near, far, clip)
+    if seen_from is not None:
+        rays = replace(rays, view_directions=view_rays(seen_from, view, near, far)[1].view_directions)
+    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
+    shape = rays.near.shape
+    rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
+    if cameras.ndc is not None:
+        whole = rays_through_pixels(cameras, all_pixels(cameras, view), near, far).far
+        depth = world_distance(straight, depth / whole)
+    return Picture(rgb, depth, opacity, *first)
+
+
+def view_rays(
+    cameras: Cameras,
+    view: int,
+    near: Float[Tensor, "views"],
+    far: Float[Tensor, "views"],
+    clip: Clip | None = None,
+) -> tuple[RayBundle, RayBundle]:
+    """Return a picture of rays as the model takes them, and the same rays through the world."""
+    pixels = all_pixels(cameras, view)
+    rays = rays_through_pixels(cameras, pixels, near, far)
+    straight = rays if cameras.ndc is None else rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)
+    if clip is not None:
+        rays = clip(rays, straight, ndc=cameras.ndc is not None)
+    return rays, straight
+
+
+def _flat(picture: Tensor) -> Tensor:
+    return picture.flatten(0, 1)
+
+
+@torch.no_grad()
+def render_rays(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+    """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
+
+    Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
+    """
+    count = rays.near.numel()
+    behind = background_colors(background, count, torch.device("cpu"), random=None)
+    empty = torch.zeros(count, 3) if behind is None else behind
+    columns = [empty.clone(), rays.far.cpu().clone(), torch.zeros(count)]
+    if model.first_picture is not None:
+        columns.append(empty.clone())
+    shown = (rays.far > rays.near).nonzero()[:, 0]
+    if shown.numel():
+        rendered = _render_all(model, rays[shown], background, tile_points)
+        for column, part in zip(columns, rendered, strict=True):
+            column[shown.cpu()] = part.to(column)
+    return columns
+
+
+def _render_all(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+    at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
+    if model.most_rays is not None:
+        at_once = min(at_once, model.most_rays)
+    while True:
+        try:
+            return _render_in_tiles(model, rays, background, at_once)
+        except RuntimeError as error:
+            if at_once == 1 or not is_out_of_memory(error):
+                raise
+        model.most_rays = at_once = at_once // 2
+        log.warning("no memory to render so many rays at once: from now on %d", at_once)
+
+
+def _render_in_tiles(model: RadianceModel, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
+    device, count = next(model.parameters()).device, rays.near.numel()
+    columns: list[Tensor] = []
+    for part in tiles(count, at_once):
+        rendered = _render_tile(model, rays[part].to(device), background)
+        # Made once: thousands of small results between what comes and goes would leave holes many times their size.
+        columns = columns or [result.new_empty(count, *result.shape[1:]) for result in rendered]
+        for column, result in zip(columns, rendered, strict=True):
+            column[part] = result
+    return columns
+
+
+def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> list[Tensor]:
+    behind = background_colors(background, rays.near.numel(), rays.near.device, random=None)
+    levels = model(rays, behind, random=None)
+    last, first = levels[-1], model.first_picture
+    columns = [last.rgb.cpu(), last.depth.cpu(), last.opacity.cpu()]
+    return columns if first is None else [*columns, levels[first].rgb.cpu()]

@@ -1,0 +1,62 @@
+"""Tiles: a batch of rays goes through a model in parts, so that what is kept of them stays small."""
+
+from collections.abc import Iterator
+
+import torch
+
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+from nerf_lightning.nerf.types.scene import Background
+
+
+def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
+    """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
+
+    >>> [(part.start, part.stop) for part in tiles(10, 4)]
+    [(0, 4), (4, 7), (7, 10)]
+    """
+    count = max(1, -(-num_rays // tile_rays))
+    size, rest = divmod(num_rays, count)
+    start = 0
+    for number in range(count):
+        stop = start + size + int(number < rest)
+        yield slice(start, stop)
+        start = stop
+
+
+def tile_rays_for(model: RadianceModel, tile_points: int, training: bool = False) -> int:
+    """Return how many rays make a tile of about `tile_points` points, at least one."""
+    return max(1, int(tile_points / model.points_per_ray(training)))
+
+
+def is_out_of_memory(error: RuntimeError) -> bool:
+    """Tell whether there was no room for a tensor; smaller tiles may find it."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+
+
+def weighted_renderings(
+    model: RadianceModel, rays: RayBundle, background: Background, key: int, tile_points: int
+) -> Iterator[tuple[RayBundle, list[DenseRendering | PackedRendering]]]:
+    """Render rays as a training step does, without its gradients: tile by tile, each with what every level saw.
+
+    With random numbers a level that leaves out what is empty keeps its weights, which it does not in plain rendering.
+    What levels count in training steps is put back at the end.
+
+    Args:
+        model: the levels, on the rays' device.
+        rays: scene units.
+        background: what lies behind them.
+        key: of the random numbers.
+        tile_points: most points that go through a field at once.
+    """
+    count = rays.near.numel()
+    random = batch_random(key, count, rays.near.device)
+    behind = background_colors(background, count, rays.near.device, random)
+    counts = [number.clone() for number in model.counts()]
+    for part in tiles(count, tile_rays_for(model, tile_points, training=True)):
+        yield rays[part], model(rays[part], None if behind is None else behind[part], random[part])
+    for number, before in zip(model.counts(), counts, strict=True):
+        number.copy_(before)

@@ -1,0 +1,90 @@
+"""Adam for sparse gradients: entries that a step did not touch are left alone (Sec. 4, arXiv 2201.05989)."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.kernels.adam.step import adam_step
+
+
+class TableAdam(Optimizer):
+    """Adam (arXiv 1412.6980) that skips entries whose gradient is exactly zero, in one pass over memory.
+
+    A batch touches a small part of a hash grid's tables; updating the moments of all the rest would cost more than
+    the batch, and would let entries drift on old momentum. Gradients are kept allocated and are added to in place
+    (`grad_in_place`); the pass that uses them sets them back to zero.
+
+    Args:
+        params: parameters or groups of them.
+        lr: learning rate.
+        betas: decay of the two moments.
+        eps: added to the root of the second moment; tiny, since the gradients of rarely seen entries are.
+        weight_decay: added to the gradient, times the weight; the system gives tables a group with none.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-2,
+        betas: tuple[float, float] | list[float] = (0.9, 0.99),
+        eps: float = 1e-15,
+        weight_decay: float = 0.0,
+    ):
+        if lr <= 0 or eps <= 0 or weight_decay < 0 or not all(0 <= beta < 1 for beta in betas):
+            raise InputError(
+                f"optimizer: lr={lr}, betas={list(betas)}, eps={eps}, weight_decay={weight_decay}: give a positive lr "
+                "and eps, betas from 0 to below 1, and no negative weight_decay."
+            )
+        super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps, "weight_decay": weight_decay})
+        self._clean = False
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Set the gradients to zero where the last step has not; they stay allocated whatever is asked for."""
+        for parameter in self._parameters():
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+                parameter.grad_in_place = True  # type: ignore[attr-defined]
+            elif not self._clean:
+                parameter.grad.zero_()
+        self._clean = False
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """Update the touched entries, and set their gradients to zero."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            beta1, beta2 = group["betas"]
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                state = self.state[parameter]
+                if not state:
+                    state["step"] = 0
+                    state["exp_avg"] = torch.zeros_like(parameter)
+                    state["exp_avg_sq"] = torch.zeros_like(parameter)
+                state["step"] += 1
+                if group["weight_decay"]:
+                    parameter.grad.add_(parameter, alpha=group["weight_decay"])
+                adam_step(
+                    parameter,
+                    parameter.grad,
+                    state["exp_avg"],
+                    state["exp_avg_sq"],
+                    step_size=group["lr"] / (1.0 - beta1 ** state["step"]),
+                    root_scale=1.0 / math.sqrt(1.0 - beta2 ** state["step"]),
+                    betas=(beta1, beta2),
+                    eps=group["eps"],
+                )
+        self._clean = True
+        return loss
+
+    def _parameters(self) -> Iterable[Tensor]:
+        return (parameter for group in self.param_groups for parameter in group["params"])

@@ -1,0 +1,111 @@
+"""Stateless randomness: every number is a hash of what it is for, so nothing depends on what was drawn before.
+
+A uniform number is a function of (seed, attempt, step, purpose, ray slot in the global batch, sample number). Tiles,
+ranks and devices slice the same numbers, and a resumed run draws what the uninterrupted one would have drawn.
+Words are non-negative 32-bit integers kept in int64, and each multiplier is below 2^31, so no product overflows
+and every device agrees.
+"""
+
+import zlib
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+WORD = 0xFFFFFFFF
+FEISTEL_ROUNDS = 6
+
+
+def mix(word: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
+    """Scramble 32-bit words: a bijection in which each input bit changes half of the output bits.
+
+    >>> mix(torch.tensor([0, 1, 2])).unique().numel()
+    3
+    """
+    word = word ^ (word >> 16)
+    word = (word * 0x7FEB352D) & WORD
+    word = word ^ (word >> 15)
+    word = (word * 0x5BD1E995) & WORD
+    word = word ^ (word >> 16)
+    word = (word * 0x6C50B47D) & WORD
+    return word ^ (word >> 15)
+
+
+def purpose_word(purpose: str) -> int:
+    """Return the 32-bit word that stands for a purpose, the same in every process."""
+    return zlib.crc32(purpose.encode())
+
+
+def fold(*parts: int | str) -> int:
+    """Return one 32-bit key for a list of numbers and purposes; the order matters and 0 is a number like others.
+
+    >>> fold(0, "rays") != fold(1, "rays")
+    True
+    """
+    key = torch.tensor(0x243F6A88)
+    for part in parts:
+        word = purpose_word(part) if isinstance(part, str) else part & WORD
+        key = mix(key ^ mix(torch.tensor(word)) ^ 0x5A5A5A5A)
+    return int(key)
+
+
+@dataclass(frozen=True)
+class RayRandom(TensorStruct):
+    """The random numbers of a batch of rays in one training step; slice it as the rays are sliced."""
+
+    key: Int[Tensor, "*rays"]
+    """fold(seed, attempt, step), the same for all rays."""
+    slots: Int[Tensor, "*rays"]
+    """The ray's place in the global batch."""
+
+    def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
+        """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
+        sample = torch.arange(count, device=self.slots.device)
+        ray = mix(self.key ^ purpose_word(purpose)) ^ mix(self.slots & WORD)
+        words = mix((mix(ray)[..., None] + sample * 0x3C6EF35F) & WORD)
+        return (words >> 8).to(torch.float32) * 2.0**-24
+
+    def normal(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
+        """Return `count` standard normal numbers per ray (Box and Muller, 1958)."""
+        radius = torch.sqrt(-2.0 * torch.log1p(-self.uniform(purpose, count)))
+        return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle", count))
+
+
+def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu", first: int = 0) -> RayRandom:
+    """Return the random numbers of a batch, or of its rays from slot `first` on; `key` comes from `fold`."""
+    slots = torch.arange(first, first + num_rays, device=device)
+    return RayRandom(key=torch.full_like(slots, key), slots=slots)
+
+
+def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:
+    """Return where a keyed permutation of range(size) sends each index; nothing is stored, any size is allowed.
+
+    An alternating Feistel network on a grid of about sqrt(size) x sqrt(size) cells: each round adds a keyed hash of
+    one coordinate to the other. The few cells beyond `size` are walked through until the path comes back (Black and
+    Rogaway, 2002), so the result is a permutation exactly.
+
+    >>> torch.equal(permute(torch.arange(10), 10, torch.full((10,), 7)).sort().values, torch.arange(10))
+    True
+    """
+    rows = max(1, int(size**0.5))
+    columns = -(-size // rows)
+    place = _feistel(index, rows, columns, key)
+    while (outside := (place >= size).nonzero(as_tuple=True))[0].numel():
+        place[outside] = _feistel(place[outside], rows, columns, key.expand(place.shape)[outside])
+    return place
+
+
+def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
+    row = index // columns
+    column = index - row * columns
+    # As many words as there are keys: a batch that lies in one epoch has one.
+    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
+    for number, round_key in enumerate(mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)):
+        if number % 2:
+            column = (column + mix(round_key ^ row)) % columns
+        else:
+            row = (row + mix(round_key ^ column)) % rows
+    return row * columns + column

@@ -1,0 +1,43 @@
+"""The background, decided in one place: what lies behind a ray, and what a photograph shows in front of it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.scene import Background, Scene
+
+
+def background_colors(
+    background: Background, num_rays: int, device: torch.device, random: RayRandom | None
+) -> Float[Tensor, "rays 3"] | None:
+    """Return the colour behind each ray, or None where the ray is closed.
+
+    `random` draws a fresh colour per ray and step while training, which teaches empty space to be empty; without
+    random numbers (evaluation, rendering) it stands for white.
+    """
+    if background == "none":
+        return None
+    if background == "random" and random is not None:
+        return random.uniform("background", 3)
+    return torch.full((num_rays, 3), 0.0 if background == "black" else 1.0, device=device)
+
+
+def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] | None) -> Float[Tensor, "*rays 3"]:
+    """Return straight-alpha colours over a background: rgb * a + background * (1 - a).
+
+    Without a background the colours are taken as they are.
+
+    >>> blend(torch.tensor([1.0, 0.0, 0.0, 0.25]), torch.ones(3))
+    tensor([1.0000, 0.7500, 0.7500])
+    """
+    if background is None:
+        return rgba[..., :3]
+    alpha = rgba[..., 3:]
+    return rgba[..., :3] * alpha + background * (1.0 - alpha)
+
+
+def photograph(scene: Scene, view: int, background: Background) -> Float[Tensor, "height width 3"]:
+    """Return what a view's photograph shows over the background of evaluation."""
+    behind = background_colors(background, 1, torch.device("cpu"), random=None)
+    return blend(scene.pixels.view(view).float() / 255.0, behind)

@@ -1,0 +1,41 @@
+"""Histograms along a ray: inverse transform sampling from piecewise constant densities.
+
+Letters: `edges` are bins + 1 increasing fenceposts, `weights` the mass of each bin, `u` uniform numbers in [0, 1).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.search import search
+
+
+def sample_histogram(
+    edges: Float[Tensor, "*rays edges"],
+    weights: Float[Tensor, "*rays bins"],
+    u: Float[Tensor, "*rays count"],
+    floor: float = 1e-5,
+) -> Float[Tensor, "*rays count"]:
+    """Return where the cumulative distribution of a histogram reaches `u` (Sec. 5.2, arXiv 2003.08934).
+
+    Args:
+        edges: fenceposts; exactly one more than there are weights.
+        weights: mass of each bin, need not sum to one.
+        u: numbers in [0, 1).
+        floor: mass added to each bin, so that an empty ray is sampled evenly and no bin has zero width in the
+            distribution.
+
+    >>> sample_histogram(torch.tensor([0.0, 1, 2]), torch.tensor([0.0, 1]), torch.tensor([0.5]), floor=0.0)
+    tensor([1.5000])
+    """
+    if edges.shape[-1] != weights.shape[-1] + 1:
+        raise ValueError(f"{weights.shape[-1]} weights need {weights.shape[-1] + 1} edges, not {edges.shape[-1]}")
+    mass = weights + floor
+    cdf = torch.cumsum(mass / mass.sum(dim=-1, keepdim=True), dim=-1)
+    cdf = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1)
+    bin_index = (search(cdf, u, right=True) - 1).clamp(0, weights.shape[-1] - 1)
+    below, above = cdf.gather(-1, bin_index), cdf.gather(-1, bin_index + 1)
+    left, right = edges.gather(-1, bin_index), edges.gather(-1, bin_index + 1)
+    span = above - below
+    part = torch.where(span > 0, (u - below) / torch.where(span > 0, span, 1.0), 0.5)
+    return left + part.clamp(0.0, 1.0) * (right - left)

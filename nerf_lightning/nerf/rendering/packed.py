@@ -1,0 +1,47 @@
+"""Volume rendering of packed samples: the quadrature of `rendering.quadrature`, in the other layout."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.packed.integrate import integrate
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering
+
+
+def composite_packed(
+    output: FieldOutput,
+    samples: PackedSamples,
+    rays: RayBundle,
+    background: Float[Tensor, "rays 3"] | None,
+) -> PackedRendering:
+    """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
+
+    Args:
+        output: density and colour at the samples' midpoints.
+        samples: the intervals.
+        rays: where far stands.
+        background: colour behind each ray; None leaves the rays open in front of black.
+    """
+    foreground, opacity, depth, weights = integrate(output.density, output.rgb, samples)
+    escaped = 1.0 - opacity
+    return PackedRendering(
+        rgb=foreground if background is None else foreground + escaped[:, None] * background,
+        foreground=foreground,
+        opacity=opacity,
+        depth=depth + escaped * rays.far,
+        weights=weights,
+        samples=samples,
+    )
+
+
+def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:
+    """Return the samples' midpoints in space."""
+    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
+    return rays.origins[samples.ray_index] + along
+
+
+def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
+    """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
+    kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]
+    return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

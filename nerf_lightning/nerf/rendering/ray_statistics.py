@@ -1,0 +1,69 @@
+"""What the weights along rays tell: where a level sees something, and on how many samples its picture rests."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.contraction import normalized_distance
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+
+
+def effective_samples(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
+    """Return on how many samples each ray's light rests: (sum of weights)^2 / (sum of their squares), Kish's measure.
+
+    It is 1 where one sample has all the weight, the number of samples where all weigh the same, and 0 where none has
+    any.
+    """
+    ray, _, weights = _samples_of(rendering)
+    sums = torch.zeros(2, rays.near.numel(), device=weights.device)
+    sums.index_add_(1, ray, torch.stack([weights, weights.square()]))
+    return sums[0].square() / sums[1].clamp(min=torch.finfo(sums.dtype).tiny)
+
+
+def weight_along(
+    rendering: DenseRendering | PackedRendering, rays: RayBundle, bins: int, endless: bool = False
+) -> Float[Tensor, "bins"]:
+    """Return how much weight lies in each of `bins` equal parts of the way from near to far, as a mean over rays.
+
+    Args:
+        rendering: what a level saw.
+        rays: along what.
+        bins: number of parts.
+        endless: whether the parts are equal in the spacing of space without bounds (`geometry.spacing`).
+    """
+    ray, distance, weights = _samples_of(rendering)
+    near, far = rays.near.reshape(-1), rays.far.reshape(-1)
+    if endless:
+        near, far, distance = normalized_distance(near), normalized_distance(far), normalized_distance(distance)
+    share = (distance - near[ray]) / (far - near).clamp(min=torch.finfo(torch.float32).tiny)[ray]
+    place = (bins * share).long().clamp(0, bins - 1)
+    total = torch.zeros(bins, device=weights.device).index_add_(0, place, weights)
+    return total / rays.near.numel()
+
+
+def median_distances(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
+    """Return where each ray has half of its weight behind it; far, where it has none.
+
+    Unlike the expected distance it lies in what the ray sees, not between the haze before a surface and the surface.
+    """
+    ray, distance, weights = _samples_of(rendering)
+    ends = weights.double().cumsum(0)  # over all rays, so float32 would lose a ray's own
+    total = torch.zeros(rays.near.numel(), dtype=ends.dtype, device=ends.device).index_add_(0, ray, weights.double())
+    half = (total.cumsum(0) - 0.5 * total)[ray]
+    crossed = (ends >= half) & (ends - weights < half)
+    median = rays.far.reshape(-1).clone()
+    median[ray[crossed]] = distance[crossed].to(median)
+    return median
+
+
+def _samples_of(
+    rendering: DenseRendering | PackedRendering,
+) -> tuple[Int[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:
+    """Return each sample's ray, distance and weight."""
+    samples, weights = rendering.samples, rendering.weights.float().reshape(-1)
+    if isinstance(rendering, PackedRendering):
+        return rendering.samples.ray_index, samples.midpoints.float(), weights
+    per_ray = rendering.weights.shape[-1]
+    ray = torch.arange(weights.numel(), device=weights.device) // per_ray
+    return ray, samples.midpoints.float().reshape(-1), weights

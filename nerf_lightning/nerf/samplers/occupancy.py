@@ -1,0 +1,285 @@
+"""An occupancy grid: march through the cells that may hold something (Sec. 5.1 and Appendix E, arXiv 2201.05989)."""
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
+from nerf_lightning.nerf.geometry.contraction import Contracted
+from nerf_lightning.nerf.kernels.carving.carve import possible_cells
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
+from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.rendering.packed import first_of_each_ray, positions_of
+from nerf_lightning.nerf.samplers.base import AnySampler
+from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.scene import Scene
+
+log = logging.getLogger(__name__)
+
+CELLS_AT_ONCE = 1 << 18
+# Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
+CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
+# Devices on which a number may be read on the host between two kernels while rendering.
+HOSTS = ("cpu", "cuda")
+RANGES = {
+    "num_cascades": (1, 32),
+    "num_steps": (1, 1 << 20),
+    "cone_angle": (0.0, 1.0),
+    "update_every": (1, 1 << 30),
+    "warmup_steps": (0, 1 << 40),
+    "prune_after": (0, 1 << 40),
+    "decay": (0.0, 1.0),
+    "min_alpha": (0.0, 1.0),
+    "opaque_below": (0.0, 1.0),
+    "capacity": (1, 1 << 31),
+}
+DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
+ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
+
+
+class OccupancySampler(OccupancyGrid, AnySampler):
+    """Keep a moving average of the density in each cell, and sample only where it is high enough.
+
+    Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
+    the new one, and is occupied above the smaller of the mean and the density that makes one interval `min_alpha`
+    opaque. Cells that no training view sees, and those through which a photograph's alpha shows nothing, are
+    empty from the start.
+
+    Args:
+        resolution: cells along a side of the box; a multiple of 4.
+        num_cascades: boxes, each twice as large as the one before, the first being the scene's. None: 1, and in
+            contracted scenes 6 of half the resolution (in whole blocks of 4 cells).
+        num_steps: intervals across the diagonal of the scene's box.
+        cone_angle: interval length over distance where that is larger; 0 keeps all intervals alike. None: 0, and in
+            contracted scenes 1/256.
+        update_every: steps between two updates of the grid.
+        warmup_steps: until then every cell is asked at each update, later every other one.
+        prune_after: steps before which no cell is given up; larger where the background is baked into the pictures,
+            so that dark content is not lost before it is learnt.
+        decay: of the average, per update.
+        min_alpha: opacity of an interval that counts.
+        opaque_below: a ray's samples end where less light than this is left; 0 keeps them all.
+        capacity: size of the arrays of samples on GPUs, where no size is read on the host.
+    """
+
+    def __init__(
+        self,
+        resolution: int = 128,
+        num_cascades: int | None = None,
+        num_steps: int = 256,
+        cone_angle: float | None = None,
+        update_every: int = 16,
+        warmup_steps: int = 256,
+        prune_after: int = 0,
+        decay: float = 0.95,
+        min_alpha: float = 0.001,
+        opaque_below: float = 1e-3,
+        capacity: int = 1 << 20,
+    ):
+        super().__init__()
+        if resolution % BLOCK or resolution < BLOCK:
+            raise ValueError(f"resolution={resolution}: give a multiple of {BLOCK}")
+        require_ranges(locals(), RANGES)
+        self.wanted = (resolution, num_cascades, cone_angle)
+        self.num_steps = num_steps
+        self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
+        self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
+        self.contracted = Contracted()
+        self._fit_to_space()
+        # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
+        self._lattice: Tensor | None = None
+        self._numbers: Tensor | None = None
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
+
+        Raises:
+            InputError: no training ray meets the box, or nothing is left in it.
+        """
+        self.contracted.fit_to(scene)
+        self._fit_to_space()
+        self.aabb.copy_(scene.aabb)
+        self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
+        self._lattice = self._numbers = None
+        for cascade in range(self.num_cascades):
+            centers, half_diagonal = self.cell_centers(cascade)
+            # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
+            if scene.space != "ndc":
+                possible = possible_cells(scene, centers, half_diagonal)
+                self.possible[cascade] = possible.view(self.possible.shape[1:])
+        if not bool(self.possible.any()):
+            lower, upper = ([round(float(x), 3) for x in corner] for corner in scene.aabb)
+            raise InputError(
+                f"The box of the scene {scene.name}, from {lower} to {upper}, holds nothing that the training views "
+                "show: no camera sees it, or all that they see there is transparent. Correct the box "
+                "(scene.aabb_half), or the cameras' poses."
+            )
+        self.reset()
+        if scene.space == "bounded":
+            self._question_cameras_inside(scene)
+        else:
+            log.warning(
+                "The photographs of %s show what lies behind the content, so little of its space is empty: "
+                "model=fast_proposal learns such captures several times faster than an occupancy grid does.",
+                scene.name,
+            )
+
+    def _question_cameras_inside(self, scene: Scene) -> None:
+        eyes = scene.cameras.c2w[list(scene.splits["train"]), :, 3]
+        inside = int(((eyes > scene.aabb[0]) & (eyes < scene.aabb[1])).all(dim=-1).sum())
+        if inside:
+            log.warning(
+                "%d of %d training cameras stand inside the box of the scene %s: what lies outside of it is not "
+                "learnt. If the capture has no bounds, give scene.space=contracted where its reader knows it; else "
+                "make the box smaller (scene.aabb_half).",
+                inside,
+                eyes.shape[0],
+                scene.name,
+            )
+
+    def forward(
+        self, rays: RayBundle, screen_fn: ScreenFn, random: RayRandom | None
+    ) -> tuple[PackedSamples, Float[Tensor, "capacity f"] | None]:
+        """Return the occupied intervals of each ray up to where it is opaque, and their features.
+
+        Args:
+            rays: unit directions.
+            screen_fn: the field's, asked without gradients.
+            random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
+        """
+        capacity = self.capacity_on(rays.near.device)
+        samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
+        if capacity is not None or self.opaque_below == 0:
+            return samples, None
+        with torch.no_grad():
+            density, features = screen_fn(positions_of(rays, samples))
+            kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
+            return samples.at(*kept), None if features is None else features[kept[0]]
+
+    def capacity_on(self, device: torch.device) -> int | None:
+        """Return the size of the arrays of samples; None where sizes may be read on the host."""
+        return self.capacity if device.type == "cuda" else None
+
+    def start(self, rays: RayBundle, random: RayRandom | None) -> March:
+        """Return the beginning of a march along rays."""
+        center, half = center_and_half(self.aabb)
+        half = half * 2.0 ** (self.num_cascades - 1)
+        enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
+        jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
+        return March(enter, leave, jitter, torch.zeros_like(rays.camera_index))
+
+    @property
+    def grid(self) -> OccupancyCells:
+        """What is occupied now."""
+        return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
+
+    def density_in_cells(self, density_fn: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
+        kept = (floor_of_cells(positions, self.grid) >= 0).nonzero()[:, 0]
+        density = torch.zeros_like(positions[:, 0])
+        if kept.numel():
+            density[kept] = density_fn(positions[kept]).float()
+        return density
+
+    @property
+    def step_size(self) -> float:
+        """The shortest interval, in scene units."""
+        return float((self.aabb[1] - self.aabb[0]).norm()) / self.num_steps
+
+    @property
+    def lattice(self) -> Float[Tensor, "edges"]:
+        """The distances that intervals begin at, from the scene's near to beyond its far."""
+        if self._lattice is None:
+            near, far = self.range.tolist()
+            edges, step = [near], self.step_size
+            self._require_few((far - near) / step if not self.cone_angle else 0.0)
+            while edges[-1] <= far:
+                edges.append(edges[-1] + max(step, self.cone_angle * edges[-1]))
+                if len(edges) > self.max_intervals:  # of a narrow cone, whose intervals hardly grow
+                    self._require_few(max((far - near) / step, len(edges)))
+            edges.append(2 * edges[-1] - edges[-2])
+            self._lattice = torch.tensor(edges)
+        self._lattice = self._lattice.to(self.aabb.device)
+        return self._lattice
+
+    def lattice_over(self, rays: RayBundle) -> Float[Tensor, "edges"]:
+        """Return the lattice for rendering from anywhere: from afar, or from close by.
+
+        It is `lattice` where that reaches; elsewhere it is shifted by whole intervals. On devices that compile for
+        fixed shapes (XLA) it is always `lattice`.
+        """
+        # Contracted scenes, whose intervals grow with the distance, have one near and far for all cameras.
+        if rays.near.device.type not in HOSTS or self.cone_angle or not rays.near.numel():
+            return self.lattice
+        near, far = self.range.tolist()
+        nearest, farthest = float(rays.near.min()), float(rays.far.max())
+        if near <= nearest and farthest <= far:
+            return self.lattice
+        step = self.step_size
+        self._require_few((farthest - nearest) / step)
+        first = max(math.floor((nearest - near) / step), math.ceil(-near / step))
+        number = torch.arange(first, math.ceil((farthest - near) / step) + 3, dtype=torch.float64)
+        return (near + step * number).float().to(rays.near.device)
+
+    def _require_few(self, intervals: float) -> None:
+        """Refuse a march that would not end: near, far and the box may come out of a file."""
+        if not intervals <= self.max_intervals:
+            raise InputError(
+                f"A ray from near to far would be cut into {intervals:.3g} intervals of {self.step_size:.3g} scene "
+                f"units, and more than {self.max_intervals:,} are not taken. Give a smaller sampler.num_steps, or a "
+                "larger box; or add budgets.intervals=N."
+            )
+
+    @torch.no_grad()
+    def update(self, density_fn: DensityFn, step: int, key: int) -> None:
+        """Ask the field about the cells, where it is time; without reading anything on the host.
+
+        Args:
+            density_fn: the field's.
+            step: steps that this attempt has taken.
+            key: of this step's random numbers.
+        """
+        if step % self.update_every or step == 0:
+            return
+        if self._numbers is None:
+            self._numbers = self.possible.flatten().cpu().nonzero()[:, 0]
+        number = self._numbers = self._numbers.to(self.possible.device)
+        if step > self.warmup_steps:
+            number = number[(step // self.update_every) % 2 :: 2]
+        within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
+        for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
+            self.learn(cells, density_fn(self.positions(cells, part)).float(), self.decay)
+        if step >= self.prune_after:
+            mean = self.density.sum() / self.possible.sum()
+            shortest = (self.aabb[1] - self.aabb[0]).norm().double() / self.num_steps
+            threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
+            self.occupy((self.density > threshold) & self.possible)
+
+    def _fit_to_space(self) -> None:
+        """Make the grid as large as the space wants it; what it held is forgotten."""
+        resolution, cascades, cone_angle = self.wanted
+        if self.contracted.is_on():
+            resolution = max(BLOCK, resolution // 2 // BLOCK * BLOCK) if cascades is None else resolution
+            cascades = CASCADES_ENDLESS if cascades is None else cascades
+            cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
+        self.cone_angle = cone_angle or 0.0
+        self.allocate(resolution, cascades or 1)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        # The grid must be as large as the one that is read. A missing switch is complained of below.
+        self.contracted.switch.copy_(state_dict.get(f"{prefix}contracted.switch", self.contracted.switch))
+        self.contracted.forget()
+        self._fit_to_space()
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        self._lattice = self._numbers = None

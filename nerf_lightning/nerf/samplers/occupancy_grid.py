@@ -1,0 +1,100 @@
+"""The grid of an occupancy sampler: where its cells lie, and what is known of each."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, blocks_of
+
+# The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
+# counts as thin, and only solid matter ends a march.
+RISE = 0.3
+
+
+class OccupancyGrid(nn.Module):
+    """Cells in nested boxes, each box twice as large as the one before; cells are numbered box by box, z fastest.
+
+    A sampler is a grid and does not have one, so that checkpoints have the same names as they always had.
+    """
+
+    aabb: Tensor
+    """Lower and upper corner of the first box."""
+    range: Tensor
+    """Near and far of the scene."""
+    density: Tensor
+    """A decaying maximum of what was found in each cell."""
+    floor: Tensor
+    """About the smallest density in each cell."""
+    possible: Tensor
+    """Which cells may ever hold something."""
+    cells: Tensor
+    """1 where occupied."""
+    blocks: Tensor
+    """1 where any cell of a block is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.register_buffer("range", torch.tensor([0.0, 1.0]))
+
+    def allocate(self, resolution: int, num_cascades: int) -> None:
+        """Make the grid so many cells wide and so many boxes deep; what it held is forgotten."""
+        self.resolution, self.num_cascades = resolution, num_cascades
+        side = (num_cascades, resolution, resolution, resolution)
+        blocks = (num_cascades, *(resolution // BLOCK,) * 3)
+        device = self.aabb.device
+        self.register_buffer("density", torch.zeros(side, device=device))
+        self.register_buffer("floor", torch.zeros(side, device=device))
+        self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
+        self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
+        self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: a box without inside, or cells that are neither empty nor occupied.
+        """
+        require_box(self.aabb)
+        near, far = self.range.tolist()
+        sound = 0.0 <= near < far and float(self.cells.max()) <= 1 and bool((self.density >= 0).all())
+        if not sound or not torch.equal(self.blocks, blocks_of(self.cells)):
+            raise InputError(f"The occupancy grid in the model's state cannot be one. {ANOTHER}")
+
+    def reset(self) -> None:
+        """Forget what was learnt: every possible cell is occupied."""
+        self.density.zero_()
+        self.floor.zero_()
+        self.occupy(self.possible)
+
+    def learn(self, number: Int[Tensor, "cells"], found: Float[Tensor, "cells"], decay: float) -> None:
+        """Take note of the densities that were found in some cells; older ones decay."""
+        density, floor = self.density.view(-1), self.floor.view(-1)
+        density[number] = torch.maximum(decay * density[number], found)
+        floor[number] = torch.minimum(found, floor[number] + RISE * (found - floor[number]))
+
+    def occupy(self, occupied: Tensor) -> None:
+        """Say which cells rays may not pass over."""
+        self.cells.copy_(occupied)
+        self.blocks.copy_(blocks_of(self.cells))
+
+    def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
+        """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""
+        side = self.resolution
+        cascade, rest = number // side**3, number % side**3
+        cell = torch.stack([rest // side**2, rest // side % side, rest % side], dim=-1)
+        return self._from_cells(cell + within, (2.0**cascade)[:, None])
+
+    def cell_centers(self, cascade: int) -> tuple[Float[Tensor, "cells 3"], float]:
+        """Return the centres of the cells of one box, and half the diagonal of a cell."""
+        along = torch.arange(self.resolution, device=self.aabb.device)[:, None] + 0.5
+        axes = self._from_cells(along, 2.0**cascade).unbind(dim=-1)
+        half_diagonal = 0.5 * float((self.aabb[1] - self.aabb[0]).norm()) * 2**cascade / self.resolution
+        return torch.stack(torch.meshgrid(*axes, indexing="ij")).view(3, -1).t(), half_diagonal
+
+    def _from_cells(self, at: Tensor, scale: Tensor | float) -> Tensor:
+        """Return places that are given in cells from the lower corner of a box, `scale` times as large as the first."""
+        center, half = center_and_half(self.aabb)
+        return center + (2.0 * at / self.resolution - 1.0) * half * scale

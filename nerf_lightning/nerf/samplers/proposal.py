@@ -1,0 +1,49 @@
+"""Samples drawn anew from what a cheaper level saw: the proposals of mip-NeRF 360 (Sec. 3, arXiv 2111.12077)."""
+
+import torch
+
+from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.rendering.histograms import sample_histogram
+from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
+from nerf_lightning.nerf.types.renderings import DenseRendering
+
+
+class ProposalSampler(Sampler):
+    """Draw the fenceposts of this level from the histogram of the level before, and keep none of that level's own.
+
+    The positions carry no gradient: the level before learns from the interlevel loss alone.
+
+    Args:
+        num_samples: intervals of this level.
+        padding: weight added to each interval of the level before, so that what it overlooks is still found.
+    """
+
+    def __init__(self, num_samples: int = 32, padding: float = 0.01):
+        super().__init__()
+        if num_samples < 1 or padding <= 0:
+            raise ValueError(f"num_samples={num_samples}, padding={padding}: both must be positive")
+        self.num_samples, self.padding = num_samples, padding
+
+    def forward(self, rays: RayBundle, history: list[DenseRendering], random: RayRandom | None) -> RaySamples:
+        """Return `num_samples` intervals where the last level saw something."""
+        edges, weights = history[-1].samples.edges.detach(), history[-1].weights.detach()
+        count = self.num_samples + 1
+        strata = torch.arange(count, device=edges.device, dtype=edges.dtype)
+        within = 0.5 if random is None else random.uniform("proposal", count)
+        u = ((strata + within) / count).expand(*edges.shape[:-1], -1)
+        if not history[-1].samples.endless:
+            return RaySamples(edges=sample_histogram(edges, weights, u, floor=self.padding))
+        shares = sample_histogram(normalized_distance(edges), weights, u, floor=self.padding)
+        return RaySamples(edges=from_normalized_distance(shares), endless=True)
+
+    def num_samples_after(self, before: int) -> int:
+        """Always `num_samples`.
+
+        Raises:
+            ValueError: there is no level before.
+        """
+        if before < 1:
+            raise ValueError("a proposal sampler needs a level before it, to draw from")
+        return self.num_samples

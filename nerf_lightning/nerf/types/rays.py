@@ -1,0 +1,112 @@
+"""Rays, where they are sampled, and the pixels that they belong to."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+
+@dataclass(frozen=True)
+class RayBundle(TensorStruct):
+    """Rays r(t) = origin + t * direction, for t between near and far."""
+
+    origins: Float[Tensor, "*rays 3"]
+    directions: Float[Tensor, "*rays 3"]
+    """Unit length, so `t` is a distance."""
+    near: Float[Tensor, "*rays"]
+    far: Float[Tensor, "*rays"]
+    camera_index: Int[Tensor, "*rays"]
+    view_directions: Float[Tensor, "*rays 3"]
+    """Where the camera looks in the world, unit length: what colour depends on. Differs from `directions` in
+    normalised device coordinates."""
+
+
+@dataclass(frozen=True)
+class RaySamples(TensorStruct):
+    """Adjacent intervals along each ray, kept as their fenceposts."""
+
+    edges: Float[Tensor, "*rays edges"]
+    """Increasing distances; one more than there are samples."""
+    endless: bool = False
+    """Whether even steps are those of `geometry.spacing`, for space without bounds, and not of the distance."""
+
+    @property
+    def starts(self) -> Float[Tensor, "*rays samples"]:
+        """Where each interval begins."""
+        return self.edges[..., :-1]
+
+    @property
+    def ends(self) -> Float[Tensor, "*rays samples"]:
+        """Where each interval ends."""
+        return self.edges[..., 1:]
+
+    @property
+    def midpoints(self) -> Float[Tensor, "*rays samples"]:
+        """Where the field is asked."""
+        return 0.5 * (self.starts + self.ends)
+
+    @property
+    def deltas(self) -> Float[Tensor, "*rays samples"]:
+        """Length of each interval."""
+        return self.ends - self.starts
+
+
+@dataclass(frozen=True)
+class PackedSamples(TensorStruct):
+    """Only the intervals that may hold something, ray after ray, each ray's in order.
+
+    The arrays have a capacity; what lies beyond the last bound is padding of zero length. It is packed for speed, and
+    has functions of its own (`rendering.packed`).
+    """
+
+    ray_index: Int[Tensor, "capacity"]
+    starts: Float[Tensor, "capacity"]
+    ends: Float[Tensor, "capacity"]
+    bounds: Int[Tensor, "bounds"]
+    """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
+    found: Int[Tensor, ""]
+    """How many there were before what exceeds the capacity was dropped."""
+
+    @property
+    def place(self) -> Int[Tensor, "capacity"]:
+        """Number of each sample in its ray, from 0."""
+        return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - self.bounds[self.ray_index]
+
+    def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
+        """Return some of the samples, in order, with the bounds that they have then."""
+        return PackedSamples(self.ray_index[kept], self.starts[kept], self.ends[kept], bounds, self.found)
+
+    @property
+    def midpoints(self) -> Float[Tensor, "capacity"]:
+        """Where the field is asked."""
+        return 0.5 * (self.starts + self.ends)
+
+    @property
+    def deltas(self) -> Float[Tensor, "capacity"]:
+        """Length of each interval."""
+        return self.ends - self.starts
+
+
+@dataclass(frozen=True)
+class PixelIndex(TensorStruct):
+    """Which pixel of which view."""
+
+    view: Int[Tensor, "*rays"]
+    x: Int[Tensor, "*rays"]
+    """Column, from 0 on the left."""
+    y: Int[Tensor, "*rays"]
+    """Row, from 0 on top."""
+
+
+@dataclass(frozen=True)
+class Batch(TensorStruct):
+    """Rays, all that a model may see, and what the photographs say of them."""
+
+    rays: RayBundle
+    rgba: Float[Tensor, "*rays 4"]
+    """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
+    weight: Float[Tensor, "*rays"]
+    """How much each pixel counts: 0 where it is masked, else 1."""

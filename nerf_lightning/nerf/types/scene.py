@@ -1,0 +1,114 @@
+"""What a reader returns: cameras, pixels, and where the content lies."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+Background = Literal["white", "black", "random", "none"]
+"""What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
+
+LensModel = Literal["pinhole", "radial_tangential", "fisheye"]
+"""How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`."""
+
+Space = Literal["bounded", "ndc", "contracted"]
+"""How much of the world is modelled: a box, all that lies in front of a near plane (normalised device coordinates), or
+everything, contracted around a box."""
+
+
+@dataclass(frozen=True)
+class Cameras(TensorStruct):
+    """Cameras, one per view, through lenses of one kind."""
+
+    c2w: Float[Tensor, "*views 3 4"]
+    """Camera-to-world; the columns are right, up, back and the camera's centre."""
+    focal: Float[Tensor, "*views 2"]
+    """Focal lengths in pixels along x and y."""
+    center: Float[Tensor, "*views 2"]
+    """Principal point in pixels from the upper left corner of the image (x, y)."""
+    lens: Float[Tensor, "*views 6"]
+    """Distortion coefficients k1, k2, k3, k4, p1, p2 in the sense of OpenCV; zeros for a pinhole, p 0 for a fisheye."""
+    lens_model: LensModel
+    """What the coefficients mean; one for all views of a scene."""
+    width: Int[Tensor, "*views"]
+    """Image width in pixels."""
+    height: Int[Tensor, "*views"]
+    """Image height in pixels."""
+    ndc: Float[Tensor, "*views 2"] | None = None
+    """Focal length over half the image's size, where rays run through normalised device coordinates (`geometry.ndc`)
+    and the world's z axis is the captures' back; None: rays run through the world."""
+
+
+@dataclass(frozen=True)
+class PixelStore:
+    """Every pixel of every view in one flat array; views may differ in size. Row by row, row 0 on top.
+
+    The arrays may be a file's, mapped into memory and larger than it: index them, never go over the whole.
+    """
+
+    rgba: UInt8[Tensor, "pixels 4"]
+    """Straight (not premultiplied) alpha; 255 where the format has none."""
+    offset: Int[Tensor, "views"]
+    """Index of each view's first pixel."""
+    width: Int[Tensor, "views"]
+    height: Int[Tensor, "views"]
+    has_transparency: bool
+    """Whether the alpha of any pixel says more than that something is there."""
+    mask: UInt8[Tensor, "pixels"] | None = None
+    """1 where a pixel is trained on and scored, 0 where it is left out; None keeps all."""
+
+    def view(self, index: int) -> UInt8[Tensor, "height width 4"]:
+        """Return one view as a picture (no copy)."""
+        return self._picture(self.rgba, index)
+
+    def kept(self, index: int) -> Bool[Tensor, "height width"] | None:
+        """Tell which pixels of one view the mask keeps; None where there is no mask."""
+        return None if self.mask is None else self._picture(self.mask, index) > 0
+
+    def _picture(self, flat: Tensor, index: int) -> Tensor:
+        start, width, height = (int(x[index]) for x in (self.offset, self.width, self.height))
+        return flat[start : start + width * height].view(height, width, *flat.shape[1:])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The exact geometry of each pixel, where a scene knows it. Flat like the pixel store."""
+
+    depth: Float[Tensor, "pixels"]
+    """Distance along the unit ray through the pixel's centre to the first surface; inf where there is none."""
+    normals: Float[Tensor, "pixels 3"]
+    """Unit surface normal in world axes, facing the camera; zero where there is no surface."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a reader returns: pictures with cameras, and where to look for content."""
+
+    name: str
+    cameras: Cameras
+    pixels: PixelStore
+    near: Float[Tensor, "views"]
+    """Distance along the ray at which content may begin, per view, in scene units."""
+    far: Float[Tensor, "views"]
+    """Distance at which content ends."""
+    aabb: Float[Tensor, "2 3"]
+    """Lower and upper corner of a world box that contains the content."""
+    splits: dict[str, tuple[int, ...]]
+    """Views of `train`, `val` and `test`."""
+    view_names: tuple[str, ...]
+    background: Background
+    to_user: Float[Tensor, "4 4"]
+    """Similarity that takes scene coordinates to the user's own frame."""
+    protocol: dict[str, str]
+    """How the pixels were made (downscale filter and the like), stamped on every number measured on them."""
+    truth: Truth | None
+    """Exact depth and normals, for scenes that know them."""
+    space: Space = "bounded"
+    points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
+    """Sparse points of a reconstruction, in scene units; there may be none."""
+    left_out: tuple[str, ...] = ()
+    """Photographs of the capture that have no pose, and so are no views."""

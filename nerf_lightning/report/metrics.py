@@ -1,0 +1,124 @@
+"""What `metrics.json` holds, as a page shows it. The file may be anybody's: what does not fit is left out."""
+
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.kept_views import PARTS, picture_name
+from nerf_lightning.evaluation.metrics_files import COLUMNS
+from nerf_lightning.files.json_files import number
+from nerf_lightning.report.embedding import embedded_file
+from nerf_lightning.report.page import Pairs, ViewOnPage
+
+FORMATS = {
+    "psnr": "{:.2f} dB",
+    "ssim": "{:.4f}",
+    "lpips": "{:.4f}",
+    "depth_error": "{:.4f}",
+    "normal_error": "{:.1f}°",
+    "seconds": "{:.3f}",
+}
+LABELS = {
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "depth_error": "depth error, scene units",
+    "normal_error": "normal error",
+}
+MOST_VIEWS = 12
+MOST_ROWS = 5000
+MOST_PAIRS = 60
+
+
+def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
+    """Return the numbers on top of a page."""
+    median, worst = _mapping(metrics.get("median")), _mapping(_mapping(metrics.get("worst")).get("psnr"))
+    shown = [
+        ("PSNR, mean", _shown("psnr", metrics.get("psnr"))),
+        ("PSNR, median", _shown("psnr", median.get("psnr"))),
+        ("PSNR, worst", _shown("psnr", worst.get("value"))),
+        *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
+    ]
+    origin = _mapping(metrics.get("origin"))
+    for label, value, form in (
+        ("frames per second", metrics.get("frames_per_second"), "{:.3g}"),
+        ("memory, GB at most", metrics.get("peak_memory_gigabytes"), "{:.2f}"),
+        ("seconds of training", note.get("training_seconds"), "{:,.0f}"),
+        ("steps", note.get("finished_at_step"), "{:,.0f}"),
+        ("parameters", origin.get("parameters"), "{:,.0f}"),
+        ("weights, MB", origin.get("megabytes"), "{:.1f}"),
+    ):
+        known = number(value)
+        shown.append((label, "" if known is None else form.format(known)))
+    return [(label, text) for label, text in shown if text]
+
+
+def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return the columns and the rows of the table of all views; columns that no view has are left out."""
+    rows = [row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)][:MOST_ROWS]
+    columns = [column for column in COLUMNS if any(row.get(column) is not None for row in rows)]
+    texts = [[str(row.get(c, ""))[:200] if c == "name" else _shown(c, row.get(c)) for c in columns] for row in rows]
+    return [column.replace("_", " ") for column in columns], texts
+
+
+def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
+    """Return protocol, origin and environment as pairs of texts."""
+    titles = {"protocol": "Protocol", "origin": "Whose numbers these are", "environment": "Environment"}
+    return [(title, _pairs(_mapping(metrics.get(key)))) for key, title in titles.items()]
+
+
+def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPage], list[ViewOnPage], list[str]]:
+    """Return the worst views, those of the even spread, and what could not be read."""
+    rows = {str(row.get("name")): row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)}
+    worst = [str(name) for name in _sequence(metrics.get("worst_views"))][:MOST_VIEWS]
+    named = [(f"worst_{place}", name) for place, name in enumerate(worst, start=1)]
+    split = str(_mapping(metrics.get("protocol")).get("split"))
+    spread = [(picture_name(split, name), name) for name in map(str, _sequence(metrics.get("pictures")))][:MOST_VIEWS]
+    missing: list[str] = []
+    pages: list[list[ViewOnPage]] = []
+    for folders in (named, spread):
+        pages.append([])
+        for folder, name in folders:
+            try:
+                pages[-1].append(_view(images / "views" / _plain(folder), name, rows.get(name, {})))
+            except (InputError, OSError) as error:
+                missing.append(f"View {name[:80]}: {error}")
+    if metrics and not worst and not spread:
+        missing.append("Views: none were kept when this was measured; nerf eval keeps some (then measured=eval).")
+    return pages[0], pages[1], missing
+
+
+def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
+    parts = {part: embedded_file(folder / f"{part}.png") for part in PARTS}
+    numbers = ", ".join(
+        f"{metric.upper()} {text}" for metric in ("psnr", "ssim") if (text := _shown(metric, row.get(metric)))
+    )
+    return ViewOnPage(name=name[:200], numbers=numbers, **parts)
+
+
+def _plain(name: str) -> str:
+    if name != Path(name).name or name in ("", "..") or "\\" in name or "\0" in name:
+        raise InputError("its name is no plain file name")
+    return name
+
+
+def _shown(metric: str, value: Any) -> str:
+    known = number(value)
+    return "" if known is None else FORMATS[metric].format(known)
+
+
+def _pairs(values: dict[str, Any]) -> Pairs:
+    return [(str(key).replace("_", " ")[:80], _said(value)) for key, value in list(values.items())[:MOST_PAIRS]]
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)[:300]
+    return "none" if value is None else str(value)[:300]
+
+
+def _mapping(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _sequence(value: object) -> list[Any]:
+    return value if isinstance(value, list) else []

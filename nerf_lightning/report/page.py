@@ -1,0 +1,87 @@
+"""One page that holds all of a run and loads nothing: pictures, films, curves and texts, opened from the disk.
+
+All texts may come from anybody's run folder. They are escaped, and the page's policy lets no script run but its own,
+and nothing be fetched.
+"""
+
+import base64
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.escaping import for_html
+from nerf_lightning.report.curves import Drawing
+from nerf_lightning.report.embedding import Embedded
+
+FOLDER = Path(__file__).parent
+Pairs = list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class ViewOnPage:
+    """A scored view."""
+
+    name: str
+    numbers: str
+    truth: Embedded
+    render: Embedded
+    depth: Embedded
+    error: Embedded
+
+
+@dataclass
+class Report:
+    """What a page says; what a run lacks stays empty."""
+
+    title: str
+    subtitle: str = ""
+    facts: Pairs = field(default_factory=list)
+    """The numbers on top: label and value."""
+    missing: list[str] = field(default_factory=list)
+    """What could not be shown, and why."""
+    worst: list[ViewOnPage] = field(default_factory=list)
+    views: list[ViewOnPage] = field(default_factory=list)
+    steps: list[tuple[str, Embedded]] = field(default_factory=list)
+    """Pictures of one view while it was learnt."""
+    curves: list[Drawing] = field(default_factory=list)
+    videos: Pairs = field(default_factory=list)
+    checks: list[Check] = field(default_factory=list)
+    """What the doctor found."""
+    coverage: Embedded | None = None
+    columns: list[str] = field(default_factory=list)
+    per_image: list[list[str]] = field(default_factory=list)
+    tables: list[tuple[str, Pairs]] = field(default_factory=list)
+    """Protocol, origin, environment."""
+    overrides: str = ""
+    config: str = ""
+
+
+def page(report: Report) -> str:
+    """Return the report as HTML."""
+    script, style = (_text(f"page.{ending}") for ending in ("js", "css"))
+    policy = (
+        f"default-src 'none'; img-src data:; media-src data:; script-src '{_digest(script)}'; "
+        f"style-src '{_digest(style)}'; base-uri 'none'; form-action 'none'"
+    )
+    environment = Environment(
+        loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined, finalize=_escaped
+    )
+    template = environment.get_template("page.html")
+    # Ours alone are put in as they are.
+    return template.render(report=report, policy=policy, script=Markup(script), style=Markup(style))
+
+
+def _escaped(value: object) -> object:
+    return Markup(for_html(value)) if type(value) is str else value
+
+
+def _text(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

@@ -1,0 +1,248 @@
+"""Run folders: chosen before anything is written, held by one process, never shared by two configs.
+
+A run folder has `run.json` (its config's fingerprint, and what it came to), `.hydra/` (config and overrides),
+`checkpoints/`, `tensorboard/`, `images/`, and at the end `metrics.json`, `metrics.csv`, `video.mp4`.
+"""
+
+import contextlib
+import itertools
+import os
+import time
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.writing import sweep_leftovers
+from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
+from nerf_lightning.config.instantiate import required_path
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import number, write_json
+from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.files.walk import walk
+from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.runs.summary import read_note
+from nerf_lightning.slurm import slurm_job, was_requeued
+from nerf_lightning.training.callbacks.folder_guard import require_run
+
+
+@dataclass(frozen=True)
+class ResumePoint:
+    """Where training goes on, and what must stay as it was there; small enough to be sent between processes."""
+
+    checkpoint: Path
+    step: int
+    precision: str
+    tile_points: int | None
+
+
+@dataclass
+class RunFolder:
+    """A run folder that this process holds."""
+
+    path: Path
+    lock: FileLock
+    named_checkpoint: Path | None
+    """The checkpoint that the user named to go on from."""
+    began: float = field(default_factory=time.monotonic)
+
+    def resume_point(self) -> ResumePoint | None:
+        """Read the checkpoint that the user named, else the newest that is whole; None where nothing was saved.
+
+        Raises:
+            InputError: there are checkpoints, and none can be read.
+        """
+        folder, named = self.path / "checkpoints", self.named_checkpoint
+        found = newest_checkpoint(folder) if named is None else read_checkpoint(named)
+        if found is None:
+            return None
+        path = found.path
+        if named is None and path.name == PREVIOUS:
+            # Else the next save would put the damaged one in the place of the good one.
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(folder / LAST, folder / DAMAGED)
+            path = path.replace(folder / LAST)
+        return ResumePoint(path, found.step, found.precision, found.tile_points)
+
+    def trained(self) -> None:
+        """Note that training is over, and how long it took.
+
+        Raises:
+            InputError: the folder is gone.
+        """
+        self._note(training_seconds=self._note())
+
+    def finish(self, step: int, psnr: float | None = None) -> None:
+        """Note that the run is complete.
+
+        Raises:
+            InputError: the folder is gone.
+        """
+        self._note(finished_at_step=step, psnr=psnr)
+
+    def stop(self, restarted: bool) -> None:
+        """Note that the run was stopped; a `restarted` one is started again by its scheduler, and then goes on."""
+        self._note(**({"preempted": True} if restarted else {}))
+
+    def release(self) -> None:
+        """Let others have the folder."""
+        self.lock.release()
+
+    def _note(self, **values: Any) -> float:
+        require_run(self.path)
+        note = read_note(self.path)
+        now = time.monotonic()
+        seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)
+        self.began = now
+        write_json(self.path / "run.json", note | {"seconds": seconds} | values)
+        return seconds
+
+
+def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> RunFolder:
+    """Choose the run's folder, refuse it or take hold of it, and write down the config.
+
+    Args:
+        config: the run's config.
+        num_steps: its length; a run that finished earlier counts as unfinished.
+        job_folder: the folder that a sweep gives this job, or None for a single run.
+
+    Raises:
+        InputError: the folder is in use, is occupied by another run, or cannot be written.
+    """
+    identity = run_identity(config)
+    folder = _choose(config, identity, num_steps, job_folder)
+    require_no_way_out(folder)
+    try:
+        (folder / ".hydra").mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".hydra" / "lock")
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise InputError(
+            f"{folder} is in use by another process that is training there. Wait for it, stop it, or give another "
+            "folder with paths.output_dir=DIR."
+        ) from error
+    except OSError as error:
+        raise InputError(
+            f"The run folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
+        ) from error
+    note = read_note(folder)
+    kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
+        key: note[key] for key in ("started", "seconds") if key in note
+    }
+    job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
+    write_json(
+        folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings_digest(config)} | kept | job
+    )
+    sweep_leftovers(folder / "checkpoints")
+    named = str(config.resume).endswith(".ckpt")
+    return RunFolder(folder, lock, Path(config.resume) if named else None)
+
+
+def job_folder() -> Path | None:
+    """Return the folder that a sweep gives this job, or None for a single run."""
+    hydra_config = HydraConfig.get()
+    return Path(hydra_config.runtime.output_dir) if hydra_config.mode == RunMode.MULTIRUN else None
+
+
+def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
+    """Keep the config where Hydra would: `.hydra/config.yaml`, `hydra.yaml` and `overrides.yaml`."""
+    kept = {
+        "config.yaml": config,
+        "hydra.yaml": OmegaConf.masked_copy(hydra_config, ["job", "runtime", "overrides"]),
+        "overrides.yaml": OmegaConf.create(list(hydra_config.overrides.task)),
+    }
+    for name, content in kept.items():
+        # Whole or not at all: a resume by the folder's name reads them.
+        with whole_file(folder / ".hydra" / name) as part:
+            OmegaConf.save(content, part)
+
+
+def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
+    resume, given = config.resume, config.paths.output_dir
+    if resume is not None and resume != "auto":
+        return _to_resume(Path(required_path("resume", resume)), identity)
+    folder = job_folder or (Path(given) if given else None)
+    if folder is None and (resume == "auto" or was_requeued()):
+        of_job = None if resume == "auto" else slurm_job()
+        folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), num_steps, of_job)
+    if folder is None:
+        return _fresh(Path(config.paths.root_dir) / config.scene.name)
+    if (folder / "run.json").exists():
+        resuming = resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
+        _refuse_other_run(folder, identity, resuming)
+    return folder
+
+
+def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
+    folder = path.parent.parent if path.suffix == ".ckpt" else path
+    if path.suffix == ".ckpt" and not path.is_file():
+        raise InputError(f"resume={path}: there is no such checkpoint. A run keeps last.ckpt and best.ckpt.")
+    if not (folder / "run.json").is_file():
+        raise InputError(
+            f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
+            "resume=auto for the newest unfinished run of this config."
+        )
+    _refuse_other_run(folder, identity, resuming=True)
+    return folder
+
+
+def _refuse_other_run(folder: Path, identity: dict[str, Any], resuming: bool) -> None:
+    if read_note(folder).get("fingerprint") == fingerprint(identity):
+        if resuming:
+            return
+        raise InputError(
+            f"{folder} already holds a run of this very config. Add resume=auto to go on with it, or give another "
+            "folder with paths.output_dir=DIR."
+        )
+    raise InputError(
+        f"{folder} is occupied by a run of another config ({_difference(folder, identity)}). Give the settings that it "
+        "was started with (.hydra/overrides.yaml), or another folder with paths.output_dir=DIR."
+    )
+
+
+def _difference(folder: Path, identity: dict[str, Any]) -> str:
+    saved = folder / ".hydra" / "config.yaml"
+    if not saved.is_file():
+        return "its config was not kept"
+    content = read_plain_yaml(saved)
+    if not isinstance(content, dict):
+        return "its config is damaged"
+    try:
+        other = run_identity(OmegaConf.create(content))
+    except OmegaConfBaseException:
+        return "its config is damaged"
+    keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
+    shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
+    return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
+
+
+def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
+    notes = sorted(_notes_below(root), key=lambda file: file.stat().st_mtime, reverse=True)
+    for file in notes:
+        note = read_note(file.parent)
+        ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
+        finished = number(note.get("finished_at_step"))
+        if ours and (finished is None or finished < num_steps):
+            return file.parent
+    return None
+
+
+def _notes_below(root: Path) -> list[Path]:
+    return [base / "run.json" for base, _, names in walk(root) if "run.json" in names]
+
+
+def _fresh(parent: Path) -> Path:
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    for name in itertools.chain([stamp], (f"{stamp}_{count}" for count in itertools.count(2))):
+        with contextlib.suppress(FileExistsError):
+            (parent / name).mkdir(parents=True)
+            return parent / name
+    raise AssertionError("unreachable: the names never end")

@@ -1,0 +1,47 @@
+"""Where a command that does not train writes: as the user says, or beside the checkpoint."""
+
+import tempfile
+from pathlib import Path
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.runs.folder import job_folder
+
+
+def beside_checkpoint(checkpoint: Path, name: str) -> Path:
+    """Return the folder of this name in the run folder that a checkpoint lies in."""
+    beside = checkpoint.absolute().parent
+    return (beside.parent if beside.name == "checkpoints" else beside) / name
+
+
+def chosen_folder(given: str | None, default: Path) -> Path:
+    """Return where a command that does not train is to write: as given, else by default. Nothing is made yet.
+
+    The jobs of a sweep have folders of their own.
+
+    Raises:
+        InputError: links lead out of it.
+    """
+    if given is None:
+        # Beside a checkpoint that may come from anybody.
+        require_no_way_out(default.parent if default.is_symlink() else default)
+    return job_folder() or Path(given or default)
+
+
+def output_folder(given: str | None, default: Path) -> Path:
+    """Return the folder that `chosen_folder` names, made and tried.
+
+    Raises:
+        InputError: the folder cannot be made or written, or links lead out of it.
+    """
+    folder = chosen_folder(given, default)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Under a name that nobody can have planted a link at.
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".probe"):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
+        ) from error
+    return folder

@@ -1,0 +1,134 @@
+"""Results as they lie in run folders: what was reached, by which model, on which scene, and how it was measured."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from nerf_lightning.budgets import allowed
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.metrics_files import METRICS
+from nerf_lightning.files.json_files import number, read_json_object
+from nerf_lightning.files.walk import walk
+from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.runs.summary import RunSummary, read_note, read_run
+
+Measured = Literal["run", "eval"]
+FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
+# Settings by which rows do not differ: where things lie, what is said of a run, and what has a column of its own. What
+# lies below a model or a scene is what was swept.
+NOT_SHOWN = ("seed", "model", "scene", "resume", "path", "logger")
+NOT_SHOWN_BELOW = (
+    *("paths.", "path.", "sweep.", "final.", "evaluation.", "hydra.", "logger."),
+    *("scene.root", "scene.path", "scene.name", "scene.cache_dir", "scene.verify", "scene.allow_outside"),
+    "scene.max_gigabytes",
+)
+SEED = re.compile(r"-?\d{1,18}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One measured run."""
+
+    summary: RunSummary
+    scene: str
+    model: str
+    seed: int | None
+    values: dict[str, float | None]
+    """The mean of each metric, and what else was measured; None where it is not known."""
+    settings: dict[str, str]
+    """What else was given on the command line."""
+    protocol: dict[str, Any]
+    origin: dict[str, Any]
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lies."""
+        return self.summary.folder
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the run folders in these folders, and what `nerf eval` wrote on its own; nothing is followed out of them.
+
+    Raises:
+        InputError: a folder is not there, or there is no run in them.
+    """
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"runs={folder}: there is no such folder. Give run folders, or folders that hold some.")
+    found = list(dict.fromkeys(run for folder in folders for run in _runs_below(folder)))
+    if not found:
+        named = ", ".join(map(str, folders))
+        raise InputError(f"There is no run in {named} (no run.json and no metrics.json). nerf train leaves some.")
+    return found
+
+
+def _runs_below(folder: Path) -> Iterator[Path]:
+    for count, (base, below, names) in enumerate(walk(folder)):
+        if count > allowed().folders:
+            raise InputError(
+                f"{folder} holds more than {allowed().folders:,} folders. Name the runs more closely, or add "
+                "budgets.folders=N."
+            )
+        below.sort()
+        if "run.json" in names or "metrics.json" in names:
+            below.clear()
+            yield base
+
+
+def read_result(folder: Path, measured: Measured) -> RunResult | None:
+    """Return what a run reached, None where it was not measured."""
+    own = "metrics.json" if not (folder / "run.json").exists() else FILES[measured]
+    metrics = read_json_object(folder / own)
+    if number(metrics.get("psnr")) is None:
+        return None
+    run, note = read_run(folder), read_note(folder)
+    protocol = _mapping(metrics.get("protocol"))
+    origin = _choices(folder) | _mapping(metrics.get("origin"))
+    seed = str(origin.get("seed", run.overrides.get("seed", "0")))
+    values = {metric: number(metrics.get(metric)) for metric in METRICS}
+    values["frames_per_second"] = number(metrics.get("frames_per_second"))
+    values |= {key: number(origin.get(key)) for key in ("parameters", "megabytes")}
+    values["minutes"] = _minutes(number(note.get("training_seconds")))
+    return RunResult(
+        summary=run,
+        scene=_scene_name(protocol, origin, run.overrides),
+        model=str(origin.get("model") or run.overrides.get("model", "")) or "not said",
+        seed=int(seed) if SEED.fullmatch(seed) else None,
+        values=values,
+        settings={key: value for key, value in run.overrides.items() if _is_shown(key.lstrip("+~"))},
+        protocol=protocol,
+        origin=origin,
+    )
+
+
+def _is_shown(key: str) -> bool:
+    # `scene@PACKAGE` picks from the group that `scene` picks from.
+    return key.partition("@")[0] not in NOT_SHOWN and not key.startswith(NOT_SHOWN_BELOW)
+
+
+def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
+    """Return the scene's name; where it bears its format's alone, that of the folder or file it was read from."""
+    name = str(protocol.get("scene", "")) or "not said"
+    if name != str(origin.get("scene", overrides.get("scene"))):
+        return name
+    root, file = (Path(overrides.get(key, "").strip("'\"")) for key in ("scene.root", "scene.path"))
+    return root.name or file.stem or name
+
+
+def _choices(folder: Path) -> dict[str, Any]:
+    """Return the scene and the model that were picked, for results that do not name them."""
+    try:
+        choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
+        return {key: choices[key] for key in ("scene", "model")}
+    except (InputError, LookupError, TypeError):
+        return {}
+
+
+def _mapping(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _minutes(seconds: float | None) -> float | None:
+    return None if seconds is None else seconds / 60

@@ -1,0 +1,188 @@
+"""The overrides that a run or a sweep was started with, repeated where it is gone on with by its folder's name.
+
+They come out of a file in the folder, and the folder may come from anybody: what names a class, looks something
+up (an interpolation), or says where to write or how far to trust is taken from the command line alone.
+"""
+
+import os
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, ValueType
+from hydra.errors import HydraException
+
+from nerf_lightning.budgets import require_within
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
+
+OF_ONE_START = ("resume", "paths", "init_from", "sweep", "viewer", "budgets")
+"""What belongs to one start of a run, not to the run: the viewer opens a server, for whoever sits there then."""
+OF_THE_USER = ("hydra", "logger", "scene.download", "scene.cache_dir", "scene.allow_outside", "scene.max_gigabytes")
+"""Where to write, what to fetch, and what to trust."""
+DOWNLOADED = "scene.path"
+"""Where some scenes put what they fetch: a file that is there already is only read."""
+SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
+SWEEP_NUMBERS = re.compile(r"hydra\.(launcher|sweeper|sweeper\.sampler)\.[A-Za-z]\w*", re.ASCII)
+"""Numbers that say how many jobs there are, at once and in all. Not hydra.sweeper.params: its keys are overrides."""
+SWEEP_WORDS = (
+    "hydra.launcher.batch_size",
+    "hydra.launcher.name",
+    "hydra.launcher.partition",
+    "hydra.sweeper.direction",
+)
+OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)
+KEY = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
+WORD = re.compile(r"\w[\w-]*", re.ASCII)
+
+
+def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
+    """Return what a run was started with, but for what belongs to one start and what the user gives again.
+
+    Raises:
+        InputError: the file is no list of overrides, or holds one that is not repeated from files.
+    """
+    saved = run_folder / ".hydra" / "overrides.yaml"
+    if not saved.is_file():
+        return []
+    lines = read_plain_yaml(saved)
+    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+        raise InputError(f"{saved} is no list of overrides: it is damaged. Give the run's settings by hand.")
+    return list(_repeated(lines, arguments, saved, of_sweep=False))
+
+
+def former_sweep(sweep_folder: Path, arguments: Sequence[str]) -> list[str]:
+    """Return what a sweep was started with, but for what belongs to one start and what the user gives again.
+
+    Raises:
+        InputError: the file is no record of a sweep, or holds an override that is not repeated from files.
+    """
+    record = read_sweep(sweep_folder)
+    if record is None:
+        return []
+    return list(_repeated(record.typed(), arguments, sweep_record(sweep_folder), of_sweep=True))
+
+
+def to_give_again(overrides: Sequence[str], of_sweep: bool = False) -> list[str]:
+    """Return, as typed in a shell, those overrides of a run or a sweep that are not repeated from its folder."""
+    return [
+        shlex.quote(line)
+        for line, override in ((line, _parsed(line)) for line in overrides)
+        if override and not _is_of_one_start(override, of_sweep) and not _is_harmless(override, of_sweep)
+    ]
+
+
+def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sweep: bool) -> Iterator[str]:
+    require_within("override_characters", sum(map(len, lines)), str(saved), "characters of overrides")
+    given = {argument.lstrip("+~").partition("=")[0] for argument in arguments}
+    for line in lines:
+        override = _parsed(line)
+        if override is not None and (override.key_or_group in given or _is_of_one_start(override, of_sweep)):
+            continue
+        if override is None or not _is_harmless(override, of_sweep):
+            flag, kind = ("sweep.resume=true", "sweep") if of_sweep else ("resume=", "run")
+            raise InputError(
+                f"{saved} holds {line[:200]!r}, which is not repeated from a file: what names a class, looks something "
+                "up, or says where to write, what to fetch and how far to trust is taken from the command line alone. "
+                f"If it is yours, type it again after {flag}; else do not go on with this {kind}."
+            )
+        yield line
+
+
+def _is_of_one_start(override: Override, of_sweep: bool) -> bool:
+    # Jobs of a sweep that have not begun start from there still.
+    if of_sweep and override.key_or_group == "init_from":
+        return False
+    return _belongs(override.key_or_group, OF_ONE_START)
+
+
+def _parsed(line: str) -> Override | None:
+    try:
+        # Options of Hydra's own command line, such as --config-dir, are none.
+        return None if line.startswith("-") else OverridesParser.create().parse_override(line)
+    except (HydraException, RecursionError, ValueError):  # brackets in brackets, a number of thousands of digits
+        return None
+
+
+def _is_harmless(override: Override, of_sweep: bool) -> bool:
+    if not of_sweep:
+        return _is_harmless_alone(override)
+    if _belongs(override.key_or_group, ("hydra",)):
+        return _is_sweep_setting(override)
+    return all(job is not None and _is_harmless_alone(job) for job in _of_each_job(override))
+
+
+def _is_sweep_setting(override: Override) -> bool:
+    key, value = override.key_or_group, override.value()
+    if override.package is not None or override.is_sweep_override():
+        return False
+    if key in SWEEP_GROUPS:
+        return isinstance(value, str) and KEY.fullmatch(value) is not None
+    if key in SWEEP_WORDS and isinstance(value, str):
+        return WORD.fullmatch(value) is not None
+    return SWEEP_NUMBERS.fullmatch(key) is not None and (value is None or isinstance(value, (bool, int, float)))
+
+
+def _of_each_job(override: Override) -> Iterator[Override | None]:
+    key, kind = override.get_key_element(), override.value_type
+    if kind in (ValueType.CHOICE_SWEEP, ValueType.SIMPLE_CHOICE_SWEEP):
+        yield from (_parsed(f"{key}={value}") for value in override.sweep_string_iterator())
+    elif kind == ValueType.GLOB_CHOICE_SWEEP:
+        yield _parsed(f"{key}=any")  # stands for the names of our own options
+    elif override.is_sweep_override():
+        yield _parsed(f"{key}=0")  # stands for all numbers of a range or an interval
+    else:
+        yield override
+
+
+def _is_harmless_alone(override: Override) -> bool:
+    if override.is_sweep_override():
+        return False
+    key, value, package = override.key_or_group, override.value(), override.package
+    if not all(KEY.fullmatch(word) for word in re.split(r"[./]", key)):
+        return False
+    if package is not None and (_belongs(package, OF_THE_USER) or not all(map(KEY.fullmatch, package.split(".")))):
+        return False
+    if package is not None or "/" in key or (conf_folder() / key).is_dir():
+        names = value if isinstance(value, list) else [value]
+        if key.partition("/")[0] == "hydra" or not all(_is_option(name) for name in names):
+            return isinstance(value, dict) and _is_plain(key, value)
+        return True
+    return _is_plain(key, value)
+
+
+def _is_option(name: Any) -> bool:
+    return name is None or (isinstance(name, str) and OPTION.fullmatch(name) is not None)
+
+
+def _is_plain(key: str, value: Any) -> bool:
+    for path, leaf in _leaves(key, value):
+        if _belongs(path, OF_THE_USER) or any(word.startswith("_") for word in path.split(".")):
+            return False
+        if isinstance(leaf, str) and (
+            "${" in leaf or (path == DOWNLOADED and not os.path.exists(os.path.expanduser(leaf)))
+        ):
+            return False
+        if not (leaf is None or isinstance(leaf, (str, int, float, bool))):
+            return False
+    return True
+
+
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, child in value.items():
+            yield from _leaves(f"{path}.{key}", child)
+    elif isinstance(value, list):
+        for child in value:
+            yield from _leaves(path, child)
+    else:
+        yield path, value
+
+
+def _belongs(key: str, names: Sequence[str]) -> bool:
+    return any(key == name or key.startswith((f"{name}.", f"{name}/", f"{name}@")) for name in names)

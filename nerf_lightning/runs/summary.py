@@ -1,0 +1,74 @@
+"""What a run folder says of its run, from `run.json`, `metrics.json` and `.hydra/`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.json_files import number, read_json_object
+from nerf_lightning.files.yaml_files import read_plain_yaml
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """A run in one row; None where the folder does not say."""
+
+    folder: Path
+    overrides: dict[str, str]
+    """What was given on the command line, by key."""
+    psnr: float | None
+    ssim: float | None
+    steps: int | None
+    """The step at which the run finished."""
+    seconds: float | None
+    """Time in training, evaluation and film, of all starts but those that were killed."""
+    started: str | None = None
+    """When the run was begun, such as 2026-11-21T10:00:00."""
+
+
+def read_run(folder: Path) -> RunSummary:
+    """Return what a folder says, finished or not."""
+    note, metrics = read_note(folder), read_json_object(folder / "metrics.json")
+    steps = number(note.get("finished_at_step"))
+    return RunSummary(
+        folder=folder,
+        overrides=by_key(_read_overrides(folder / ".hydra" / "overrides.yaml")),
+        psnr=number(metrics.get("psnr", note.get("psnr"))),
+        ssim=number(metrics.get("ssim")),
+        steps=None if steps is None else int(steps),
+        seconds=number(note.get("seconds")),
+        started=str(note["started"]) if "started" in note else None,
+    )
+
+
+def read_note(folder: Path) -> dict[str, Any]:
+    """Return the content of `run.json`, empty where it is missing or damaged."""
+    return read_json_object(folder / "run.json")
+
+
+def by_key(overrides: list[str]) -> dict[str, str]:
+    """Return overrides as a mapping; what is given twice holds as given last.
+
+    >>> by_key(["model=nerf_tiny", "seed=0", "seed=1"])
+    {'model': 'nerf_tiny', 'seed': '1'}
+    """
+    return {key: value for key, _, value in (override.partition("=") for override in overrides)}
+
+
+def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:
+    """Return the keys that not all settings have, or have the same value of, in the order in which they first come.
+
+    >>> differing_keys([{"model": "nerf_tiny", "seed": "0"}, {"model": "nerf_tiny", "seed": "1"}])
+    ['seed']
+    """
+    keys = dict.fromkeys(key for given in settings for key in given)
+    return [key for key in keys if len({given.get(key) for given in settings}) > 1]
+
+
+def _read_overrides(path: Path) -> list[str]:
+    try:
+        content = read_plain_yaml(path)
+    except InputError:
+        return []
+    return [str(override) for override in content] if isinstance(content, list) else []

@@ -1,0 +1,154 @@
+"""A sweep as its own process sees it: the command to go on with, the jobs' cores, Ctrl-C, and the table at its end."""
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import psutil
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.config.overrides import to_type
+from nerf_lightning.cores import num_cores
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.runs.saved_overrides import to_give_again
+from nerf_lightning.runs.sweep_job import JobRecord, read_records, records_folder, stop_file
+from nerf_lightning.runs.sweep_record import SweepRecord
+from nerf_lightning.slurm import slurm_job
+
+log = logging.getLogger(__name__)
+
+# Launchers whose jobs are processes of this machine; those of the others go on when this process is stopped.
+LOCAL_LAUNCHERS = (".JoblibLauncher", ".LocalLauncher")
+
+
+@dataclass
+class Sweep:
+    """A sweep that has begun."""
+
+    command: str
+    folder: Path
+    record: SweepRecord
+    received: int | None = None
+    """The signal that stopped it."""
+    former_handlers: dict[int, Any] = field(default_factory=dict)
+
+    def go_on_with(self) -> str:
+        """Return the command that goes on with it."""
+        folder = to_type("paths.output_dir", str(self.folder))
+        again = to_give_again(self.record.typed(), of_sweep=True)
+        return " ".join([self.command, "-m sweep.resume=true", folder, *again])
+
+
+# Hydra builds its callbacks itself, so that what they learn has to be kept outside.
+_begun: list[Sweep] = []
+
+
+class SweepWatch(Callback):
+    """Hydra's word that a sweep begins, in the process that the user started."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write down what was asked for, say how to go on after a stop, and share out the cores."""
+        asked: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
+        record = SweepRecord([*asked["hydra"], *asked["task"]], slurm_job())
+        sweep = Sweep(sys.argv[0], Path(config.hydra.sweep.dir), record)
+        for leftover in (*records_folder(sweep.folder).glob("*.json"), stop_file(sweep.folder)):
+            leftover.unlink(missing_ok=True)
+        record.write(sweep.folder)
+        if "sweep" in config:
+            said = f"sweep folder {sweep.folder}; after a stop, go on with: {sweep.go_on_with()}"
+            print(for_terminal(said), file=sys.stderr)
+        # Optuna's database library lists its parts.
+        logging.getLogger("alembic").setLevel(logging.WARNING)
+        launcher = config.hydra.launcher._target_
+        if launcher.endswith(LOCAL_LAUNCHERS):
+            _share_cores(launcher, config.hydra.launcher)
+            _pass_signals_on(sweep)
+        _begun.append(sweep)
+
+
+def watched(run: Callable[[], None]) -> None:
+    """Run a sweep, and say at its end, however it ends, what its jobs came to.
+
+    Raises:
+        InputError: some jobs failed.
+        SystemExit: it was stopped by a signal, or a job crashed.
+    """
+    _begun.clear()
+    error: Exception | None = None
+    try:
+        run()
+    except Exception as raised:
+        error = raised
+    finally:
+        records = _end() if _begun else []
+    bad = [record for record in records if record.state not in ("finished", "finished before")]
+    if error is not None and (not bad or isinstance(error, InputError)):
+        raise error
+    if _begun and _begun[-1].received is not None:
+        raise SystemExit(128 + _begun[-1].received)
+    if bad:
+        _complain(bad, len(records), error)
+
+
+def _end() -> list[JobRecord]:
+    # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
+    from nerf_lightning.console import say
+    from nerf_lightning.runs.sweep_table import job_rows
+    from nerf_lightning.runs.table_files import print_rows, write_rows
+
+    sweep = _begun[-1]
+    for number, handler in sweep.former_handlers.items():
+        signal.signal(number, handler)
+    records = read_records(sweep.folder)
+    if not records:
+        return []
+    rows = job_rows(records, sweep.folder)
+    print_rows(rows, f"sweep {sweep.folder}")
+    write_rows(rows, sweep.folder, "sweep")
+    say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
+    if any(record.state in ("running", "stopped") for record in records):
+        say(f"go on with   {sweep.go_on_with()}")
+    return records
+
+
+def _complain(bad: list[JobRecord], total: int, error: Exception | None) -> None:
+    reasons: dict[str, list[str]] = {}
+    for record in bad:
+        reasons.setdefault(record.reason or f"its process ended ({error})", []).append(Path(record.folder).name)
+    told = " ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items())
+    message = f"{len(bad)} of {total} jobs failed. {told}"
+    if all(record.state == "failed" for record in bad):
+        raise InputError(message)
+    log.error("nerf: %s", message)
+    raise SystemExit(1)
+
+
+def _share_cores(launcher: str, settings: DictConfig) -> None:
+    # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local jobs are
+    # told nothing.
+    os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
+    if launcher.endswith(".LocalLauncher"):
+        os.environ.setdefault("OMP_NUM_THREADS", str(settings.cpus_per_task or 1))
+
+
+def _pass_signals_on(sweep: Sweep) -> None:
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        if sweep.received is not None:
+            raise KeyboardInterrupt
+        sweep.received = number
+        stop_file(sweep.folder).touch()
+        log.info("stopping: the jobs that run finish their step and save")
+        for record in read_records(sweep.folder):
+            if record.state == "running" and psutil.pid_exists(record.process):
+                os.kill(record.process, signal.SIGTERM)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        sweep.former_handlers[number] = signal.signal(number, pass_on)

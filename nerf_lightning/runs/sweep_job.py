@@ -1,0 +1,147 @@
+"""One job of a sweep: skip it where it was done before, run it, and leave a record of how it ended.
+
+Jobs may run in other processes and on other machines; what the sweep's own process must know of them goes through
+files in the sweep's folder. A job that fails returns None, so that the sweep goes on with the others.
+"""
+
+import json
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from nerf_lightning.config.identity import settings_digest
+from nerf_lightning.config.messages import paragraph
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.json_files import number, write_json
+from nerf_lightning.files.regular import read_text
+from nerf_lightning.files.walk import walk
+from nerf_lightning.runs.summary import read_note
+from nerf_lightning.slurm import was_requeued
+
+MOST_BYTES = 1 << 20
+"""Of a record."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """How a job stands."""
+
+    number: int
+    overrides: list[str]
+    folder: str
+    process: int
+    state: Literal["running", "finished", "finished before", "failed", "crashed", "stopped"] = "running"
+    reason: str = ""
+
+    def write(self, sweep_folder: Path) -> None:
+        """Leave the record for the sweep's own process."""
+        write_json(records_folder(sweep_folder) / f"{self.number}.json", asdict(self))
+
+
+def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:
+    """Run one job of a sweep and return its value, None where it failed.
+
+    Args:
+        run: what the command does.
+        config: the job's config.
+        command: its name.
+
+    Raises:
+        SystemExit: a signal stopped the job, which stops a sweep whose jobs run in one process.
+    """
+    hydra = HydraConfig.get()
+    sweep_folder, own = Path(hydra.sweep.dir), Path(hydra.runtime.output_dir)
+    elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
+    if elsewhere:
+        _behave_as_one_of_many()
+        if stop_file(sweep_folder).exists():
+            return None
+    record = JobRecord(int(hydra.job.num), list(hydra.overrides.task), str(own), os.getpid())
+    record.write(sweep_folder)
+    try:
+        former = _former_run(sweep_folder, own, config)
+        if former is not None:
+            return _skip(record, former, sweep_folder)
+        value = run(config)
+    except Exception as error:
+        _failed(record, error, paragraph(error, command, conf_folder())).write(sweep_folder)
+        return None
+    except (SystemExit, KeyboardInterrupt) as stop:
+        if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started
+            replace(record, state="failed", reason="its processes have said why").write(sweep_folder)
+            return None
+        replace(record, state="stopped").write(sweep_folder)
+        # joblib would kill the other jobs before they have saved.
+        if elsewhere and stop_file(sweep_folder).exists():
+            return None
+        raise
+    replace(record, state="finished").write(sweep_folder)
+    return value
+
+
+def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
+    log.info("job %d has finished before: %s", record.number, former)
+    own = Path(record.folder)
+    if former != own and not any(own.iterdir()):
+        own.rmdir()
+    replace(record, folder=str(former), state="finished before").write(sweep_folder)
+    return number(read_note(former).get("psnr"))
+
+
+def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecord:
+    if reason is None:
+        log.exception("job %d crashed", record.number)
+        return replace(record, state="crashed", reason=f"{type(error).__name__}: {error}".splitlines()[0])
+    log.error("job %d failed: %s", record.number, reason)
+    return replace(record, state="failed", reason=reason)
+
+
+def read_records(sweep_folder: Path) -> list[JobRecord]:
+    """Return what the jobs of a sweep have left, in their order."""
+    # Not what begins with a dot: a job may be writing its record just now, or was killed while it did.
+    files = records_folder(sweep_folder).glob("[!.]*.json")
+    records = [JobRecord(**json.loads(read_text(file, MOST_BYTES))) for file in files]
+    return sorted(records, key=lambda record: record.number)
+
+
+def records_folder(sweep_folder: Path) -> Path:
+    """Return where the jobs leave their records."""
+    return sweep_folder / ".hydra" / "jobs"
+
+
+def stop_file(sweep_folder: Path) -> Path:
+    """Return the file that keeps waiting jobs from starting."""
+    return sweep_folder / ".hydra" / "stop"
+
+
+def _former_run(sweep_folder: Path, own: Path, config: DictConfig) -> Path | None:
+    if "sweep" not in config or not (config.sweep.resume or was_requeued()):
+        return None
+    others = sorted(base for base, _, names in walk(sweep_folder) if "run.json" in names and base != own)
+    return finished_run([own, *others], config)
+
+
+def _behave_as_one_of_many() -> None:
+    # The sweep's own process hears Ctrl-C and passes it on to the jobs that run.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Bars of several processes on one terminal overwrite each other; rich asks this variable.
+    os.environ["TTY_COMPATIBLE"] = "0"
+
+
+def finished_run(folders: Iterable[Path], config: DictConfig) -> Path | None:
+    """Return the first folder whose run did all that this config asks for, or None."""
+    digest = settings_digest(config)
+    for folder in folders:
+        note = read_note(folder)
+        if note.get("settings") == digest and "finished_at_step" in note:
+            return folder
+    return None

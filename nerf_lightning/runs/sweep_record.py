@@ -1,0 +1,53 @@
+"""What a sweep was started with, kept in its folder and read where it is gone on with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
+
+JOB_NUMBER = "${hydra.job.num}"
+MADE = ("hydra.mode=", "hydra.sweep.dir=", "sweep.", f"hydra.sweep.subdir='{JOB_NUMBER}")
+"""What was made of the arguments, or belongs to one start: it is made again."""
+
+
+@dataclass(frozen=True)
+class SweepRecord:
+    """What a sweep was started with, as its folder says; the folder may come from anybody."""
+
+    arguments: list[str]
+    slurm_job: str | None = None
+
+    def write(self, sweep_folder: Path) -> None:
+        """Leave it in the sweep's folder."""
+        record = sweep_record(sweep_folder)
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.write_text(yaml.safe_dump({"arguments": self.arguments, "slurm_job": self.slurm_job}))
+
+    def typed(self) -> list[str]:
+        """Return the arguments without what was made of them."""
+        return [argument for argument in self.arguments if not argument.startswith(MADE)]
+
+
+def sweep_record(sweep_folder: Path) -> Path:
+    """Return the file that says what a sweep was started with."""
+    return sweep_folder / ".hydra" / "sweep.yaml"
+
+
+def read_sweep(sweep_folder: Path) -> SweepRecord | None:
+    """Return what a sweep was started with, None where the folder holds no sweep.
+
+    Raises:
+        InputError: the file is no record of a sweep.
+    """
+    record = sweep_record(sweep_folder)
+    if not record.is_file():
+        return None
+    content = read_plain_yaml(record)
+    arguments = content.get("arguments") if isinstance(content, dict) else None
+    if not isinstance(arguments, list) or not all(isinstance(argument, str) for argument in arguments):
+        raise InputError(f"{record} is no record of a sweep. {CURE}")
+    job = content.get("slurm_job")
+    return SweepRecord(arguments, job if isinstance(job, str) else None)

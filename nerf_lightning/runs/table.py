@@ -1,0 +1,138 @@
+"""Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
+
+import statistics
+from collections.abc import Sequence
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
+from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.runs.results import RunResult
+from nerf_lightning.runs.summary import differing_keys
+from nerf_lightning.runs.table_files import Row
+
+ORDERS = (
+    *("psnr", "ssim", "lpips", "depth_error", "normal_error"),
+    *("minutes", "parameters", "megabytes", "frames_per_second", "model"),
+)
+"""What rows may be sorted by."""
+SPREAD = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "depth_error": "depth error",
+    "normal_error": "normal error",
+}
+PLAIN = {"minutes": "minutes", "frames_per_second": "frames/s", "parameters": "parameters", "megabytes": "MB"}
+HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
+# What tells whose numbers they are, and may move them a little: named below a table where it differs.
+NOTED = ("version", "commit", "device", "precision")
+
+MOST_SETTINGS = 32
+"""Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
+
+Group = list[RunResult]
+
+
+def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
+    """Return what is to be said of how the results were measured, a line for each difference.
+
+    Raises:
+        InputError: not all in the same way, and not `force`.
+    """
+    first_of: dict[str, RunResult] = {}
+    pairs: dict[str, str] = {}
+    # A result without LPIPS agrees with all backbones: what is compared with is one that has a backbone.
+    results = sorted(results, key=lambda result: result.protocol.get("lpips") is None)
+    for result in results:
+        first = first_of.setdefault(result.scene, result)
+        for other, same_scene in ((first, True), (results[0], False)):
+            apart = differences(other.protocol, result.protocol, same_scene)
+            if apart and not force:
+                raise InputError(
+                    f"{other.folder} and {result.folder} were not measured alike ({'; '.join(apart)}), so their "
+                    "numbers do not belong into one table. Leave one out (scenes=..., models=..., or fewer runs), "
+                    "measure both alike with nerf eval and add measured=eval, or add force=true."
+                )
+            for difference in apart:
+                pairs.setdefault(difference, f"{other.folder} and {result.folder}")
+    return [f"Not all of these were measured alike: {pair}: {difference}." for difference, pair in pairs.items()]
+
+
+def noted_origins(results: Sequence[RunResult]) -> list[str]:
+    """Return what else differs between the results: program, device, precision."""
+    lines = []
+    for key in NOTED:
+        found = sorted({str(result.origin.get(key, "not said")) for result in results})
+        if len(found) > 1:
+            lines.append(f"{key}: {', '.join(found)}")
+    return lines
+
+
+def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResult]]:
+    """Return results that differ by their seed alone together, and older ones of a seed that is there, left out."""
+    groups: dict[tuple[object, ...], dict[int | None, RunResult]] = {}
+    left_out = []
+    for result in sorted(results, key=lambda result: (result.summary.started or "", str(result.folder)), reverse=True):
+        key = (
+            *(result.scene, result.model, str(result.origin.get("config")), result.summary.steps),
+            *sorted(result.settings.items()),
+        )
+        seeds = groups.setdefault(key, {})
+        if result.seed in seeds:
+            left_out.append(result)
+        else:
+            seeds[result.seed] = result
+    return [list(seeds.values()) for seeds in groups.values()], left_out
+
+
+def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
+    """Return a row per group, by scene and then the best first; settings that all share are left out."""
+    shown = _differing(groups)[:MOST_SETTINGS]
+    return [_row(group, shown) for group in sorted(groups, key=lambda group: _rank(group, order))]
+
+
+def noted_settings(groups: Sequence[Group]) -> list[str]:
+    """Return what is to be said of settings that differ and have no column."""
+    hidden = _differing(groups)[MOST_SETTINGS:]
+    return [f"{len(hidden)} more settings differ and have no column: {listed(hidden, cap=5)}."] if hidden else []
+
+
+def _differing(groups: Sequence[Group]) -> list[str]:
+    return differing_keys([group[0].settings for group in groups])
+
+
+def without_empty(rows: list[Row]) -> list[Row]:
+    """Return the rows without the columns that no row has, all with the same columns in the same order."""
+    columns = dict.fromkeys(column for row in rows for column in row)
+    kept = [column for column in columns if any(row.get(column) not in (None, "") for row in rows)]
+    return [{column: row.get(column) for column in kept} for row in rows]
+
+
+def _row(group: Group, shown: list[str]) -> Row:
+    first = group[0]
+    row: Row = {"scene": first.scene, "model": first.model}
+    row |= {key: first.settings.get(key, "") for key in shown}
+    seeds = sorted(result.seed for result in group if result.seed is not None)
+    row["seeds"] = " ".join(map(str, seeds))
+    for metric, column in SPREAD.items():
+        mean, deviation = _spread(group, metric)
+        row |= {column: mean, f"{column} std": deviation}
+    row["steps"] = first.summary.steps
+    row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
+    return row | {"time": None, "source": None}
+
+
+def _spread(group: Group, key: str) -> tuple[float | None, float | None]:
+    """Return mean and standard deviation (of the population that the seeds are drawn from)."""
+    values = [value for result in group if (value := result.values.get(key)) is not None]
+    if len(values) < len(group):
+        return None, None
+    return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
+
+
+def _rank(group: Group, order: str) -> tuple[str, bool, float, str]:
+    first = group[0]
+    value = None if order == "model" else _spread(group, order)[0]
+    sign = -1.0 if order in HIGH_FIRST else 1.0
+    return first.scene, value is None and order != "model", sign * (value or 0.0), first.model

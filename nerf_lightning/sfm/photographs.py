@@ -1,0 +1,168 @@
+"""Photographs as they come from a camera: found, checked, and put upright beside the poses that will be found."""
+
+import os
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import ExifTags, Image, ImageOps
+
+from nerf_lightning.budgets import require_within
+from nerf_lightning.data.pixels.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, open_picture, read_rgba
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed, require_printable
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+FEWEST = 3
+SMALLEST_SIDE = 64
+JPEG_QUALITY = 95
+LENS_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
+LONGEST_TAG = 200
+
+
+@dataclass(frozen=True)
+class FoundPhotograph:
+    """A picture file and what its header says; sizes in pixels, upright."""
+
+    path: Path
+    width: int
+    height: int
+    upright: bool
+    """Whether the pixels are stored as they are shown, not turned by an EXIF tag."""
+    lens: tuple[str, ...]
+    """What EXIF says of camera, focal length and zoom; empty words where it says nothing."""
+
+    @property
+    def camera(self) -> tuple[int, int, tuple[str, ...]]:
+        """Return what photographs of one camera and zoom share."""
+        return self.width, self.height, self.lens
+
+
+def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPhotograph]:
+    """Return the photographs that lie in a folder, sorted by name; folders inside it are not searched.
+
+    Args:
+        folder: where they lie; it may be a link itself.
+        allow_outside: follow links that lead out of it.
+
+    Raises:
+        InputError: no such folder, fewer than three pictures in it, more than a person has agreed to, or one
+            that cannot be read or is tiny.
+    """
+    try:
+        files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
+    except OSError as error:
+        raise InputError(
+            f"images={folder} is not a folder that can be read ({error.strerror or error}). "
+            "Give the folder in which the photographs lie."
+        ) from error
+    pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
+    if len(pictures) < FEWEST:
+        raise InputError(_too_few(folder, pictures, files))
+    require_within("views", len(pictures), f"images={folder}", "photographs")
+    outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
+    if outside and not allow_outside:
+        raise InputError(
+            f"images={folder}: {listed((path.name for path in outside), 4)} are symbolic links out of this folder. If "
+            "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
+        )
+    return [_photograph(path) for path in pictures]
+
+
+def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
+    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    target = folder / photograph.path.name
+    if not photograph.upright:
+        _write_turned(photograph.path, target)
+        return
+    try:
+        os.link(photograph.path.resolve(), target)
+    except OSError:
+        shutil.copyfile(photograph.path, target)
+
+
+def check_pixels(photograph: FoundPhotograph) -> None:
+    """Decode a photograph once, so that a damaged one is named before hours are spent on the others.
+
+    Raises:
+        InputError: it is truncated, or of a mode that cannot be read as 8-bit colour.
+    """
+    if photograph.upright:
+        read_rgba(photograph.path)
+
+
+def check_one_camera(photographs: list[FoundPhotograph]) -> None:
+    """Refuse to describe photographs of different sizes by one camera.
+
+    Raises:
+        InputError: the sizes differ.
+    """
+    sizes = Counter((p.width, p.height) for p in photographs).most_common()
+    if len(sizes) > 1:
+        shown = listed((f"{count} of {width} x {height}" for (width, height), count in sizes), cap=4)
+        raise InputError(
+            f"camera_mode=single, but the photographs have several sizes ({shown} pixels). Give camera_mode=auto (one "
+            "camera per size and zoom) or per_image, or leave out the odd ones."
+        )
+
+
+def _photograph(path: Path) -> FoundPhotograph:
+    require_printable(path.name, f"A photograph in {path.parent}")
+    width, height = image_size(path)
+    if min(width, height) < SMALLEST_SIDE:
+        raise InputError(
+            f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
+            f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
+        )
+    turned, lens = _exif(path)
+    # Orientations 5 to 8 are quarter turns.
+    return FoundPhotograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
+
+
+def _exif(path: Path) -> tuple[object, tuple[str, ...]]:
+    """Return how a photograph is turned, and what tells its lens apart from others."""
+    with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
+        try:
+            # Pillow would decode a whole PNG to look for EXIF behind its pixels.
+            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
+            # Of a TIFF, this reads the file.
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+        except DECODER_ERRORS:
+            exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
+    lens = (exif.get(ExifTags.Base.Model, ""), *(details.get(tag, "") for tag in LENS_TAGS))
+    return exif.get(ORIENTATION, 1), tuple(str(value)[:LONGEST_TAG] for value in lens)
+
+
+def _write_turned(path: Path, target: Path) -> None:
+    try:
+        with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
+            upright = ImageOps.exif_transpose(image)
+            profile = image.info.get("icc_profile")
+            # PNG and TIFF take no notice of the quality.
+            upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
+    except DECODER_ERRORS as error:
+        raise InputError(
+            f"{path} cannot be turned upright: {error}. It may be damaged or cut short; copy it from the camera again."
+        ) from error
+
+
+def _too_few(folder: Path, pictures: list[Path], files: list[Path]) -> str:
+    if pictures:
+        return (
+            f"images={folder} holds only {listed(path.name for path in pictures)}. At least {FEWEST} photographs from "
+            "different places are needed, better 30 to 100 that overlap."
+        )
+    inside = sorted(path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if files:
+        endings = listed(sorted({path.suffix for path in files}), cap=6)
+        others = f"only other files ({endings})"
+        cure = " Convert HEIC or raw photographs to JPEG first; a film is given with video=FILE."
+    else:
+        others, cure = "nothing", ""
+    folders = f" It has folders of its own ({listed(inside, cap=4)}): was one of them meant?" if inside else ""
+    return f"images={folder} holds no PNG, JPEG or TIFF, {others}.{folders}{cure}"

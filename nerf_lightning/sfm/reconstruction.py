@@ -1,0 +1,229 @@
+"""Structure from motion on the CPU with pycolmap: photographs to cameras, poses and points.
+
+The method is COLMAP's (Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT features, pairs
+matched and verified, photographs registered one after the other, bundle adjustment.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.sfm.image_pairs import image_pairs, tiles_of
+from nerf_lightning.sfm.photographs import FoundPhotograph, check_one_camera
+from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings
+
+Report = Callable[[str, float], None]
+
+# A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
+FEWEST_REGISTERED = 3
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """What was found, in short."""
+
+    registered: tuple[str, ...]
+    left_out: tuple[str, ...]
+    num_points: int
+    num_cameras: int
+    reprojection_error: float
+    """Mean over the points of their mean distance from where they were seen, in pixels."""
+
+
+def require_pycolmap() -> Any:
+    """Return pycolmap.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module("pycolmap")
+    except ImportError as error:
+        raise InputError(
+            "Finding camera poses needs pycolmap, which is not installed or does not load here "
+            f"({error}). Install it with: pip install 'nerf-lightning[colmap]'"
+        ) from error
+
+
+def reconstruct(
+    photographs: list[FoundPhotograph],
+    folder: Path,
+    work: Path,
+    sparse: Path,
+    settings: SfmSettings,
+    report: Report = lambda stage, fraction: None,
+) -> SparseModel:
+    """Find the cameras of photographs and write the largest model in COLMAP's binary form.
+
+    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own.
+
+    Args:
+        photographs: in the order in which they were taken.
+        folder: where the pixels lie, upright, under the photographs' names.
+        work: a folder for the database and lists; what is left there can go.
+        sparse: the folder for cameras.bin, images.bin, points3D.bin; made here.
+        settings: how.
+        report: called with a stage of `stage_costs` and how much of it is done, 0 to 1.
+
+    Raises:
+        InputError: no pycolmap, photographs of several sizes for one camera, or nothing can be reconstructed.
+    """
+    colmap = require_pycolmap()
+    names = [photograph.path.name for photograph in photographs]
+    groups = _camera_groups(photographs, settings.camera_mode)
+    database = work / "database.db"
+    with _quiet(colmap):
+        colmap.set_random_seed(settings.seed)
+        _find_features(colmap, database, folder, groups, settings, report)
+        _match(colmap, database, names, work / "pairs.txt", settings, report)
+        model = _largest_model(colmap, database, folder, work / "models", settings, report)
+        if model is None:
+            raise InputError(_nothing_found(len(names)))
+        sparse.mkdir(parents=True)
+        model.write_binary(sparse)
+    return _in_short(model, names)
+
+
+def _in_short(model: Any, names: list[str]) -> SparseModel:
+    registered = {model.image(number).name for number in model.reg_image_ids()}
+    return SparseModel(
+        registered=tuple(name for name in names if name in registered),
+        left_out=tuple(name for name in names if name not in registered),
+        num_points=model.num_points3D(),
+        num_cameras=model.num_cameras(),
+        reprojection_error=model.compute_mean_reprojection_error(),
+    )
+
+
+@contextmanager
+def _quiet(colmap: Any) -> Iterator[None]:
+    """Let COLMAP log nothing but its own end: what goes wrong is found in its results and said in our words."""
+    before = colmap.logging.minloglevel
+    colmap.logging.minloglevel = int(colmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        colmap.logging.minloglevel = before
+
+
+def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
+    """Return the names that share a camera, group by group, and those that have a camera each."""
+    if mode == "per_image":
+        return [], [p.path.name for p in photographs]
+    if mode == "single":
+        check_one_camera(photographs)
+        return [[p.path.name for p in photographs]], []
+    sharing = Counter(p.camera for p in photographs)
+    groups = [[p.path.name for p in photographs if p.camera == camera] for camera, n in sharing.items() if n > 1]
+    return groups, [p.path.name for p in photographs if sharing[p.camera] == 1]
+
+
+def _find_features(
+    colmap: Any,
+    database: Path,
+    folder: Path,
+    groups: tuple[list[list[str]], list[str]],
+    settings: SfmSettings,
+    report: Report,
+) -> None:
+    """Find features a few photographs at a time, so that progress shows and Ctrl-C is heard."""
+    options = colmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, settings.threads
+    options.max_image_size, options.sift.max_num_features = settings.max_image_size, settings.num_features
+    shared, alone = groups
+    total, done = sum(map(len, shared)) + len(alone), 0
+    report(FEATURES, 0.0)
+    for names, mode in [*((group, colmap.CameraMode.SINGLE) for group in shared), (alone, colmap.CameraMode.PER_IMAGE)]:
+        reader = colmap.ImageReaderOptions()
+        reader.camera_model = settings.camera_model
+        for start in range(0, len(names), settings.threads):
+            part = names[start : start + settings.threads]
+            colmap.extract_features(
+                database, folder, part, mode, reader, extraction_options=options, device=colmap.Device.cpu
+            )
+            done += len(part)
+            report(FEATURES, done / total)
+            if start == 0 and mode == colmap.CameraMode.SINGLE:
+                with _opened(colmap, database) as content:
+                    reader.existing_camera_id = content.read_image_with_name(names[0]).camera_id
+    with _opened(colmap, database) as content:
+        read = {image.name for image in content.read_all_images()}
+    if unread := sorted({*chain(*shared), *alone} - read):
+        raise InputError(
+            f"COLMAP cannot read {listed(unread)} in {folder}. Save these as 8-bit JPEG or PNG, or leave them out."
+        )
+
+
+def _match(
+    colmap: Any, database: Path, names: list[str], pair_list: Path, settings: SfmSettings, report: Report
+) -> None:
+    """Match and verify pairs of photographs."""
+    options = colmap.FeatureMatchingOptions()
+    options.use_gpu, options.num_threads = False, settings.threads
+    pairing = colmap.ImportedPairingOptions()
+    pairing.match_list_path = str(pair_list)
+    pairs = image_pairs(settings.matching, len(names))
+    # The list is cut at spaces, and names may have some.
+    plain = {name: f"{number:06d}" for number, name in enumerate(names)}
+    _rename(colmap, database, plain)
+    done = 0
+    report(MATCHING, 0.0)
+    for tile in tiles_of(pairs):
+        pair_list.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in tile))
+        colmap.match_image_pairs(database, options, pairing, device=colmap.Device.cpu)
+        done += len(tile)
+        report(MATCHING, done / len(pairs))
+    _rename(colmap, database, {number: name for name, number in plain.items()})
+
+
+def _rename(colmap: Any, database: Path, new_names: dict[str, str]) -> None:
+    with _opened(colmap, database) as content:
+        for image in content.read_all_images():
+            image.name = new_names[image.name]
+            content.update_image(image)
+
+
+@contextmanager
+def _opened(colmap: Any, database: Path) -> Iterator[Any]:
+    content = colmap.Database.open(database)
+    try:
+        yield content
+    finally:
+        content.close()
+
+
+def _largest_model(
+    colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
+) -> Any | None:
+    options = colmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = settings.threads, settings.seed
+    options.min_model_size = FEWEST_REGISTERED
+    with _opened(colmap, database) as content:
+        total = content.num_images()
+    placed = chain([0.0], (count / total for count in range(2, 10**9)))
+    models.mkdir()
+
+    def advance() -> None:
+        # A second model starts again with its first pair; the bar stays full while it is tried.
+        report(MAPPING, next(placed))
+
+    advance()
+    found = colmap.incremental_mapping(
+        database, folder, models, options, initial_image_pair_callback=advance, next_image_callback=advance
+    )
+    return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _nothing_found(count: int) -> str:
+    return (
+        f"No camera could be placed: the {count} pictures share too few details. Take more photographs that "
+        "overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one zoom and "
+        "without mirrors or bare walls filling the picture; then try again. More features may help: num_features=8192."
+    )

@@ -1,0 +1,82 @@
+"""When checkpoints are written: `last.ckpt` every so often and at the end, `best.ckpt` at the best validation.
+
+The `last.ckpt` before stays as `previous.ckpt`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning.checkpoints.reading import BEST, LAST
+from nerf_lightning.errors import require_positive
+from nerf_lightning.files.schema import Maybe, Number, Record
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+
+
+class Checkpoints(Callback):
+    """Keep the last, the one before, and the best.
+
+    While gradients or weights are not finite nothing is saved, so that the last is one to go back to (`NanGuard`).
+
+    Args:
+        every_steps: steps between two writes of `last.ckpt`.
+        monitor: the logged value whose maximum is the best.
+    """
+
+    STATE = Record({"best": Maybe(Number())})
+    needs_state = True
+
+    def __init__(self, every_steps: int = 500, monitor: str = "val/psnr"):
+        require_positive(every_steps=every_steps)
+        self.every_steps, self.monitor = every_steps, monitor
+        self.best: float | None = None
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Write `last.ckpt` when it is time.
+
+        Raises:
+            InputError: an earlier one could not be written.
+        """
+        writer(trainer).raise_failure()
+        if trainer.global_step % self.every_steps == 0 and pl_module.is_sound():
+            trainer.save_checkpoint(self.folder(trainer) / LAST)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
+        """Write `best.ckpt` when the validation was the best so far."""
+        value = trainer.callback_metrics.get(self.monitor)
+        if trainer.sanity_checking or value is None:
+            return
+        if (self.best is None or float(value) > self.best) and pl_module.is_sound():
+            self.best = float(value)
+            trainer.save_checkpoint(self.folder(trainer) / BEST)
+
+    def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
+        """Write `last.ckpt` at the end, and wait until all is on the disk.
+
+        Raises:
+            InputError: the weights are not finite, or a checkpoint could not be written.
+        """
+        trainer.save_checkpoint(self.folder(trainer) / LAST)
+        writer(trainer).wait()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Remember the best across a resume."""
+        return {"best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the best up again."""
+        self.best = state_dict["best"]
+
+    @staticmethod
+    def folder(trainer: Trainer) -> Path:
+        """Return where the run's checkpoints lie."""
+        return Path(trainer.default_root_dir) / "checkpoints"
+
+
+def writer(trainer: Trainer) -> AtomicCheckpointIO:
+    """Return who writes the checkpoints."""
+    plugin = trainer.strategy.checkpoint_io
+    assert isinstance(plugin, AtomicCheckpointIO), "TrainerSettings.build gives the trainer this plugin"
+    return plugin

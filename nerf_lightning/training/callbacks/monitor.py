@@ -1,0 +1,69 @@
+"""Scalars for TensorBoard: losses, PSNR and gradients of each level, learning rate, speed, memory."""
+
+import time
+from typing import Any
+
+import psutil
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor
+
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.callbacks.watcher import Watcher
+
+GIGABYTE = 1e9
+
+
+class Monitor(Watcher):
+    """Log every few steps, straight to the loggers: `LightningModule.log` would cost more than a small step.
+
+    Args:
+        every_steps: steps between two rows.
+    """
+
+    def __init__(self, every_steps: int = 50):
+        super().__init__(every_steps)
+        self.since = 0.0
+        self.rays_seen = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        """Start the clock."""
+        self.since = time.perf_counter()
+        self.rays_seen = pl_module.progress.rays_seen
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Batch, batch_idx: int) -> None:
+        """Ask for the gradients' norms of a step that gets a row."""
+        # XLA would compile the steps that get a row and those that do not as two programs.
+        always = pl_module.device.type == "xla"
+        pl_module.measures_gradients = always or self.is_time(trainer.global_step + 1, trainer.max_steps)
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Log a row."""
+        now, step = time.perf_counter(), trainer.global_step
+        rays, seconds = system.progress.rays_seen - self.rays_seen, now - self.since
+        self.since, self.rays_seen = now, system.progress.rays_seen
+        names = system.model.level_names
+        pictures = names if system.loss.every_level_is_a_picture else names[-1:]
+        values = level_scalars(names, system.last_step["losses"], pictures) | system.model.statistics()
+        values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
+        if rays > 0 and seconds > 0:
+            values["speed/rays_per_second"] = rays / seconds
+        values["speed/rays_per_step"] = batch.rays.near.numel()
+        values["train/skipped_steps"] = system.guard.skipped
+        values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
+        if system.device.type == "cuda":
+            values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE
+        values |= {f"gradients/norm_{name}": float(norm) for name, norm in system.gradient_norms.items()}
+        for logger in trainer.loggers:
+            logger.log_metrics(values, step)
+
+
+def level_scalars(names: tuple[str, ...], losses: Tensor, pictures: tuple[str, ...]) -> dict[str, float]:
+    """Return the loss of each level, the PSNR of those whose loss is of a picture, and the sum that is minimised."""
+    losses = losses.cpu()  # the device is read once
+    values = {"train/loss": float(losses.sum())}
+    for name, loss in zip(names, losses, strict=True):
+        values[f"train/loss_{name}"] = float(loss)
+        if name in pictures:
+            values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
+    return values

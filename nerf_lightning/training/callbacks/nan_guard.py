@@ -1,0 +1,118 @@
+"""The NaN guard: a run whose numbers are not finite any more is stopped, or goes back and on at a lower rate."""
+
+import logging
+from pathlib import Path
+from typing import Any, Literal
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning import ranks
+from nerf_lightning.checkpoints.reading import last_good_checkpoint
+from nerf_lightning.errors import InputError, require_positive
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints, writer
+from nerf_lightning.training.callbacks.watcher import tensorboard_writers
+
+log = logging.getLogger(__name__)
+
+
+class NanGuard(Callback):
+    """End or mend a run that learns nothing any more because its numbers are not finite.
+
+    A step whose gradients are not finite is left out (`StepGuard`); `patience` of them in a row, or weights that are
+    not finite, are the sign. A rollback takes weights, optimizer and place from the last good checkpoint, or begins
+    anew where there is none, and goes on with other random numbers at a lower learning rate: a new attempt. Steps
+    already taken are not given back. Rate and attempt are part of the checkpoints that follow.
+
+    Args:
+        on_nan: what is done.
+        patience: so many bad steps in a row are too many.
+        factor: what a rollback multiplies the learning rate by.
+        max_rollbacks: how often it rolls back before it stops.
+        every_steps: steps between two looks at the weights, and at the count of bad steps where reading it would
+            stop the device (elsewhere it is read at each step).
+    """
+
+    def __init__(
+        self,
+        on_nan: Literal["stop", "rollback"] = "stop",
+        patience: int = 10,
+        factor: float = 0.5,
+        max_rollbacks: int = 3,
+        every_steps: int = 100,
+    ):
+        require_positive(patience=patience, every_steps=every_steps)
+        if not 0 < factor < 1:
+            raise InputError(f"callbacks.nan_guard.factor={factor}: give a factor on the rate between 0 and 1.")
+        self.on_nan, self.patience, self.every_steps = on_nan, patience, every_steps
+        self.factor, self.max_rollbacks = factor, max_rollbacks
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Look whether the run still learns.
+
+        Raises:
+            InputError: it does not, and is not to be rolled back, or was too often.
+        """
+        guard, step = pl_module.guard, pl_module.progress.step
+        looks = step % self.every_steps == 0
+        if (looks or pl_module.device.type == "cpu") and guard.in_row >= self.patience:
+            cause = (
+                f"The loss or its gradients are not finite numbers since step {step - guard.in_row + 1} "
+                f"({guard.in_row} steps in a row, all left out; first in the gradient of {guard.first_module})"
+            )
+        elif looks and (broken := pl_module.broken_weights()):
+            cause = f"The weights of step {step} are not finite numbers (first those of {broken})"
+        else:
+            return
+        self._act(trainer, pl_module, cause)
+
+    def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
+        good = ranks.from_first(lambda: _last_good(trainer))
+        if self.on_nan == "stop" or system.progress.rollbacks >= self.max_rollbacks:
+            raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
+        self._roll_back(trainer, system, good)
+        place = f"checkpoint {good}" if good is not None else "beginning, with new weights, as no checkpoint was saved"
+        rate = system.optimizers().param_groups[0]["base_lr"]
+        message = (
+            f"{cause}. Rolled back to the {place}: attempt {system.progress.attempt + 1}, rollback "
+            f"{system.progress.rollbacks} of at most {self.max_rollbacks}, base learning rate {rate:.3g}."
+        )
+        log.warning(message)
+        for logger in trainer.loggers:
+            logger.log_metrics({"train/attempt": system.progress.attempt}, trainer.global_step)
+        for board in tensorboard_writers(trainer.loggers):
+            board.add_text("nan_guard", message, trainer.global_step)
+
+    def _roll_back(self, trainer: Trainer, system: Any, good: Path | None) -> None:
+        attempt, rollbacks, skipped = system.progress.attempt, system.progress.rollbacks, system.guard.skipped
+        lowered = rollbacks
+        if good is None:
+            system.restart()
+        else:
+            content = trainer.strategy.load_checkpoint(good, weights_only=True)
+            system.on_load_checkpoint(content)
+            trainer.strategy.load_model_state_dict(content)
+            trainer.strategy.load_optimizer_state_dict(content)
+            lowered = content["nerf_lightning"]["progress"]["rollbacks"]
+        system.progress.attempt, system.progress.rollbacks = attempt + 1, rollbacks + 1
+        system.guard.restore([skipped, 0], system.device)
+        for group in system.optimizers().param_groups:
+            # The rate in the checkpoint may be that of before an earlier rollback.
+            group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (rollbacks + 1 - lowered)
+
+    def _advice(self, trainer: Trainer, good: Path | None) -> str:
+        settings = (
+            "a smaller optimizer.lr, gradient clipping (trainer.clip_norm=1) or trainer.precision=32-true, and check "
+            "the capture's poses, near and far"
+        )
+        if good is None:
+            return f"No checkpoint was saved yet: begin anew with {settings}."
+        resume = f"resume={trainer.default_root_dir} callbacks.nan_guard.on_nan=rollback"
+        lower = f"Go on from it at a lower rate with {resume}, or begin" if self.on_nan == "stop" else "Begin"
+        weights = f"a new run from its weights (init_from={good})"
+        return f"The last good checkpoint is {good}. {lower} {weights} with {settings}."
+
+
+def _last_good(trainer: Trainer) -> Path | None:
+    writer(trainer).wait()
+    return last_good_checkpoint(Checkpoints.folder(trainer))

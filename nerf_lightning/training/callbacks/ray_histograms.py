@@ -1,0 +1,87 @@
+"""Histograms for TensorBoard: where along the rays each level sees something, and on how many samples that rests."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from nerf_lightning.errors import require_positive
+from nerf_lightning.nerf.models.tiles import weighted_renderings
+from nerf_lightning.nerf.randomness import fold
+from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along
+from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS, Watcher, tensorboard_writers
+
+PARTS = 50
+
+
+class RayHistograms(Watcher):
+    """Render some of the step's rays again, as training does, and tell for each level what lies along them.
+
+    A coarse level that has learnt nothing spreads its weight evenly. Weight that piles up at 0 or at 1 lies at the near
+    or the far bound, which then cut the scene.
+
+    Args:
+        every_steps: steps between two looks.
+        num_rays: how many rays.
+    """
+
+    def __init__(self, every_steps: int = 250, num_rays: int = 256):
+        super().__init__(every_steps)
+        require_positive(num_rays=num_rays)
+        self.num_rays = num_rays
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Write two histograms and a curve for each level."""
+        writers = tensorboard_writers(trainer.loggers)
+        if not writers:
+            return
+        step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
+        seen = look_along(system, batch.rays[: self.num_rays], step, endless)
+        for name, (along, samples) in seen.items():
+            lit = samples[samples > 0]  # many rays meet nothing at all
+            for writer in writers:
+                write_shares(writer, f"along_rays/weight_{name}", along, step)
+                if lit.numel():
+                    writer.add_histogram(f"per_ray/effective_samples_{name}", lit, step)
+                    writer.add_scalar(f"rays/effective_samples_{name}", lit.mean(), step)
+
+
+@torch.no_grad()
+def look_along(
+    system: Any, rays: RayBundle, step: int, endless: bool
+) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
+    """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
+    names, num_rays = system.model.level_names, rays.near.numel()
+    key = fold(system.seed, step, "histograms")
+    tile_points = system.tile_points or WHOLE_BATCH_POINTS
+    seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in names}
+    system.eval()
+    for part, renderings in weighted_renderings(system.model, rays, system.background, key, tile_points):
+        for name, rendering in zip(names, renderings, strict=True):
+            along = weight_along(rendering, part, PARTS, endless) * part.near.numel() / num_rays
+            seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))
+    system.train()
+    return {
+        name: (torch.stack([along for along, _ in parts]).sum(0), torch.cat([samples for _, samples in parts]))
+        for name, parts in seen.items()
+    }
+
+
+def write_shares(writer: SummaryWriter, tag: str, shares: Float[Tensor, "parts"], step: int) -> None:
+    """Write a histogram over [0, 1] whose bars are given."""
+    shares = shares.double()
+    places = (torch.arange(len(shares), dtype=torch.double) + 0.5) / len(shares)
+    writer.add_histogram_raw(
+        tag,
+        min=0.0,
+        max=1.0,
+        num=float(shares.sum()),
+        sum=float((shares * places).sum()),
+        sum_squares=float((shares * places.square()).sum()),
+        bucket_limits=((torch.arange(len(shares)) + 1) / len(shares)).tolist(),
+        bucket_counts=shares.tolist(),
+        global_step=step,
+    )

@@ -1,0 +1,63 @@
+"""Ctrl-C, SIGTERM and the signals of schedulers: finish the step, save, stop; the run can go on to the last bit."""
+
+import os
+import signal
+from types import FrameType
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+from nerf_lightning import ranks
+from nerf_lightning.training.launch.preemption import stop_signals
+
+
+class StopSignals(Callback):
+    """Set a flag in the handler, and stop at a step's end.
+
+    The checkpoint itself is written when the training ends (`Checkpoints`). A handler that saved by itself would save
+    half a step. A second Ctrl-C stops at once.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self.former: dict[int, Any] = {}
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Remember the handlers from before Lightning's, which would keep a finished trainer alive and deaf."""
+        self.former = {number: signal.getsignal(number) for number in stop_signals()}
+
+    def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen."""
+        self._listen()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Listen; Lightning puts a handler of its own in place shortly before, and what it heard is ours."""
+        self._listen()
+        if trainer.received_sigterm:
+            trainer._signal_connector.received_sigterm = False
+            self.received = signal.SIGTERM
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stop where the step is whole, all processes at the same one."""
+        received = int(ranks.largest(float(self.received or 0)))
+        if received:
+            self.received = received
+            trainer.should_stop = True
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Give the handlers back."""
+        for number, handler in self.former.items():
+            signal.signal(number, handler)
+        self.former.clear()
+
+    def _listen(self) -> None:
+        for number in stop_signals():
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None and number == signal.SIGINT:
+            os._exit(128 + number)  # an exception would be caught on the way, and the process linger
+        self.received = number

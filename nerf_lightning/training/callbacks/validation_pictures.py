@@ -1,0 +1,42 @@
+"""A validation picture every so often: truth, render, depth, error; and the frames of a progress video."""
+
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view, tensorboard_writers
+from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
+
+
+class ValidationPictures(Watcher):
+    """Render one view of the validation split.
+
+    Args:
+        every_steps: steps between two pictures; the first comes at step `every_steps`.
+        view: which view of the split.
+    """
+
+    def __init__(self, every_steps: int = 1000, view: int = 0):
+        super().__init__(every_steps)
+        self.view = view
+
+    def is_time(self, step: int, last_step: int) -> bool:
+        """Tell whether to render after a step; always after the last one."""
+        return super().is_time(step, last_step) or step == last_step
+
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Render the view, and save its pictures."""
+        if not trainer.is_global_zero:
+            return
+        step = trainer.global_step
+        view, picture = render_validation_view(trainer, system, self.view)
+        scene = trainer.datamodule.scene
+        truth = photograph(scene, view, scene.background)
+        panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
+        folder = Path(trainer.default_root_dir) / "images"
+        save_png(folder / "validation" / f"step_{step:07d}.png", panel)
+        save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))
+        for writer in tensorboard_writers(trainer.loggers):
+            writer.add_image("validation/picture", panel.numpy(), step, dataformats="HWC")

@@ -1,0 +1,93 @@
+"""What looks at a run every few steps, the view that it renders, and its direct way to TensorBoard."""
+
+import threading
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from torch.utils.tensorboard import SummaryWriter
+
+from nerf_lightning.errors import require_positive
+from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.types.rays import Batch
+
+
+class Watcher(Callback):
+    """Look when it is time; `nerf bench` measures what that costs.
+
+    Nothing that training reads may be changed.
+
+    Args:
+        every_steps: steps between two looks.
+    """
+
+    def __init__(self, every_steps: int):
+        require_positive(every_steps=every_steps)
+        self.every_steps = every_steps
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """Look when it is time."""
+        if self.is_time(trainer.global_step, trainer.max_steps):
+            self.watch(trainer, pl_module, batch)
+
+    def is_time(self, step: int, last_step: int) -> bool:
+        """Tell whether to look after a step."""
+        return step % self.every_steps == 0
+
+    @abstractmethod
+    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+        """Look at the run; every process of it is asked, the loggers are the first one's."""
+
+
+WRITES = "tensorboard.summary.writer.event_file_writer"
+"""Where the class of the thread that writes is defined."""
+
+
+def tensorboard_writers(loggers: Sequence[Logger]) -> list[SummaryWriter]:
+    """Return the writers of the TensorBoard loggers among `loggers`."""
+    return [logger.experiment for logger in loggers if isinstance(logger, TensorBoardLogger)]
+
+
+@contextmanager
+def errors_told_once() -> Iterator[None]:
+    """Let TensorBoard's threads print nothing when they cannot write, as where the disk is full.
+
+    They keep the error, and whoever writes next, or flushes, raises it.
+    """
+    former = threading.excepthook
+
+    def quiet(failure: threading.ExceptHookArgs) -> None:
+        if not (isinstance(failure.exc_value, OSError) and _writes(failure.thread)):
+            former(failure)
+
+    threading.excepthook = quiet
+    try:
+        yield
+    finally:
+        for thread in filter(_writes, threading.enumerate()):
+            if getattr(thread, "exception", None) is not None:
+                thread.join()  # it is about to say so
+        threading.excepthook = former
+
+
+def _writes(thread: threading.Thread | None) -> bool:
+    return type(thread).__module__ == WRITES
+
+
+WHOLE_BATCH_POINTS = 65_536
+
+
+def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:
+    """Return the number-th validation view (counted round) and its picture, in the precision of training."""
+    scene = trainer.datamodule.scene
+    views = scene.splits["val"]
+    view = views[number % len(views)]
+    tile_points = system.tile_points or WHOLE_BATCH_POINTS
+    system.eval()
+    picture = render_picture(system.model, scene.cameras, view, scene.near, scene.far, scene.background, tile_points)
+    system.train()
+    return view, picture

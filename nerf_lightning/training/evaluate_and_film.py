@@ -1,0 +1,130 @@
+"""The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the person."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Trainer
+from omegaconf import DictConfig
+
+from nerf_lightning import ranks
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.console import say
+from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.evaluation.evaluator import Scoring
+from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.video.encoding import require_ffmpeg, write_video
+from nerf_lightning.video.film import film, require_room
+from nerf_lightning.video.paths.base import CameraPath
+from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.shots import Subject, lay_path
+
+PROGRESS_FPS = 4
+
+
+@dataclass
+class Finish:
+    """What happens after training; built before it, so that bad input shows at once."""
+
+    scoring: Scoring | None
+    path: CameraPath | None
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> "Finish":
+        """Build what the config asks for.
+
+        Raises:
+            InputError: a setting is wrong, or a video is wanted and there is no ffmpeg.
+        """
+        scoring, path = build(config.evaluation), build(config.path)
+        if config.final.video:
+            require_ffmpeg()
+        return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
+
+    def require_film(self, scene: Scene) -> None:
+        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory.
+
+        Raises:
+            InputError: why not.
+        """
+        if self.path is not None:
+            record = scene_record(scene)
+            require_room(lay_path(self.path, record), FilmSettings(), [record])
+
+    def __call__(
+        self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
+    ) -> float | None:
+        """Evaluate, film, print a summary, and return the test PSNR (else the validation's)."""
+        settings.prepare(model).eval()
+        lines, psnr = [], trainer.callback_metrics.get("val/psnr")
+        tile_points = settings.inference_tile_points
+        with torch.no_grad():
+            if self.scoring is not None:
+                origin = _origin(trainer, model, settings)
+                metrics = self.scoring.score(model, scene, scene.background, tile_points, folder, origin)
+                psnr = metrics["psnr"]
+                _log_metrics(trainer, metrics)
+                lines += metric_lines(metrics, folder)
+            if self.path is not None:
+                subject = Subject(model, scene_record(scene), scene.background)
+                shown = FilmSettings(precision=settings.precision)
+                video, depth = film([subject], self.path, tile_points, folder, shown)
+                lines += [f"video        {video}", f"depth        {depth}"]
+                lines += _film_progress(folder) if ranks.is_first() else []
+        lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
+        lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
+        say(*lines)
+        return None if psnr is None else float(psnr)
+
+
+def _origin(trainer: Trainer, model: RadianceModel, settings: TrainerSettings) -> dict[str, Any]:
+    system: Any = trainer.lightning_module
+    record = system.record
+    return measured_of(model, record["config"], record["choices"], settings.device, settings.precision)
+
+
+def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
+    """Return the lines that a person reads at the end."""
+    protocol = metrics["protocol"]
+    ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
+    lines = [
+        f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
+        f"({metrics['num_images']} views, {protocol['background']} background)",
+        f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
+        f"({metrics['worst']['psnr']['name']})",
+    ]
+    if metrics["depth_error"] is not None:
+        normal = metrics["normal_error"]
+        angle = "" if normal is None else f"   normal error {normal:.1f} degrees"
+        lines.append(f"depth error  {metrics['depth_error']:.4f} scene units{angle}")
+    if metrics["lpips"] is None:
+        lines.append(f"LPIPS        not computed: {metrics['lpips_hint']}")
+    else:
+        lines.append(f"LPIPS        {metrics['lpips']:.4f}")
+    lines.append(
+        f"speed        {metrics['frames_per_second']:.3g} frames per second, "
+        f"at most {metrics['peak_memory_gigabytes']:.2f} GB of memory"
+    )
+    return [*lines, f"metrics      {folder / 'metrics.json'}"]
+
+
+def _log_metrics(trainer: Trainer, metrics: dict[str, Any]) -> None:
+    values = {name: metrics[name.partition("/")[2]] for name in FINAL_METRICS}
+    for logger in trainer.loggers:
+        logger.log_metrics({name: v for name, v in values.items() if v is not None}, trainer.global_step)
+
+
+def _film_progress(folder: Path) -> list[str]:
+    """Join the pictures that were taken of one view during training; return the line that says where."""
+    files = sorted((folder / "images" / "progress").glob("step_*.png"))
+    if len(files) < 2:
+        return []
+    frames = [torch.from_numpy(read_rgba(file)[..., :3].copy()) for file in files]
+    write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
+    return [f"progress     {folder / 'progress.mp4'}"]

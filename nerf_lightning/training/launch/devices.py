@@ -1,0 +1,174 @@
+"""Which device computes, and in which numbers, with the reason; and the process prepared for it."""
+
+import ctypes
+import logging
+import os
+import sys
+import warnings
+from typing import Any, Literal, cast, get_args
+
+import torch
+from torch import distributed
+
+from nerf_lightning.cores import num_cores
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
+from nerf_lightning.training.launch import xla
+
+log = logging.getLogger(__name__)
+
+Accelerator = Literal["auto", "cpu", "gpu", "mps", "tpu"]
+DeviceType = Literal["cpu", "cuda", "mps", "xla"]
+Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
+LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps", "xla": "tpu"}
+LEAST_GPU_MEMORY = 1_000_000_000
+"""Bytes of a GPU that must be free: tiles shrink to what there is, but libraries and tables need some room."""
+
+
+def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
+    """Return the type of device and why it is that one; auto takes a CUDA GPU where there is one, else the CPU.
+
+    Raises:
+        InputError: torch does not see the device that was asked for.
+    """
+    if accelerator == "cpu":
+        return "cpu", "as asked"
+    if accelerator == "mps":
+        if not torch.backends.mps.is_available():
+            raise InputError(
+                "trainer=mps: torch sees no Apple GPU here. It needs a Mac with Apple silicon and macOS 14 or later; "
+                "use trainer=cpu or trainer=auto."
+            )
+        log.warning("trainer=mps has never been tried: compare its first losses with those of trainer=cpu.")
+        return "mps", "as asked, untested"
+    if accelerator == "tpu":
+        return "xla", f"{xla.require_device()}, as asked"
+    if torch.cuda.is_available():
+        return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
+    if accelerator == "gpu":
+        raise InputError(
+            "trainer=gpu: torch sees no CUDA device here. Use trainer=cpu or trainer=auto, or install a CUDA build "
+            "of torch and check nvidia-smi."
+        )
+    return "cpu", "no GPU found"
+
+
+def working_device(chosen: tuple[DeviceType, str], accelerator: Accelerator) -> tuple[DeviceType, str]:
+    """Try a chosen GPU, and return it with the reason for it; where it was not asked for, the CPU can take its place.
+
+    Raises:
+        InputError: the GPU cannot be used, and was asked for, or others of the run have theirs.
+    """
+    trouble = _trouble_of_gpu() if chosen[0] == "cuda" else None
+    if trouble is None:
+        return chosen
+    if accelerator == "gpu" or distributed.is_initialized():
+        raise InputError(
+            f"torch sees a GPU here, and it cannot be used: {trouble}. nvidia-smi shows who uses it and which driver "
+            "there is. Choose another one with CUDA_VISIBLE_DEVICES, or use trainer=cpu."
+        )
+    log.warning(
+        "torch sees a GPU here, and it cannot be used: %s. The CPU computes instead; trainer=gpu insists on the GPU.",
+        trouble,
+    )
+    return "cpu", "the GPU cannot be used"
+
+
+def _trouble_of_gpu() -> str | None:
+    try:
+        free, total = torch.cuda.mem_get_info()
+        if free < LEAST_GPU_MEMORY:
+            return f"{free / 1e9:.1f} GB of its {total / 1e9:.1f} GB of memory are free, and 1 GB is the least"
+        square = torch.ones(8, 8, device="cuda")
+        right = bool((square @ square == 8.0).all())
+    except RuntimeError as error:  # no memory, no kernels for this GPU, a driver that does not fit
+        return " ".join(str(error).split())[:200]
+    return None if right else "it computes 8 times 1 wrongly"
+
+
+def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal["32-true", "tf32", "bf16-mixed"], str]:
+    """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
+
+    NERF_LIGHTNING_PRECISION in the environment says what auto means: machines of one kind can be tried as another.
+
+    Raises:
+        InputError: tf32 is asked of a device that has none, or the environment names no precision.
+    """
+    meant = os.environ.get("NERF_LIGHTNING_PRECISION", "auto")
+    if asked == "auto" and meant != "auto":
+        if meant not in get_args(Precision):
+            raise InputError(
+                f"NERF_LIGHTNING_PRECISION={meant} in the environment is no precision: give one of "
+                f"{', '.join(get_args(Precision))}, or unset it."
+            )
+        return choose_precision(cast(Precision, meant), device_type)[0], "as NERF_LIGHTNING_PRECISION says"
+    if asked == "auto":
+        native = has_native_bfloat16(device_type)
+        return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"
+    if asked == "tf32" and not has_tf32(device_type):
+        raise InputError(
+            "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
+            "device here is none. Use trainer.precision=32-true, or auto."
+        )
+    if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
+        log.warning("trainer.precision=%s: this device has no native bfloat16 and emulates it, slowly.", asked)
+    return asked, "as asked"
+
+
+def has_native_bfloat16(device_type: str) -> bool:
+    """Tell whether the device multiplies bfloat16 matrices in hardware."""
+    if device_type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return cpu_multiplies_bfloat16() if device_type == "cpu" else device_type == "xla"
+
+
+def has_tf32(device_type: str) -> bool:
+    """Tell whether the device multiplies matrices in TensorFloat-32."""
+    return device_type == "cuda" and torch.cuda.get_device_capability() >= (8, 0)
+
+
+ALL_THREADS = min(torch.get_num_threads(), num_cores())
+M_MMAP_THRESHOLD = -3
+M_TRIM_THRESHOLD = -1
+
+
+def prepare_machine(num_threads: int | None) -> None:
+    """Set threads and the allocator, once per process; None: one thread per core."""
+    torch.set_num_threads(num_threads or ALL_THREADS)
+    _keep_float32()
+    _keep_large_blocks()
+    _quiet_libraries()
+
+
+def _keep_float32() -> None:
+    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (products.py). cuDNN would
+    # lower convolutions, SSIM's among them, unless it is told not to.
+    torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = False
+
+
+def _keep_large_blocks() -> None:
+    # glibc gives blocks of 32 MB and more back to the system at each free; fetching them anew costs more than the
+    # arithmetic done in them (measured: 1.5 times the whole step).
+    if sys.platform != "linux":
+        return
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(M_MMAP_THRESHOLD, 1 << 30)
+    mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def _quiet_libraries() -> None:
+    # Advice about data loader workers and the like, which does not apply: our loader is not a DataLoader.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    ignored: list[dict[str, Any]] = [
+        {"message": ".*does not have many workers.*"},
+        {"message": ".*LeafSpec.*", "category": FutureWarning},
+        {"message": ".*isinstance.treespec, LeafSpec.*"},
+        {"message": ".*ckpt_path.*mid-epoch.*"},
+        {"message": ".*checkpoint that ended before the epoch ended.*"},
+    ]
+    for rule in ignored:
+        warnings.filterwarnings("ignore", **rule)

@@ -1,0 +1,73 @@
+"""Being asked by a scheduler to leave: stop where nothing is lost, and see that the job is started again.
+
+While training, `callbacks/stop_signals.py` finishes the step and saves; before and after it there is nothing to save,
+and the process leaves at once. Either way it ends with SystemExit(128 + signal), and here is done what follows from it:
+
+* SIGUSR1 in a Slurm job (sbatch --signal=USR1@90): the job is put back into the queue.
+* The signal of submitit (SIGUSR2 if not configured): submitit's own handler is called, which counts and requeues.
+* SIGTERM: nothing. Slurm itself requeues what it preempts, and what a person cancels shall stay cancelled.
+"""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, NoReturn
+
+from torch import distributed
+
+from nerf_lightning.slurm import requeue
+
+
+@contextmanager
+def preemptible() -> Iterator[None]:
+    """Leave at a scheduler's signal, and requeue if it wants that."""
+    if distributed.is_initialized():  # a worker: the process that started it hears the scheduler
+        yield
+        return
+    listened = [number for number in stop_signals() if number != signal.SIGINT]
+    former = {number: signal.signal(number, _leave) for number in listened}
+    try:
+        yield
+    except SystemExit as stop:
+        if wants_restart(stop.code):
+            _restart(int(stop.code or 0) - 128, former)
+        raise
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def wants_restart(code: Any) -> bool:
+    """Tell whether an exit code is that of a signal whose sender will start the run again."""
+    sent = {submitit_signal()} | ({signal.SIGUSR1} if hasattr(signal, "SIGUSR1") else set())
+    return isinstance(code, int) and code - 128 in sent
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    raise SystemExit(128 + number)
+
+
+def _restart(number: int, former: dict[int, Any]) -> None:
+    handler = former.get(number)
+    if number == submitit_signal() and callable(handler):
+        handler(number, None)
+    elif "SUBMITIT_EXECUTOR" not in os.environ:
+        requeue()
+
+
+def stop_signals() -> list[int]:
+    """Return the signals that ask a run to save and stop."""
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)]
+    numbers = [int(getattr(signal, name)) for name in names]
+    own = submitit_signal()
+    return numbers if own is None or own in numbers else [*numbers, own]
+
+
+def submitit_signal() -> int | None:
+    """Return the signal by which submitit tells its job that the time is up, or None outside of submitit."""
+    if "SUBMITIT_EXECUTOR" not in os.environ:
+        return None
+    found = getattr(signal, "SIG" + os.environ.get("SUBMITIT_PREEMPT_SIGNAL", "USR2"), None)
+    return None if found is None else int(found)

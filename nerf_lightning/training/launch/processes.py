@@ -1,0 +1,189 @@
+"""The processes of one run: started here (one per device), or by torchrun or srun, and joined.
+
+Lightning would start the others by repeating the command line, which starts sweeps anew. Here torch's own launcher
+starts `python -m nerf_lightning.cli.worker` on the config that this process has composed.
+"""
+
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from torch import distributed
+
+from nerf_lightning import ranks
+from nerf_lightning.config.instantiate import require_fitting_values
+from nerf_lightning.errors import InputError
+from nerf_lightning.training.launch.devices import choose_device
+from nerf_lightning.training.launch.strategy import Launcher, cluster_environment
+from nerf_lightning.training.launch.trainer import MOST_PROCESSES
+
+# What of Hydra's own config a worker may ask for.
+HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_logging"]
+LONGEST_WAIT = timedelta(hours=2)
+# So long another process may take to say what is wrong, before this one says it too.
+PATIENCE_SECONDS = 3.0
+
+
+def on_all_processes(command: str, config: DictConfig, work: Callable[[DictConfig], Any]) -> Any:
+    """Do a command's work in as many processes as the config's trainer wants, and return the first one's result.
+
+    Raises:
+        InputError: the processes that the config speaks of were not started, or others were.
+        SystemExit: a process ended with this code.
+    """
+    if distributed.is_initialized():  # a worker: its processes are joined
+        return work(config)
+    require_fitting_values(config.trainer, "trainer")
+    launcher: Launcher = config.trainer.launched_by
+    _require_launcher(launcher)
+    if launcher == "nerf":
+        count = num_processes(config.trainer.devices, choose_device(config.trainer.accelerator)[0])
+        return work(config) if count == 1 else launch(command, config, count)
+    with joined(choose_device(config.trainer.accelerator)[0]):
+        return work(config)
+
+
+def num_processes(devices: int | str, device_type: str) -> int:
+    """Return how many processes to start: one per device, and one for all cores of a TPU.
+
+    Raises:
+        InputError: there are fewer devices, or their number is left open on the CPU.
+    """
+    if device_type == "xla":
+        return 1  # which drives all cores
+    there = torch.cuda.device_count() if device_type == "cuda" else 1
+    if devices == "auto" and device_type == "cpu":
+        raise InputError(
+            "trainer.devices=auto takes every GPU, and there is none here. Say how many processes shall share the CPU "
+            "(trainer.devices=2), or use trainer=cpu, whose one process has all its cores."
+        )
+    count = there if devices == "auto" else int(devices)
+    if not 1 <= count <= MOST_PROCESSES:
+        raise InputError(f"trainer.devices={devices}: give a number from 1 to {MOST_PROCESSES}, or auto for every GPU.")
+    if device_type != "cpu" and count > there:
+        raise InputError(f"trainer.devices={devices}: there are {there} devices here. Give at most so many, or auto.")
+    return count
+
+
+@contextmanager
+def joined(device_type: str) -> Iterator[None]:
+    """Join the processes that torchrun or srun has started; only the first one speaks."""
+    environment = cluster_environment()
+    os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"] = environment.main_address, str(environment.main_port)
+    if device_type == "cuda":
+        torch.cuda.set_device(environment.local_rank())
+    distributed.init_process_group(
+        "cpu:gloo,cuda:nccl" if device_type == "cuda" else "gloo",
+        rank=environment.global_rank(),
+        world_size=environment.world_size(),
+        timeout=LONGEST_WAIT,
+    )
+    if not ranks.is_first():
+        logging.getLogger().setLevel(logging.ERROR)
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    try:
+        yield
+    except InputError:
+        if not ranks.is_first():
+            # The first one says the same, and ends the others; who is alone with it speaks.
+            time.sleep(PATIENCE_SECONDS)
+        raise
+    finally:
+        distributed.destroy_process_group()
+
+
+def launch(command: str, config: DictConfig, count: int) -> Any:
+    """Start `count` workers on this machine and wait for them; return what the first one returned.
+
+    Raises:
+        SystemExit: a worker failed or was stopped by a signal; what is wrong it has said.
+    """
+    from torch.distributed.elastic.multiprocessing import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    for name in ("torch.distributed.elastic", "torch.distributed.launcher"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # it repeats what the workers have said
+    with tempfile.TemporaryDirectory(prefix="nerf-") as folder, _share_of_cores(count):
+        OmegaConf.save(config, Path(folder) / "config.yaml")
+        hydra: Any = HydraConfig.get()
+        OmegaConf.save(OmegaConf.masked_copy(hydra, HYDRA_PARTS), Path(folder) / "hydra.yaml")
+        settings = LaunchConfig(
+            min_nodes=1,
+            max_nodes=1,
+            nproc_per_node=count,
+            run_id=uuid.uuid4().hex,
+            rdzv_backend="c10d",
+            rdzv_endpoint="127.0.0.1:0",
+            local_addr="127.0.0.1",
+            max_restarts=0,
+            monitor_interval=0.1,
+            signals_to_handle="SIGTERM,SIGINT,SIGHUP,SIGUSR1" if os.name == "posix" else "SIGTERM,SIGINT",
+        )
+        try:
+            elastic_launch(settings, sys.executable)("-m", "nerf_lightning.cli.worker", command, folder)
+        except ChildFailedError as error:
+            raise SystemExit(_exit_code([failure.exitcode for failure in error.failures.values()])) from None
+        except SignalException as stopped:
+            raise SystemExit(128 + stopped.sigval) from None
+        return json.loads((Path(folder) / "result.json").read_text())
+
+
+def _exit_code(codes: list[int]) -> int:
+    # Negative: killed by a signal, mostly by the launcher after another one had failed.
+    own = [code for code in codes if code > 0]
+    return own[0] if own else 128 + signal.SIGTERM
+
+
+@contextmanager
+def _share_of_cores(count: int) -> Iterator[None]:
+    share = str(max(1, torch.get_num_threads() // count))
+    former = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
+    os.environ.update(dict.fromkeys(former, share))
+    try:
+        yield
+    finally:
+        for name, value in former.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _require_launcher(launcher: Launcher) -> None:
+    by_torchrun = distributed.is_torchelastic_launched()
+    by_srun = int(os.environ.get("SLURM_NTASKS", "1")) > 1 and "SLURM_STEP_ID" in os.environ
+    if launcher == "torchrun" and not by_torchrun:
+        raise InputError(
+            "trainer=torchrun: this process was not started by torchrun. Start it with torchrun --standalone "
+            "--nproc-per-node 2 -m nerf_lightning train trainer=torchrun ..., or use trainer=ddp, which starts the "
+            "processes by itself."
+        )
+    if launcher != "nerf" and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise InputError(
+            f"A sweep (-m) under trainer={launcher}: each of the processes would run the sweep by itself, and wait for "
+            "the others for ever. Start nerf train -m once, with trainer=ddp for jobs of several devices, or with "
+            "hydra/launcher=submitit_slurm for jobs of a cluster."
+        )
+    if launcher == "slurm" and "SLURM_PROCID" not in os.environ:
+        raise InputError(
+            "trainer=slurm: this process was not started by Slurm's srun. Put srun before nerf in the batch script, "
+            "or use trainer=ddp, which starts the processes of one machine by itself."
+        )
+    if launcher == "nerf" and (by_torchrun or by_srun):
+        name = "torchrun" if by_torchrun else "slurm"
+        raise InputError(
+            f"This process is one of several that {'torchrun' if by_torchrun else 'srun'} started, and with this "
+            f"trainer each of them would train alone. Add trainer={name}, so that they train together."
+        )

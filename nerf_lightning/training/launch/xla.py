@@ -1,0 +1,121 @@
+"""XLA devices (TPUs) under Lightning: one process, whatever the number of cores, and the parts that differ there.
+
+The cores run one program: rays are spread over them, weights are copied to each, and the compiler adds up the
+gradients (SPMD, single program, multiple data). So nothing else has to know how many there are.
+"""
+
+import importlib.util
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch.accelerators import XLAAccelerator
+from lightning.pytorch.plugins import XLACheckpointIO, XLAPrecision
+from lightning.pytorch.strategies import SingleDeviceXLAStrategy
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+
+ACCELERATOR: type[XLAAccelerator] = XLAAccelerator
+"""Lightning's, which counts TPU chips; tests put one here that takes XLA's CPU device."""
+
+
+def require_device() -> str:
+    """Return what kind of device XLA drives here.
+
+    Raises:
+        InputError: torch_xla is not installed, or finds no TPU.
+    """
+    if importlib.util.find_spec("torch_xla") is None:
+        raise InputError(
+            "trainer=tpu needs torch_xla, which is not installed here. It runs on a TPU's host (Linux, x86-64), and "
+            "its newest release, 2.9, goes with torch 2.9 alone: `make xla` installs both into an environment of their "
+            "own, where .venv-xla/bin/nerf is the command. Elsewhere use trainer=auto."
+        )
+    if not ACCELERATOR.is_available():
+        raise InputError("trainer=tpu: torch_xla finds no TPU on this machine. Use trainer=auto, or a TPU's host.")
+    import torch_xla
+    from torch_xla import runtime
+
+    return f"{runtime.device_type()}, torch_xla {torch_xla.__version__}"
+
+
+def refuse(compiles: bool, launched_by: str) -> None:
+    """Refuse settings that mean nothing to XLA.
+
+    Raises:
+        InputError: there are some.
+    """
+    if compiles:
+        raise InputError("trainer.compile=true is for other devices: XLA compiles every step by itself. Leave it out.")
+    if launched_by != "nerf":
+        raise InputError(
+            f"trainer.launched_by={launched_by} with a TPU: one process drives all cores of a host. Start nerf itself."
+        )
+
+
+def require_static_shapes(model: RadianceModel) -> None:
+    """Refuse models that XLA would compile anew at each step.
+
+    Raises:
+        InputError: shapes of this one depend on the data.
+    """
+    if not model.has_static_shapes:
+        raise InputError(
+            "This model leaves empty space out, so the shapes of each step depend on the data, and XLA would compile "
+            "every step anew. Use model=fast_dense, which masks empty space instead, model=fast_proposal or model=nerf."
+        )
+
+
+def use_cores(wanted: int | Literal["auto"]) -> int:
+    """Prepare this process for so many cores, and return their number; before anything is put on them.
+
+    Raises:
+        InputError: the machine has another number.
+    """
+    from torch_xla import backends, runtime
+
+    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (products.py).
+    backends.set_mat_mul_precision("highest")
+    if wanted == 1:
+        runtime.global_runtime_device_count()  # autograd must see the device before its first backward
+        return 1
+    runtime.use_spmd()
+    found = runtime.global_runtime_device_count()
+    if wanted not in ("auto", found):
+        raise InputError(
+            f"trainer.devices={wanted}: XLA finds {found} cores on this machine. Give trainer.devices=auto for all of "
+            "them, or 1."
+        )
+    return found
+
+
+def trainer_arguments(cores: int) -> dict[str, Any]:
+    """Return what Lightning's Trainer has to know."""
+    return {"accelerator": ACCELERATOR(), "devices": 1, "strategy": ManyCores(cores)}
+
+
+class ManyCores(SingleDeviceXLAStrategy):
+    """Spread the rays of each batch over the cores."""
+
+    def __init__(self, cores: int):
+        super().__init__(0, checkpoint_io=AtomicXLACheckpointIO(), precision_plugin=XLAPrecision("32-true"))
+        self.cores = cores
+
+    def batch_to_device(self, batch: Any, device: torch.device | None = None, dataloader_idx: int = 0) -> Any:
+        """Put a batch onto the cores, each a share of the rays."""
+        batch = super().batch_to_device(batch, device, dataloader_idx)
+        return batch if self.cores == 1 else batch.map(self._spread)
+
+    def _spread(self, tensor: Tensor) -> Tensor:
+        import numpy as np
+        from torch_xla.distributed import spmd
+
+        mesh = spmd.Mesh(np.arange(self.cores), (self.cores,), ("rays",))
+        spmd.mark_sharding(tensor, mesh, ("rays", *(None,) * (tensor.ndim - 1)))
+        return tensor
+
+
+class AtomicXLACheckpointIO(AtomicCheckpointIO, XLACheckpointIO):
+    """Write as elsewhere; Lightning asks for the other kind by name."""

@@ -1,0 +1,138 @@
+"""The memory plan: what a run will hold and where, said before it starts."""
+
+import logging
+from dataclasses import dataclass
+
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
+from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
+from nerf_lightning.machine import free_memory
+from nerf_lightning.nerf.encoders.base import matrices_of
+from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.memory_trial import Trial, try_out
+from nerf_lightning.training.system import RadianceFieldSystem
+
+# What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.
+GAPS = 0.25
+# A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
+# rows as a rule (products.py: few_sizes), and kept: 0.7 MB each.
+COMPILED_PER_MATRIX = 3 * 2 * 700_000
+# Smaller shortages are within what a plan can know.
+NOTICEABLE = 1.05
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of thing that takes memory."""
+
+    what: str
+    num_bytes: int
+    where: str
+    counts: bool = True
+    """Whether the run must find room for it; a mapped file's pages come and go."""
+    cure: str | None = None
+    """The setting that makes it smaller."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """All rows, and the room that there is."""
+
+    rows: list[Row]
+    instead: list[Row]
+    """Of these only the largest is there at a time."""
+    free: int
+
+    @property
+    def total(self) -> int:
+        """Bytes at the most."""
+        return sum(row.num_bytes for row in self.rows if row.counts) + max(row.num_bytes for row in self.instead)
+
+    def __str__(self) -> str:
+        def line(what: str, size: int, where: str) -> str:
+            return f"  {what:<38} {size / GIGABYTE:8.3f} GB  {where}"
+
+        lines = [line(row.what, row.num_bytes, row.where) for row in [*self.rows, *self.instead]]
+        return "\n".join(
+            ["memory plan:", *lines, line("at most", self.total, f"{self.free / GIGABYTE:.1f} GB are free")]
+        )
+
+    @property
+    def warning(self) -> str | None:
+        """What to lower where the room is short; None where it is not."""
+        if self.total <= NOTICEABLE * self.free:
+            return None
+        largest = max(
+            (row for row in [*self.rows, *self.instead] if row.counts and row.cure), key=lambda row: row.num_bytes
+        )
+        needed, free, most = (f"{size / GIGABYTE:.1f} GB" for size in (self.total, self.free, largest.num_bytes))
+        return (
+            f"The run needs about {needed} of memory, and {free} are free: it may be stopped by the system. "
+            f"Most of it is {largest.what} ({most}): {largest.cure}."
+        )
+
+
+def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> MemoryPlan:
+    """Plan by short trials: what a step and a picture hold is counted and scaled up."""
+    device, tile = settings.device, settings.tile_points
+    free = free_memory(device)
+    trial = try_out(settings, system, data.batches, tile)
+    pixels = data.scene.pixels
+    moves = data.fits(device)
+    where = "GPU" if device.type == "cuda" else "memory"
+    if moves:
+        row = Row("pixels", num_bytes(pixels), where, cure="lower data.device_budget, or raise scene.downscale")
+    else:
+        # What lies in memory already is not asked for again.
+        there = f"mapped file {pixels.path}" if isinstance(pixels, MappedPixelStore) else "memory, there already"
+        row = Row("pixels", num_bytes(pixels), there, counts=False)
+    weights = sum(tensor.nbytes for tensor in [*system.model.parameters(), *system.model.buffers()])
+    steps = [_step(trial, tile, where), _picture(trial, data, where)]
+    gaps = 0 if device.type == "cuda" else int(GAPS * max(row.num_bytes for row in steps))
+    tables = "lower encoder.log2_table_size or field.width, or choose a smaller model"
+    return MemoryPlan(
+        [
+            row,
+            Row("weights, tables, grids", weights, f"{where}, there already", False),
+            Row("gradients", trial.gradients, where, cure=tables),
+            Row("optimizer's state", trial.optimizer, where, cure=tables),
+            Row("gaps in the heap, about", gaps, where),
+            *([Row("compiled products, about", _compiled(system), where)] if _compiles_products(settings) else []),
+        ],
+        steps,
+        free,
+    )
+
+
+def _compiles_products(settings: TrainerSettings) -> bool:
+    return settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
+
+
+def _compiled(system: RadianceFieldSystem) -> int:
+    return COMPILED_PER_MATRIX * len(matrices_of(system.model))
+
+
+def announce_memory(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> None:
+    """Log the plan; warn where the room is short."""
+    plan = memory_plan(settings, system, data)
+    for line in str(plan).splitlines():
+        log.info("%s", line)
+    if plan.warning is not None:
+        log.warning(plan.warning)
+
+
+def _step(trial: Trial, tile: int | None, where: str) -> Row:
+    if tile is None:
+        return Row("a step on a whole batch", trial.batch + trial.activations, where, cure="lower data.batch_rays")
+    cure = "lower trainer.tile_points" if trial.activations > trial.batch else "lower data.batch_rays"
+    return Row(f"a step in tiles of {tile:,} points", trial.batch + trial.activations, where, cure=cure)
+
+
+def _picture(trial: Trial, data: RayDataModule, where: str) -> Row:
+    pixels = data.scene.pixels
+    view = int((pixels.width * pixels.height).argmax())
+    what = f"or a picture of {int(pixels.width[view])} x {int(pixels.height[view])}"
+    return Row(what, trial.picture, where, cure="raise scene.downscale")

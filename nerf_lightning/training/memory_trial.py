@@ -1,0 +1,233 @@
+"""How much memory a step and a picture take: a few small ones are tried and counted, and scaled up.
+
+What a step holds is linear in the rays of the batch and in those of a tile, and what a picture holds is linear in its
+pixels and in the rays of a tile, so a few trials say all.
+"""
+
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.nerf.geometry.cameras import resized
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.tiles import tile_rays_for
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+
+# So many that rays of different lengths make a mean, and so few that it takes a second at most.
+TRIAL_POINTS, FEWEST_RAYS = 2048, 4
+TRIAL_SIDE = 256
+EXAMPLE = 1024
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Bytes of a run on its device."""
+
+    gradients: int
+    optimizer: int
+    """What the optimizer remembers."""
+    batch: int
+    """What grows with the rays of a step."""
+    activations: int
+    """What grows with the rays of a tile, and temporary copies of gradients."""
+    picture: int
+    """Rendering and measuring the largest picture."""
+
+
+def try_out(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> Trial:
+    """Return what the run will hold, by trials that leave nothing behind.
+
+    Args:
+        settings: the device and the precision.
+        system: ready to train.
+        batches: the loader.
+        tile: points of a tile; None trains batches whole.
+    """
+    system.to(settings.device)
+    trainable = [parameter for parameter in system.model.parameters() if parameter.requires_grad]
+    gradients = sum(parameter.nbytes for parameter in trainable)
+    with _untouched(system):
+        batch, activations = _step(settings, system, batches, tile, gradients)
+        picture = _picture(settings, system, batches, tile)
+    return Trial(gradients, _optimizer_bytes(system, trainable), batch, activations, picture)
+
+
+@contextmanager
+def _untouched(system: RadianceFieldSystem) -> Iterator[None]:
+    """Put everything back that trial steps change; no trial changes weights."""
+    buffers, former = list(system.model.buffers()), [buffer.clone() for buffer in system.model.buffers()]
+    tile = system.tile_points
+    try:
+        yield
+    finally:
+        system.tile_points = tile
+        system.forget_measurements()
+        for buffer, value in zip(buffers, former, strict=True):
+            buffer.copy_(value)
+
+
+def _step(
+    settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None, gradients: int
+) -> tuple[int, int]:
+    """Return what grows with the batch, and what grows with the tile."""
+    model, optimizer = system.model, system.configure_optimizers()
+    batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
+    num_rays = batch.rays.near.numel()
+
+    def held(tile_rays: int, parts: int) -> int:
+        points = model.points_per_ray(training=True)
+        system.tile_points = None if model.needs_whole_batch else int((tile_rays + 0.5) * points)
+        some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
+
+        def work() -> None:
+            optimizer.zero_grad()
+            system.accumulate_gradients(some, lambda loss: loss.backward())
+
+        model.zero_grad(set_to_none=True)
+        return peak_bytes(work, settings.device)
+
+    held(_few_rays(model, training=True), 1)  # compiles kernels
+    system.learn_points_per_ray()
+    few = _few_rays(model, training=True)
+    two, four, larger = held(few, 2), held(few, 4), held(2 * few, 2)
+    per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
+    copies = max(0.0, two - few * (2 * per_batch_ray + per_tile_ray) - gradients)
+    tile_rays = num_rays if tile is None else min(num_rays, tile / model.points_per_ray(training=True))
+    loaded = sum(tensor.nbytes for tensor in _tensors(batch)) * (2 if batches.prefetch_for is not None else 1)
+    return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
+
+
+def _few_rays(model: RadianceModel, training: bool) -> int:
+    return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
+
+
+def _tensors(batch: Batch) -> list[Tensor]:
+    rays = (getattr(batch.rays, field.name) for field in fields(batch.rays))
+    return [batch.rgba, batch.weight, *rays]
+
+
+def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> int:
+    """Return what the largest picture of the scene holds while it is rendered and measured."""
+    model, scene = system.model, batches.scene
+    few = _few_rays(model, training=False)
+    rays = batches.at(0, batches.crop_rays(0)).rays.to(settings.device)
+
+    def rendered(count: int) -> int:
+        some = rays[torch.arange(count, device=settings.device) % rays.near.numel()]
+        with torch.no_grad():
+            behind = background_colors(system.background, count, settings.device, None)
+            return peak_bytes(lambda: model(some, behind, None), settings.device)
+
+    per_ray = (rendered(2 * few) - rendered(few)) / few
+    num_pixels = int((scene.pixels.width * scene.pixels.height).max())
+    tile_rays = min(num_pixels, tile_rays_for(model, settings.inference_tile_points if tile is None else tile))
+    # A small picture, cut into as many tiles by a stand-in that holds as much for each ray.
+    share = TRIAL_SIDE**2 / num_pixels
+    side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
+    camera = resized(scene.cameras[:1], side, side)
+    stand_in = _StandIn(int(per_ray)).to(settings.device)
+
+    def work() -> None:
+        tile_points = max(1, int(tile_rays * share))
+        picture = render_picture(stand_in, camera, 0, scene.near[:1], scene.far[:1], scene.background, tile_points)
+        image_metrics(picture.rgb, picture.rgb)
+
+    return int(peak_bytes(work, settings.device) / share)
+
+
+class _StandIn(RadianceModel):
+    """A model that computes nothing, and takes as much memory for each ray as another does."""
+
+    def __init__(self, bytes_per_ray: int):
+        super().__init__({})
+        self.bytes_per_ray = bytes_per_ray
+        self.parameter = nn.Parameter(torch.zeros(()))
+
+    def points_per_ray(self, training: bool) -> float:
+        return 1.0
+
+    def forward(self, rays: RayBundle, background: Tensor | None, random: RayRandom | None) -> list[Rendering]:
+        torch.empty(rays.near.numel() * self.bytes_per_ray, dtype=torch.uint8, device=rays.near.device)
+        rgb = torch.zeros_like(rays.directions)
+        return [Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))]
+
+
+def _optimizer_bytes(system: RadianceFieldSystem, trainable: list[nn.Parameter]) -> int:
+    """Return what the optimizer will remember: as much per weight as it does of a small example."""
+    example = nn.Parameter(torch.zeros(EXAMPLE, device=trainable[0].device))
+    optimizer = system.build_optimizer([{"params": [example]}])
+    example.grad = torch.zeros_like(example)
+    optimizer.step()
+    kept = sum(value.numel() for value in optimizer.state[example].values() if isinstance(value, Tensor))
+    return kept // EXAMPLE * sum(parameter.nbytes for parameter in trainable)
+
+
+class PeakBytes(TorchDispatchMode):
+    """Watch what is allocated under it and freed again; what was there before does not count.
+
+    Args:
+        device_type: where; what lies elsewhere does not count.
+    """
+
+    def __init__(self, device_type: str):
+        super().__init__()
+        self.device_type = device_type
+        self.held, self.most = 0, 0
+        self.watched: set[int] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run the operation, and look at what went in and what came out."""
+        kwargs = kwargs or {}
+        for tensor in _tensors_in((args, kwargs)):
+            self._watch(tensor, is_new=False)
+        out = func(*args, **kwargs)
+        for tensor in _tensors_in(out):
+            self._watch(tensor, is_new=True)
+        return out
+
+    def _watch(self, tensor: Tensor, is_new: bool) -> None:
+        storage = tensor.untyped_storage()
+        key = storage._cdata
+        if key in self.watched or storage.device.type != self.device_type:
+            return
+        size = storage.nbytes() if is_new else 0
+        self.watched.add(key)
+        self.held += size
+        self.most = max(self.most, self.held)
+        weakref.finalize(storage, self._forget, key, size)
+
+    def _forget(self, key: int, size: int) -> None:
+        self.watched.discard(key)
+        self.held -= size
+
+
+def peak_bytes(work: Callable[[], Any], device: torch.device) -> int:
+    """Do the work and return the most bytes that it held on the device at once, beyond what was there before."""
+    with PeakBytes(device.type) as counter:
+        work()
+    return counter.most
+
+
+def _tensors_in(tree: Any) -> Iterator[Tensor]:
+    # What operations take and return is nested no deeper than lists; torch's own flattening takes as long as they do.
+    if isinstance(tree, Tensor):
+        yield tree
+    elif isinstance(tree, (tuple, list)):
+        for part in tree:
+            yield from _tensors_in(part)
+    elif isinstance(tree, dict):
+        yield from _tensors_in(list(tree.values()))

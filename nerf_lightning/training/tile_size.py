@@ -1,0 +1,71 @@
+"""Choose the tile by a short measurement: how many points at a time suit this machine's caches and this model."""
+
+import logging
+from collections.abc import Callable, Sequence
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.machine import seconds_of
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+
+CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
+GPU_TILES = (1 << 18, 1 << 20, 1 << 22)
+# A tile must be better by so much to be preferred to a smaller one, which takes less memory.
+GAIN = 0.95
+# Smaller tiles than one that takes so much longer than the fastest are not tried: they only add to what made it slow.
+HOPELESS = 1.2
+LONGEST_SECONDS = 0.4
+FEW_RAYS = 16
+
+log = logging.getLogger(__name__)
+
+
+def measured_tile(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches) -> int:
+    """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
+    system.to(settings.device)
+    batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
+    num_rays = _rays_in_time(settings, system, batch)
+    points = num_rays * system.model.points_per_ray(training=True)
+    tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES
+    enough = next((number for number, tile in enumerate(tiles) if tile >= points), len(tiles))
+    # Larger ones than the first that takes all points at once would be the same.
+    best = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, system, batch, num_rays, tile))
+    system.forget_measurements()
+    log.info("tiles of %d points are the fastest of those tried here", best)
+    return best
+
+
+def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> int:
+    """Return the tile that takes the shortest time of two tries, or a smaller one that takes hardly longer.
+
+    Large tiles are tried first: small ones take the longest to measure, and are the best only where large ones do not
+    fit into the caches.
+
+    >>> fastest((4, 8, 16), {4: 9.0, 8: 3.0, 16: 2.9}.__getitem__)
+    8
+    """
+    taken: dict[int, float] = {}
+    for tile in reversed(tiles):
+        taken[tile] = min(seconds(tile) for _ in range(2))
+        if taken[tile] > HOPELESS * min(taken.values()):
+            break
+    best, best_seconds = 0, float("inf")
+    for tile in reversed(taken):
+        if taken[tile] < GAIN * best_seconds:
+            best, best_seconds = tile, taken[tile]
+    return best
+
+
+def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch) -> int:
+    _seconds(settings, system, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
+    system.learn_points_per_ray()
+    few = min(batch.rays.near.numel(), 4 * FEW_RAYS)
+    per_ray = _seconds(settings, system, batch, few, CPU_TILES[0]) / few
+    return max(FEW_RAYS, min(batch.rays.near.numel(), int(LONGEST_SECONDS / per_ray)))
+
+
+def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
+    system.tile_points = tile
+    some = batch[:num_rays]
+    return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))

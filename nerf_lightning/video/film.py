@@ -1,0 +1,151 @@
+"""Film models along a camera path: colour, depth and more, as videos or as frames, where there is memory for one."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from rich.progress import track
+from torch import Tensor
+
+from nerf_lightning import ranks
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.console import stderr_console
+from nerf_lightning.errors import InputError
+from nerf_lightning.machine import require_memory
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.ranks import processes_here
+from nerf_lightning.video.encoding import require_ffmpeg
+from nerf_lightning.video.frames import FilmFrames, Range
+from nerf_lightning.video.panels import FILMS, film_pictures, panel
+from nerf_lightning.video.paths.base import CameraPath
+from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
+
+
+def film(
+    subjects: list[Subject], path: CameraPath, tile_points: int, folder: Path, settings: FilmSettings | None = None
+) -> list[Path]:
+    """Write the films (`video.mp4`, `depth.mp4`; or folders of frames of these names) and return where they are.
+
+    A film that was stopped goes on with its missing frames. Depth is in the user's units along the ray, coloured over
+    the range of what is seen on the whole path, with its scale beside it.
+
+    Args:
+        subjects: models of one capture; where there are several, they are shown side by side.
+        path: where the cameras are.
+        tile_points: most points that go through a field at once.
+        folder: where to.
+        settings: what is filmed; None: colour and depth as videos.
+
+    Raises:
+        InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
+    """
+    settings = FilmSettings() if settings is None else settings
+    _check(subjects, settings)
+    shots = make_shots(subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera)
+    require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
+    films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
+    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form)
+    try:
+        # The first process alone looks, before any of them writes.
+        missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
+        mine = ranks.every_other(missing)
+        for number in track(mine, description="filming", transient=True, console=stderr_console()):
+            for name, picture in _frame(shots, settings, number, seen).items():
+                frames.save(name, number, picture)
+        ranks.gather(None)  # all frames are there
+        if ranks.is_first():
+            frames.finish(path.fps)
+    finally:
+        frames.close()
+    return frames.results()
+
+
+def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ 3"]]:
+    panels = []
+    for shot in shots:
+        picture = shot.picture(number)
+        normals = shot.normals(number, picture) if "normals" in settings.outputs else None
+        panels.append({name: panel(name, picture, seen, shot.unit, normals) for name in settings.outputs})
+    return film_pictures(panels, [shot.subject.label for shot in shots], settings.mosaic)
+
+
+def _check(subjects: list[Subject], settings: FilmSettings) -> None:
+    if settings.form == "video":
+        require_ffmpeg()
+    for subject in subjects:
+        name = f" ({subject.label})" if len(subjects) > 1 else ""
+        if "levels" in settings.outputs and subject.model.first_picture is None:
+            raise InputError(
+                f"outputs: this model{name} has one level that makes pictures, so there is no difference of levels to "
+                "show. Leave levels out; model=nerf and its smaller versions have two."
+            )
+        if settings.crop is not None and subject.background == "none":
+            raise InputError(
+                f"crop: this model{name} has no background that could be seen around the box. Add background=white or "
+                "background=black."
+            )
+
+
+def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
+    """Return what tells films apart: the weights, the cameras, and all settings that decide what is seen."""
+    digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
+    for shot in shots:
+        digest.update(f"{shot.subject.label} {shot.subject.background}".encode())
+        cameras, seen_from = shot.cameras, shot.seen_from
+        tensors = [cameras.c2w, cameras.focal, cameras.width, cameras.height, shot.near, shot.far]
+        tensors += [] if seen_from is None else [seen_from.c2w]
+        for tensor in (*tensors, *shot.subject.model.state_dict().values()):
+            flat = tensor.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+# Bytes per pixel, measured on the CPU. All rays of a frame are made at once; these are they, and the picture rendered:
+PLAIN = 140
+# where rays are cut, or looked at a second time for normals or for another camera's colour;
+TWICE = 260
+# where they go through normalised device coordinates.
+BENT = 400
+# What is shown of it: a panel, its caption and its place in the frame.
+PANEL = 16
+
+
+def bytes_per_pixel(settings: FilmSettings, scenes: Sequence[SceneRecord]) -> int:
+    """Return what a frame takes for each pixel of a panel; models are rendered one after the other."""
+    bent = any(scene.cameras.ndc is not None for scene in scenes)
+    twice = settings.hold_camera or settings.crop is not None or settings.near is not None
+    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs else PLAIN
+    return picture + PANEL * len(settings.outputs) * len(scenes)
+
+
+def require_room(cameras: Cameras, settings: FilmSettings, scenes: Sequence[SceneRecord]) -> None:
+    """Refuse frames that take more memory than can be had.
+
+    Args:
+        cameras: of the path, all of one size.
+        settings: what is filmed.
+        scenes: those of the models that are filmed side by side.
+
+    Raises:
+        InputError: in all processes; it says which size would fit.
+    """
+    width, height = int(cameras.width[0]), int(cameras.height[0])
+    together = processes_here() if ranks.world_size() > 1 else 1
+    each = together * bytes_per_pixel(settings, scenes)
+
+    def tall(wide: int) -> int:
+        return max(1, round(height * wide / width))
+
+    ranks.from_first(
+        lambda: require_memory(
+            f"A frame of {width} x {height} pixels is rendered as a whole",
+            width,
+            lambda wide: each * wide * tall(wide),
+            lambda wide: f"path.width={wide} path.height={tall(wide)}",
+        )
+    )

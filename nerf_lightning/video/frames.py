@@ -1,0 +1,176 @@
+"""The frames of a film on the disk: each is written as soon as it is rendered, so a stopped film goes on.
+
+`.frames/film.json` in the output folder says which film the frames belong to (a fingerprint of all that decides what is
+seen) and over which depths their colours reach.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import torch
+from filelock import FileLock, Timeout
+from jaxtyping import UInt8
+from rich.progress import track
+from torch import Tensor
+
+from nerf_lightning.console import stderr_console
+from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.video.encoding import write_video
+from nerf_lightning.video.settings import Form
+from nerf_lightning.visualization.pictures import save_png
+
+Range = tuple[float, float]
+LOCK = "lock"
+
+log = logging.getLogger(__name__)
+
+
+class FilmFrames:
+    """Frames of one or more films of equal length.
+
+    Args:
+        folder: where the films go.
+        films: their names.
+        count: how many frames each has.
+        form: `video` keeps frames in a hidden folder until the videos are made of them; `frames` are the result.
+    """
+
+    def __init__(self, folder: Path, films: Sequence[str], count: int, form: Form) -> None:
+        self.folder, self.films, self.count, self.form = folder, films, count, form
+        self.hidden = folder / ".frames"
+        self.root = self.hidden if form == "video" else folder
+        self.lock = FileLock(self.hidden / LOCK)
+
+    def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
+        """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
+
+        Frames of another film are removed, and the range is measured anew.
+
+        Raises:
+            InputError: another process films into this folder, or it cannot be written.
+        """
+        self._hold()
+        note = read_json_object(self.hidden / "film.json")
+        if note.get("fingerprint") != fingerprint or not _is_range(note.get("depth_range")):
+            self._discard()
+            note = {"fingerprint": fingerprint, "depth_range": list(measure())}
+            with self._kept(), whole_file(self.hidden / "film.json") as part:
+                part.write_text(json.dumps(note, indent=2) + "\n")
+        missing = [number for number in range(self.count) if not self._is_there(number)]
+        if len(missing) < self.count:
+            log.info(
+                "%d of %d frames are there already: the missing ones follow", self.count - len(missing), self.count
+            )
+        near, far = note["depth_range"]
+        return missing, (near, far)
+
+    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width 3"]) -> None:
+        """Keep one frame.
+
+        Raises:
+            InputError: the disk is full, or cannot be written.
+        """
+        try:
+            with self._kept():
+                save_png(self._file(film, number), picture)
+        except InputError as error:
+            raise InputError(f"{error} {self._cure()}") from error
+
+    def finish(self, fps: int) -> None:
+        """Make the videos of the frames, remove these, and let others have the folder.
+
+        Raises:
+            InputError: ffmpeg fails, or the disk is full; the frames stay.
+        """
+        if self.form == "video":
+            for film in self.films:
+                try:
+                    with self._kept():
+                        write_video(self.folder / f"{film}.mp4", self._read(film), fps, self.count)
+                except InputError as error:
+                    raise InputError(f"{error} {self._cure()}") from error
+            self._remove()
+        self.close()
+        if self.form == "video":
+            with suppress(OSError):  # another process has come
+                self.hidden.rmdir()
+
+    def close(self) -> None:
+        """Let others have the folder; the frames stay."""
+        self.lock.release()
+
+    def results(self) -> list[Path]:
+        """Return the videos, or the folders of frames."""
+        return [self.folder / (film if self.form == "frames" else f"{film}.mp4") for film in self.films]
+
+    def _file(self, film: str, number: int) -> Path:
+        return self.root / film / f"frame_{number:04d}.png"
+
+    def _is_there(self, number: int) -> bool:
+        files = [self._file(film, number) for film in self.films]
+        return all(file.is_file() and file.stat().st_size > 0 for file in files)
+
+    def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width 3"]]:
+        numbers = range(self.count)
+        for number in track(numbers, description=f"encoding {film}", transient=True, console=stderr_console()):
+            file = self._file(film, number)
+            try:
+                yield torch.from_numpy(read_rgba(file)[..., :3].copy())
+            except InputError as error:
+                raise InputError(f"The frame {file} cannot be read. Remove it.") from error
+
+    def _hold(self) -> None:
+        with self._kept():
+            self.hidden.mkdir(parents=True, exist_ok=True)
+            try:
+                self.lock.acquire(timeout=0)
+            except Timeout as error:
+                raise InputError(
+                    f"{self.folder} is in use by another process that is filming there. Wait for it, stop it, or give "
+                    "another folder with paths.output_dir=DIR."
+                ) from error
+
+    def _remove(self) -> None:
+        """Remove all that is hidden while it is ours, the lock's file last: released, it may be another process's."""
+        with suppress(OSError):  # the films are there, whatever stays
+            for place in self.hidden.iterdir():
+                if place.is_dir():
+                    shutil.rmtree(place)
+                elif place.name != LOCK:
+                    place.unlink()
+            (self.hidden / LOCK).unlink()
+
+    def _discard(self) -> None:
+        for folder in self.hidden.iterdir():
+            if folder.is_dir():
+                shutil.rmtree(folder)
+        if self.form == "frames":
+            for film in self.films:
+                for file in (self.folder / film).glob("frame_*.png"):
+                    file.unlink()
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            raise InputError(f"{where}{error.strerror or error}. See that there is space left.") from error
+
+    def _cure(self) -> str:
+        there = sum(map(self._is_there, range(self.count)))
+        return (
+            f"{there} of {self.count} frames are kept in {self.root}: the same command, given again, goes on with the "
+            "missing ones."
+        )
+
+
+def _is_range(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(each, (int, float)) for each in value)

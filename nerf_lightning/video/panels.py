@@ -1,0 +1,95 @@
+"""The panels of a film: what is shown of a rendered view, and how panels make one picture."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from nerf_lightning.nerf.models.render_image import Picture
+from nerf_lightning.visualization.pictures import (
+    depth_picture,
+    error_picture,
+    faded,
+    letter_size,
+    side_by_side,
+    to_bytes,
+    with_caption,
+)
+
+FILMS = {"rgb": "video", "depth": "depth", "opacity": "opacity", "normals": "normals", "levels": "levels"}
+"""What can be shown, and the name of its film."""
+
+_PAPER = 255
+
+
+def panel(
+    output: str,
+    picture: Picture,
+    depth_range: tuple[float, float],
+    unit: float,
+    normals: Float[Tensor, "height width 3"] | None,
+) -> UInt8[Tensor, "height wider 3"]:
+    """Return one output of a view as a picture.
+
+    Args:
+        output: a key of `FILMS`. `levels` is the absolute difference of the first level that makes pictures and the
+            last; `normals` are the surface's, as colours: 0.5 + 0.5 n along the axes of the capture's own frame.
+        picture: the view.
+        depth_range: near and far of the depth's colours, in the user's units.
+        unit: how many of these make one of the scene's.
+        normals: in the user's axes, where they are wanted.
+    """
+    if output == "depth":
+        return depth_picture(unit * picture.depth, *depth_range, picture.opacity)
+    if output == "opacity":
+        return to_bytes(picture.opacity[..., None].expand(-1, -1, 3))
+    if output == "normals" and normals is not None:
+        return to_bytes(faded(0.5 + 0.5 * normals, picture.opacity))
+    if output == "levels" and picture.first_rgb is not None:
+        return error_picture(picture.first_rgb, picture.rgb)
+    return to_bytes(picture.rgb)
+
+
+def film_pictures(
+    panels: Sequence[Mapping[str, UInt8[Tensor, "_ _ 3"]]], labels: Sequence[str], mosaic: bool
+) -> dict[str, UInt8[Tensor, "_ _ 3"]]:
+    """Return a frame of each film by the film's name.
+
+    Args:
+        panels: for each model its panels by output.
+        labels: what the models are called; where there are several, their panels stand side by side under their names.
+        mosaic: one film, with a column for each output and a row for each model.
+    """
+    several = len(panels) > 1
+    size = letter_size(next(iter(panels[0].values())).shape[0])
+    if mosaic:
+        rows = [
+            side_by_side(
+                [with_caption(each[name], f"{label} | {name}" if several else name, size) for name in each], gap=size
+            )
+            for each, label in zip(panels, labels, strict=True)
+        ]
+        return {"mosaic": _framed(_stacked(rows, size), size)}
+    if not several:
+        return {FILMS[name]: picture for name, picture in panels[0].items()}
+    return {
+        FILMS[name]: _framed(
+            side_by_side(
+                [with_caption(each[name], label, size) for each, label in zip(panels, labels, strict=True)], gap=size
+            ),
+            size,
+        )
+        for name in panels[0]
+    }
+
+
+def _stacked(rows: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int) -> UInt8[Tensor, "height width 3"]:
+    """Return pictures one above the other, aligned on the left."""
+    width = max(row.shape[1] for row in rows)
+    padded = [torch.nn.functional.pad(row, (0, 0, 0, width - row.shape[1], 0, gap), value=_PAPER) for row in rows]
+    return torch.cat(padded)[:-gap]
+
+
+def _framed(picture: UInt8[Tensor, "height width 3"], size: int) -> UInt8[Tensor, "taller wider 3"]:
+    return torch.nn.functional.pad(picture, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)

@@ -1,0 +1,211 @@
+"""The contract of a camera path: a frame of reference in, cameras in order of time out.
+
+What a person gives or reads (positions, distances, directions) is in the frame and the units of the capture's own
+files; `PathFrame.to_user` says how the working frame lies in it.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
+from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
+from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.scene import Cameras
+
+# What a camera in front of a scene looks at, in units of the near plane's distance.
+NDC_FOCUS = 5.0
+# Larger numbers overflow when they are squared.
+LARGEST = 1e15
+
+
+@dataclass(frozen=True)
+class PathFrame:
+    """What a path moves around, and through what kind of camera it looks."""
+
+    center: Float[Tensor, "3"]
+    """The point to look at, in scene coordinates."""
+    up: Float[Tensor, "3"]
+    """Where the top of the picture points; any length but zero."""
+    radius: float
+    """How far the photographs were taken from the centre, in scene units."""
+    focal: float
+    """Focal length in pixels, for a picture of `width` by `height`."""
+    width: int
+    height: int
+    poses: Float[Tensor, "views 3 4"]
+    """Where the photographs were taken, camera to world."""
+    to_user: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
+    """Similarity that takes scene coordinates to the capture's own frame."""
+    view_names: tuple[str, ...] = ()
+    """What the photographs are called, in the order of `poses`."""
+
+    @property
+    def unit(self) -> float:
+        """How many of the user's units make one of the scene's."""
+        return unit_of(self.to_user)
+
+    def point(self, name: str, given: Sequence[int | float] | None) -> Float[Tensor, "3"] | None:
+        """Return a point that the user gave, in scene coordinates; None where none was given.
+
+        Raises:
+            InputError: it is not three finite numbers; `name` is the setting.
+        """
+        if given is None:
+            return None
+        check_setting(name, given, is_point(given), "three finite numbers, [x, y, z], in the capture's own frame")
+        point = torch.tensor([[float(number) for number in given]], dtype=torch.float64)
+        return points_from_user(point, self.to_user.double())[0].to(self.center)
+
+    @own_precision
+    def direction(self, given: Sequence[float]) -> Float[Tensor, "3"]:
+        """Return a direction that the user gave as a unit vector of the scene."""
+        user = torch.tensor([float(number) for number in given], dtype=torch.float64)
+        return normalize(self.to_user[:3, :3].double().mT @ user, dim=0).to(self.center)
+
+    def size(self, width: int | None, height: int | None) -> tuple[int, int, float]:
+        """Return a picture's width, height, and how much longer its focal length is in pixels.
+
+        Args:
+            width: in pixels; None: it follows the height, or is the frame's own.
+            height: in pixels; None: it follows the width, or is the frame's own.
+        """
+        if width is None and height is not None:
+            scale = height / self.height
+            return max(1, round(self.width * scale)), height, scale
+        width = self.width if width is None else width
+        scale = width / self.width
+        return width, (max(1, round(self.height * scale)) if height is None else height), scale
+
+
+def is_point(given: object) -> bool:
+    """Tell whether something is three finite numbers.
+
+    >>> is_point([0, 1.5, -2]), is_point([0, 1]), is_point("top")
+    (True, False, False)
+    """
+    return isinstance(given, (list, tuple)) and len(given) == 3 and all(map(is_number, given))
+
+
+def is_number(given: object) -> bool:
+    """Tell whether something is a number that a path can have: finite, and not astronomical."""
+    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) < LARGEST
+
+
+def check_setting(name: str, value: object, good: bool, rule: str) -> None:
+    """Refuse a setting of a path.
+
+    Raises:
+        InputError: it is not good.
+    """
+    if not good:
+        raise InputError(f"path.{name} is {value}, but must be {rule}")
+
+
+def check_turns(turns: float, start: float = 0.0) -> None:
+    """Refuse a number of circles, or the angle in degrees at which they begin.
+
+    Raises:
+        InputError: one of them is not good.
+    """
+    check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
+    check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
+
+
+@own_precision
+def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
+    axis = torch.zeros_like(up)
+    axis[0 if abs(float(up[0])) < 0.9 else 1] = 1.0
+    return normalize(axis - (axis @ up) * up, dim=0)
+
+
+@dataclass
+class CameraPath(ABC):
+    """A path of virtual cameras for a video; a subclass adds the settings of its own.
+
+    Args:
+        num_frames: how many cameras.
+        width: picture's width in pixels; None: it follows the height, or is the photographs'.
+        height: picture's height in pixels; None: it follows the width, or is the photographs'.
+        fov: degrees that the picture's width takes in; None: as the photographs.
+        fps: frames per second at which the path is meant to be played.
+
+    Raises:
+        InputError: a number out of its range.
+    """
+
+    num_frames: int = 120
+    _: KW_ONLY
+    width: int | None = None
+    height: int | None = None
+    fov: float | None = None
+    fps: int = 30
+
+    def __post_init__(self) -> None:
+        width, height, fov = self.width, self.height, self.fov
+        check_setting("num_frames", self.num_frames, self.num_frames >= 1, "at least 1")
+        check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
+        check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
+        check_setting("fov", fov, fov is None or 0 < fov < 180, "between 0 and 180 degrees, both excluded, or null")
+        check_setting("fps", self.fps, self.fps >= 1, "at least 1")
+
+    @abstractmethod
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return one camera per frame, all of one size, in order of time."""
+
+    def pinholes(self, c2w: Float[Tensor, "frames 3 4"], around: PathFrame) -> Cameras:
+        """Return cameras at these poses. A picture of another size keeps the horizontal field of view.
+
+        Raises:
+            InputError: a camera looks straight up or down, or stands where it looks: its picture has no up.
+        """
+        lost = (~is_rigid(c2w)).nonzero().flatten().tolist()
+        if lost:
+            raise InputError(
+                f"The camera of frame {lost[0]} of the path looks along its own up axis, or at the very point where it "
+                f"stands ({len(lost)} of {len(c2w)} frames do), so its picture has no top. Move the camera, or what "
+                "it looks at, or give another up."
+            )
+        width, height, scale = around.size(self.width, self.height)
+        focal = around.focal * scale if self.fov is None else focal_from_fov(width, math.radians(self.fov))
+        return pinhole_cameras(c2w, focal, width, height)
+
+
+def frame_of(
+    cameras: Cameras,
+    aabb: Float[Tensor, "2 3"],
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    to_user: Float[Tensor, "4 4"] | None = None,
+    view_names: tuple[str, ...] = (),
+) -> PathFrame:
+    """Return the frame of a capture: the middle of its box, seen from the mean distance of its cameras.
+
+    Forward-facing captures have no middle: theirs lies in front of the mean camera, a few times as far as the near
+    plane, and up is the mean camera's.
+
+    Focal length and size are those of the first camera; its lens and principal point are left behind, for what is
+    rendered on a path is seen through a centred pinhole. The default `up` is the world's z axis.
+    """
+    center = aabb.mean(dim=0).to(cameras.c2w)
+    if cameras.ndc is not None:
+        center, up = torch.tensor([0.0, 0.0, -NDC_FOCUS]).to(cameras.c2w), (0.0, 1.0, 0.0)
+    return PathFrame(
+        center=center,
+        up=torch.tensor(up).to(cameras.c2w),
+        radius=float((cameras.c2w[:, :, 3] - center).norm(dim=-1).mean()),
+        focal=float(cameras.focal[0, 0]),
+        width=int(cameras.width[0]),
+        height=int(cameras.height[0]),
+        poses=cameras.c2w,
+        to_user=torch.eye(4) if to_user is None else to_user,
+        view_names=view_names,
+    )

@@ -1,0 +1,65 @@
+"""A level circle around the scene, looking at its middle."""
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
+
+
+@final
+@dataclass
+class Orbit(CameraPath):
+    """Circle around the centre, anticlockwise from above; the last frame precedes the first, not repeats it.
+
+    Args:
+        elevation: degrees above the horizon, between -90 and 90, both excluded (there the picture has no up).
+        radius: distance from the centre in the capture's units; None: as far as the photographs were taken.
+        turns: full circles; negative goes clockwise.
+        start: azimuth of the first camera in degrees; 0 is on the world's x axis where up is z.
+        center: what it goes around, [x, y, z] in the capture's own frame; None: the middle of the scene.
+
+    Raises:
+        InputError: a number out of its range.
+    """
+
+    elevation: float = 30.0
+    radius: float | None = None
+    turns: float = 1.0
+    start: float = 0.0
+    center: list[int | float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        good = self.radius is None or 0 < self.radius < math.inf
+        check_setting(
+            "elevation", self.elevation, -90 < self.elevation < 90, "between -90 and 90 degrees, both excluded"
+        )
+        check_setting("radius", self.radius, good, "a positive distance, or null")
+        check_turns(self.turns, self.start)
+
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras of the circle."""
+        given = around.point("center", self.center)
+        center = around.center if given is None else given
+        radius = around.radius if self.radius is None else self.radius / around.unit
+        eyes = center + radius * self._directions(around.up)
+        return self.pinholes(look_at(eyes, center.expand_as(eyes), around.up), around)
+
+    def _directions(self, up: Float[Tensor, "3"]) -> Float[Tensor, "frames 3"]:
+        """Return unit vectors from the centre to the cameras."""
+        up = normalize(up, dim=0)
+        east = horizontal(up)
+        north = torch.linalg.cross(up, east)
+        steps = torch.arange(self.num_frames, dtype=up.dtype, device=up.device) / self.num_frames
+        azimuth = (math.radians(self.start) + 2 * math.pi * self.turns * steps)[:, None]
+        level = torch.cos(azimuth) * east + torch.sin(azimuth) * north
+        elevation = math.radians(self.elevation)
+        return math.cos(elevation) * level + math.sin(elevation) * up

@@ -1,0 +1,60 @@
+"""A camera that stays where it is and turns."""
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
+from nerf_lightning.video.paths.photographs import find_views
+
+
+@final
+@dataclass
+class Pan(CameraPath):
+    """Turn about the vertical, from the left of where a photograph looks to its right.
+
+    Args:
+        view: the photograph to begin from: its name, or its number from 0.
+        position: where to stand instead, [x, y, z] in the capture's own frame, looking at the middle of the scene.
+        sweep: degrees to turn in all; 360 makes a panorama, negative turns to the left.
+        tilt: degrees to look higher than the photograph.
+
+    Raises:
+        InputError: a number out of its range.
+    """
+
+    view: int | str = 0
+    position: list[int | float] | None = None
+    sweep: float = 40.0
+    tilt: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        good = math.isfinite(self.sweep) and self.sweep != 0
+        check_setting("sweep", self.sweep, good, "a finite angle in degrees, not 0")
+        check_setting("tilt", self.tilt, -180 < self.tilt < 180, "between -180 and 180 degrees")
+
+    @own_precision
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras that turn."""
+        pose = around.poses[find_views("view", [self.view], around.view_names, len(around.poses))[0]]
+        eye, ahead = around.point("position", self.position), -pose[:, 2]
+        if eye is None:
+            eye = pose[:, 3]
+        else:
+            ahead = normalize(around.center - eye, dim=0)
+        up = normalize(around.up, dim=0)
+        right = normalize(torch.linalg.cross(ahead, up), dim=0)
+        level = torch.linalg.cross(up, right)
+        height = (ahead @ up).clamp(-1, 1).asin() + math.radians(self.tilt)
+        steps = (torch.arange(self.num_frames).to(eye) + 0.5) / self.num_frames - 0.5
+        angle = (math.radians(self.sweep) * steps)[:, None]
+        directions = height.cos() * (angle.cos() * level + angle.sin() * right) + height.sin() * up
+        eyes = eye.expand_as(directions)
+        return self.pinholes(look_at(eyes, eyes + directions, up), around)

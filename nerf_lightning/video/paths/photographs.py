@@ -1,0 +1,71 @@
+"""A smooth path through chosen photographs of the capture."""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import final
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.video.paths.base import CameraPath, PathFrame
+from nerf_lightning.video.paths.spline import even_speed, frame_times, poses_along
+
+
+@final
+@dataclass
+class Photographs(CameraPath):
+    """Go from photograph to photograph, where and as they were taken, at about one speed.
+
+    Args:
+        views: photographs in the order of the path, each by its name, a pattern ("IMG_01*") or its number from 0;
+            None: all, in the capture's order.
+        closed: go back to the first one at the end; the last frame then precedes the first.
+
+    Raises:
+        InputError: a number out of its range.
+    """
+
+    views: list[str | int] | None = None
+    closed: bool = False
+
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras between the photographs."""
+        count = len(around.poses)
+        chosen = list(range(count)) if self.views is None else self.views
+        numbers = find_views("views", chosen, around.view_names, count)
+        if len(numbers) < 2:
+            raise InputError(
+                f"path.views={self.views} names {len(numbers)} photograph(s), and a path needs two to lie between. "
+                "Name more of them, or use path=pan for a camera that stays."
+            )
+        keys = around.poses[numbers]
+        knots = even_speed(keys, around.radius, self.closed)
+        at = frame_times(knots, self.num_frames, self.closed)
+        return self.pinholes(poses_along(knots, keys, at), around)
+
+
+def find_views(setting: str, chosen: Sequence[str | int], names: Sequence[str], count: int) -> list[int]:
+    """Return the numbers of photographs that are given by name, pattern or number.
+
+    >>> find_views("views", [2, "b", "*"], ["a", "b", "c"], 3)
+    [2, 1, 0, 1, 2]
+
+    Raises:
+        InputError: there is no such photograph; near names are told.
+    """
+    found: list[int] = []
+    for each in [chosen] if isinstance(chosen, str) else chosen:
+        if isinstance(each, int) and not isinstance(each, bool):
+            numbers = [each] if 0 <= each < count else []
+        else:
+            exact = [number for number, name in enumerate(names) if name == str(each)]
+            numbers = exact or [number for number, name in enumerate(names) if fnmatchcase(name, str(each))]
+        if not numbers:
+            near = difflib.get_close_matches(str(each), names, n=3) or list(names[:3])
+            raise InputError(
+                f"path.{setting}: the capture has no photograph {each}. It has {count}, numbered from 0"
+                + (f", with names like {', '.join(near)}." if near else ".")
+            )
+        found += numbers
+    return found

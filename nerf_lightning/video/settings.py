@@ -1,0 +1,87 @@
+"""What `nerf render` films, as its config says it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.video.panels import FILMS
+from nerf_lightning.video.paths.base import is_point
+
+Form = Literal["video", "frames"]
+Corner = tuple[float, float, float]
+SWITCHES = ("mosaic", "hold_camera")
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """What is filmed. Distances and places are in the frame and the units of the capture's own files."""
+
+    outputs: tuple[str, ...] = ("rgb", "depth")
+    """Keys of `export.panels.FILMS`."""
+    mosaic: bool = False
+    """One film of all outputs, in place of one for each."""
+    form: Form = "video"
+    near: float | None = None
+    """Where rays begin; None: where the photographs' do."""
+    crop: tuple[Corner, Corner] | None = None
+    """Lower and upper corner of a box, outside of which nothing is shown."""
+    hold_camera: bool = False
+    """Stay at the first camera, and let only the direction from which colour is looked up move."""
+    precision: str | None = None
+    """What the models compute in, as the caller has seen to; frames of another precision belong to another film."""
+
+
+def film_settings(config: Mapping[str, Any]) -> FilmSettings:
+    """Return what is to be filmed, by settings that are plain values.
+
+    Raises:
+        InputError: an output, a form, a box or a distance that makes no film.
+    """
+    for name in SWITCHES:
+        if not isinstance(config[name], bool):
+            raise InputError(f"{name}={config[name]} does not fit: it must be true or false.")
+    outputs = tuple(map(str, as_list(config["outputs"])))
+    if not outputs or len(set(outputs)) < len(outputs) or not set(outputs) <= set(FILMS):
+        raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
+    if config["format"] not in ("video", "frames"):
+        raise InputError(f"format={config['format']}: choose video (mp4) or frames (PNG files).")
+    return FilmSettings(
+        outputs=outputs,
+        mosaic=config["mosaic"],
+        form=config["format"],
+        near=_near(config["near"]),
+        crop=_crop(config["crop"]),
+        hold_camera=config["hold_camera"],
+    )
+
+
+def as_list(value: Any) -> list[Any]:
+    """Return one value or a list of them as a list."""
+    return list(value) if isinstance(value, list) else [value]
+
+
+def _near(value: Any) -> float | None:
+    if value is None:
+        return None
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 <= value < math.inf:
+        raise InputError(f"near={value}: give a distance from the camera, not negative, or null.")
+    return float(value)
+
+
+def _crop(corners: Any) -> tuple[Corner, Corner] | None:
+    if corners is None:
+        return None
+    if not isinstance(corners, list) or len(corners) != 2 or not all(map(is_point, corners)):
+        raise InputError(
+            f"crop={corners}: give the lower and the upper corner of a box in the capture's own frame, "
+            "crop=[[x,y,z],[x,y,z]]."
+        )
+    (x, y, z), (upper_x, upper_y, upper_z) = (map(float, corner) for corner in corners)
+    if not (x < upper_x and y < upper_y and z < upper_z):
+        raise InputError(
+            f"crop={corners} holds nothing: every coordinate of the first corner must be smaller than that of the "
+            "second."
+        )
+    return (x, y, z), (upper_x, upper_y, upper_z)

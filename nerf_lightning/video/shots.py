@@ -1,0 +1,216 @@
+"""What each frame of a film shows of each model: cameras in the model's frame, where rays begin and end."""
+
+import logging
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import at_most, coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
+from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
+from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
+from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.video.paths.base import CameraPath, frame_of
+from nerf_lightning.video.settings import Corner
+
+# The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
+PROBES, PROBE_PIXELS = 8, 64
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model to be filmed, and where it was learnt."""
+
+    model: RadianceModel
+    scene: SceneRecord
+    background: Background
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """All frames of one model."""
+
+    subject: Subject
+    cameras: Cameras
+    seen_from: Cameras | None
+    """Cameras whose directions the colour is looked up from, where the camera itself is held."""
+    near: Float[Tensor, "frames"]
+    far: Float[Tensor, "frames"]
+    clip: Clip | None
+    tile_points: int
+
+    @property
+    def unit(self) -> float:
+        """How many of the user's units make one of the scene's."""
+        return unit_of(self.subject.scene.to_user)
+
+    def picture(self, frame: int) -> Picture:
+        """Render one frame."""
+        return render_picture(
+            self.subject.model,
+            self.cameras,
+            frame,
+            self.near,
+            self.far,
+            self.subject.background,
+            self.tile_points,
+            self.clip,
+            self.seen_from,
+        )
+
+    def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
+        """Return the unit normals of what the picture shows, in the user's axes."""
+        rays, straight = view_rays(self.cameras, frame, self.near, self.far, self.clip)
+        bent = self.cameras.ndc is not None
+        surface = picture.depth if bent else surface_depth(picture.depth, picture.opacity, rays.far)
+        normals = normals_from_depth(straight.origins + surface[..., None] * straight.directions)
+        return normals @ (self.subject.scene.to_user[:3, :3] / self.unit).mT
+
+    def small(self) -> "Shot":
+        """Return a few of the frames, in small."""
+        chosen = evenly_spaced_subset(range(len(self.cameras.c2w)), PROBES)
+        cameras = at_most(self.cameras[chosen], PROBE_PIXELS)
+        return replace(self, cameras=cameras, seen_from=None, near=self.near[chosen], far=self.far[chosen])
+
+
+def make_shots(
+    subjects: list[Subject],
+    path: CameraPath,
+    tile_points: int,
+    near: float | None = None,
+    crop: tuple[Corner, Corner] | None = None,
+    hold_camera: bool = False,
+) -> list[Shot]:
+    """Return the shot of each model; the path is that of the first one's capture.
+
+    Args:
+        subjects: models of one capture; their working frames may differ.
+        path: where the cameras are.
+        tile_points: most points that go through a field at once.
+        near: where rays begin, in the user's units; None: where the photographs' do.
+        crop: lower and upper corner of a box in the user's frame, outside of which nothing is shown.
+        hold_camera: stay at the first camera, and let only the direction from which colour is looked up move.
+
+    Raises:
+        InputError: a camera stands inside of the box, or the path cannot be laid around this capture.
+    """
+    first = subjects[0].scene
+    cameras = lay_path(path, first)
+    shots = []
+    for subject in subjects:
+        scene = subject.scene
+        moved = _in_frame_of(cameras, first, scene)
+        held = replace(moved, c2w=moved.c2w[:1].expand_as(moved.c2w)) if hold_camera else moved
+        clip = None
+        if near is not None or crop is not None:
+            box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
+            clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
+        near_end, far_end = scene.near_and_far(held.c2w[:, :, 3])
+        _check_outside(held, clip)
+        _check_near(scene, clip, far_end)
+        shots.append(
+            Shot(
+                subject=subject,
+                cameras=_bent(held, scene),
+                seen_from=moved if hold_camera else None,
+                near=near_end,
+                far=far_end,
+                clip=clip,
+                tile_points=tile_points,
+            )
+        )
+    return shots
+
+
+def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:
+    """Return the cameras of a path around a scene.
+
+    Raises:
+        InputError: the path cannot be laid there: it names a photograph that is not there, or has no up.
+    """
+    return path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
+
+
+def depth_range(shots: list[Shot]) -> tuple[float, float]:
+    """Return near and far of what is seen on the whole path, in the user's units, from a few small frames.
+
+    The outer 1 % at each end are left out. Where nothing is seen they are the scene's own.
+    """
+    seen = []
+    for shot in map(Shot.small, shots):
+        for frame in range(len(shot.cameras.c2w)):
+            picture = shot.picture(frame)
+            seen.append(shot.unit * picture.depth[picture.opacity > 0.5])
+    depths = torch.cat(seen)
+    if not depths.numel():
+        scene = shots[0].subject.scene
+        return shots[0].unit * float(scene.near.min()), shots[0].unit * float(scene.far.max())
+    near, far = torch.quantile(depths, torch.tensor([0.01, 0.99])).tolist()
+    return near, far
+
+
+def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
+    """Tell which cameras normalised device coordinates can render: before the plane z = -1, and looking along -z."""
+    zeros = torch.zeros(len(cameras.c2w))
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
+    return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
+
+
+def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Cameras:
+    """Return cameras of the first scene's working frame as another's: both know their way to the user's."""
+    if torch.equal(first.to_user, scene.to_user):
+        return cameras
+    apart = torch.linalg.inv(first.to_user.double()) @ scene.to_user.double()
+    return replace(cameras, c2w=poses_from_user(cameras.c2w.double(), apart).float())
+
+
+def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
+    """Return the cameras with rays through normalised device coordinates, where the scene was learnt in these."""
+    if scene.cameras.ndc is None:
+        return cameras
+    count = len(cameras.c2w)
+    lost = int((~in_front_of_near_plane(cameras)).sum())
+    if lost:
+        log.warning(
+            "%d of %d cameras of the path look aside or stand among the content, where the forward-facing capture "
+            "%s has nothing to show: their pictures mean nothing. Use path=spiral.",
+            lost,
+            count,
+            scene.name,
+        )
+    return replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
+
+
+def _check_outside(cameras: Cameras, clip: Clip | None) -> None:
+    if clip is None or clip.box is None:
+        return
+    inside = clip.box.holds(cameras.c2w[:, :, 3]).nonzero().flatten().tolist()
+    if inside:
+        raise InputError(
+            f"crop: the camera of frame {inside[0]} stands inside the box ({len(inside)} of {len(cameras.c2w)} frames "
+            "do), where it would look at the content from within. Make the box smaller, or move the path away (for "
+            "instance path=orbit path.radius=...)."
+        )
+
+
+def _check_near(scene: SceneRecord, clip: Clip | None, far_end: Float[Tensor, "frames"]) -> None:
+    if clip is None or clip.near is None or scene.cameras.ndc is not None:
+        return
+    far = float(far_end.max())
+    if clip.near >= far:
+        unit = unit_of(scene.to_user)
+        raise InputError(
+            f"near={unit * clip.near:g} leaves nothing to see: rays end at {unit * far:g} of the capture's units. Give "
+            "a distance between 0 and that."
+        )

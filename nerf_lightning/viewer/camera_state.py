@@ -1,0 +1,59 @@
+"""What a person wants to see: a place to look from, in a window of some size; and the cameras that show it."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras, resized
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.types.scene import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """One wish of a person; a new wish is a new object."""
+
+    c2w: Float[Tensor, "3 4"]
+    """Camera to world, columns right, up, back, centre; the model's frame."""
+    fov: float
+    """Vertical field of view in radians."""
+    width: int
+    """The window in pixels."""
+    height: int
+    crop: CropBox | None = None
+    """Only what lies in this box is shown; None: all."""
+    photograph: int | None = None
+    """Look through the camera of this view, lens included, with its picture in the middle of the window."""
+
+
+def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
+    """Return the pose of a camera whose rotation is given with axes right, down, forward (OpenCV's).
+
+    >>> back = pose_of(torch.tensor([1.0, 0, 0, 0]), torch.zeros(3))[:, 2]
+    >>> (back + 0.0).tolist()  # it looks along z
+    [0.0, 0.0, -1.0]
+    """
+    turned = rotation_from_quaternion(wxyz) * torch.tensor([1.0, -1.0, -1.0]).to(wxyz)
+    return torch.cat([turned, position[:, None]], dim=-1)
+
+
+def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:
+    """Return one camera for a picture of about this height, and its near and far.
+
+    A photograph's camera keeps the photograph's shape, and fits into the window.
+    """
+    if look.photograph is not None:
+        view = slice(look.photograph, look.photograph + 1)
+        cameras, near, far = record.cameras[view], record.near[view], record.far[view]
+        shrunk = height / max(int(cameras.height), int(cameras.width) * look.height / look.width)
+        sizes = ((size * shrunk).round().long().clamp(min=2) for size in (cameras.width, cameras.height))
+        return resized(cameras, *sizes), near, far
+    width = max(2, round(height * look.width / look.height))
+    cameras = pinhole_cameras(look.c2w[None], focal_from_fov(height, look.fov), width, height)
+    if record.cameras.ndc is not None:
+        cameras = replace(cameras, ndc=record.cameras.ndc[:1])
+    return cameras, *record.near_and_far(look.c2w[None, :, 3])

@@ -1,0 +1,144 @@
+"""One person in front of the page: where they look from, what they see, and what is sent to them."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.video.paths.base import PathFrame
+from nerf_lightning.viewer.camera_state import CameraState, pose_of
+from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
+from nerf_lightning.viewer.photographs import Photographs
+from nerf_lightning.viewer.progressive import ProgressiveRendering
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import View
+
+# Coarse pictures are sent often, fine ones once.
+COARSE_QUALITY, FINE_QUALITY = 75, 92
+# Who stands this near (share of the photographs' distance) to a photograph's place, looking the same way, is there.
+NEAR, SAME_WAY = 2e-3, 1 - 1e-5
+
+
+class ViewerClient:
+    """Turn the movements of viser's camera into looks, and views into what the page shows.
+
+    viser calls from threads of its own; pictures come from the thread that renders.
+
+    Args:
+        client: viser's handle.
+        queue: renders.
+        photographs: to compare with.
+        around: the middle of the scene, and how far the photographs were taken.
+        most_height: the finest picture, in pixels.
+    """
+
+    def __init__(self, client: Any, queue: RenderQueue, photographs: Photographs, around: PathFrame, most_height: int):
+        self.client, self.queue, self.photographs, self.around = client, queue, photographs, around
+        self.refinement = ProgressiveRendering(self._show, most_height)
+        self.channel, self.split = COLOR, 0.5
+        self.crop: CropBox | None = None
+        self.photograph: int | None = None
+        """The view whose camera is looked through."""
+        self.on_finest: Callable[[], None] = lambda: None
+        self.on_leave: Callable[[], None] = lambda: None
+        self._arrived = False
+        self._seen: tuple[View, CameraState] | None = None
+        self._shown: UInt8[Tensor, "h w 3"] | None = None
+        self._wants_present, self._presenting = False, threading.Lock()
+
+    def start(self) -> None:
+        """Follow the camera from now on; there is a picture at once."""
+        self.client.camera.on_update(self.queue.complaints.harmless(lambda _: self.look()))
+        self.look()
+        self.queue.add(self.client.client_id, self.refinement)
+
+    def look(self) -> None:
+        """Wish for what the camera sees now."""
+        camera = self.client.camera
+        if self.photograph is not None:
+            self._notice_leaving()
+        self.refinement.ask(
+            CameraState(
+                c2w=self.pose(),
+                fov=float(camera.fov),
+                width=max(1, int(camera.image_width)),
+                height=max(1, int(camera.image_height)),
+                crop=self.crop,
+                photograph=self.photograph,
+            )
+        )
+        self.queue.wake()
+
+    def pose(self) -> Tensor:
+        """Return viser's camera as ours."""
+        camera = self.client.camera
+        return pose_of(torch.tensor(camera.wxyz).float(), torch.tensor(camera.position).float())
+
+    def enter(self, view: int) -> None:
+        """Look through the camera of a photograph."""
+        c2w = self.photographs.record.cameras.c2w[view]
+        self.photograph, self._arrived = view, False
+        ahead = max(float((c2w[:, 3] - self.around.center) @ c2w[:, 2]), 0.1 * self.around.radius)
+        with self.client.atomic():
+            self.client.camera.position = c2w[:, 3].double().numpy()
+            self.client.camera.look_at = (c2w[:, 3] - ahead * c2w[:, 2]).double().numpy()
+        self.look()
+
+    def leave(self) -> None:
+        """Look freely again."""
+        if self.photograph is not None:
+            self.photograph = None
+            self.on_leave()
+            self.look()
+
+    def present(self) -> None:
+        """Send the newest view again, as another channel or with the comparison cut elsewhere.
+
+        A slider asks for it more often than it can be done: who finds it being done leaves the next turn to whoever
+        does it.
+        """
+        self._wants_present = True
+        while self._wants_present and self._presenting.acquire(blocking=False):
+            try:
+                self._wants_present = False
+                if self._seen is not None:
+                    self._send(*self._seen, FINE_QUALITY)
+            finally:
+                self._presenting.release()
+
+    def latest(self) -> UInt8[Tensor, "h w 3"] | None:
+        """Return the picture that was sent last."""
+        return self._shown
+
+    def _show(self, view: View, look: CameraState, finest: bool) -> None:
+        self._seen = view, look
+        self._send(view, look, FINE_QUALITY if finest else COARSE_QUALITY)
+        if finest:
+            self.on_finest()
+
+    def _send(self, view: View, look: CameraState, quality: int) -> None:
+        picture = picture_of(view, self.channel)
+        if look.photograph is not None:
+            height, width, _ = picture.shape
+            if self.photographs.has(look.photograph):
+                truth = self.photographs.picture(look.photograph, width, height)
+                picture = wiped(truth, picture, self.split)
+            picture = in_window(picture, look.width / look.height)
+        self._shown = picture
+        self.client.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality)
+        self.client.flush()
+
+    def _notice_leaving(self) -> None:
+        assert self.photograph is not None
+        there = self.photographs.record.cameras.c2w[self.photograph]
+        here = self.pose()
+        near = float((here[:, 3] - there[:, 3]).norm()) < NEAR * self.around.radius
+        if near and float(here[:, 2] @ there[:, 2]) > SAME_WAY:
+            self._arrived = True
+        elif self._arrived:
+            self.photograph = None
+            self.on_leave()

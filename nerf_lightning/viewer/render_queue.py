@@ -1,0 +1,78 @@
+"""Who is served next: every slice of rendering goes to one of the people who look on."""
+
+import logging
+import threading
+import time
+
+from nerf_lightning.viewer.complaints import Complaints
+from nerf_lightning.viewer.progressive import ProgressiveRendering
+from nerf_lightning.viewer.renderer import SlicedRenderer
+
+log = logging.getLogger(__name__)
+
+
+class RenderQueue:
+    """All rendering, in the thread that calls `work`: the kernels take no second one.
+
+    Args:
+        renderer: renders for everybody.
+    """
+
+    def __init__(self, renderer: SlicedRenderer):
+        self.renderer = renderer
+        self.complaints = Complaints(log)
+        self._refinements: dict[int, ProgressiveRendering] = {}
+        self._lock = threading.Lock()
+        self._wish = threading.Event()
+
+    def add(self, client: int, refinement: ProgressiveRendering) -> None:
+        """Serve somebody."""
+        with self._lock:
+            self._refinements[client] = refinement
+        self.wake()
+
+    def remove(self, client: int) -> None:
+        """Forget somebody who has left."""
+        with self._lock:
+            self._refinements.pop(client, None)
+
+    def wake(self) -> None:
+        """Say that somebody has a wish."""
+        self._wish.set()
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until somebody has a wish, or this time has passed."""
+        self._wish.wait(seconds)
+
+    def refresh(self) -> None:
+        """Let everybody see the model as it is now."""
+        with self._lock:
+            for refinement in self._refinements.values():
+                refinement.refresh()
+
+    def work(self) -> bool:
+        """Render one slice for somebody; return False where nobody has a wish that is not fulfilled.
+
+        Who moves comes first; among equals, who was served longest ago. What cannot be drawn is dropped: it ends
+        neither the page of the others nor a training.
+        """
+        self._wish.clear()
+        for refinement in self._in_order():
+            refinement.served = time.monotonic()
+            try:
+                if refinement.work(self.renderer):
+                    return True
+            except Exception as error:
+                refinement.give_up()
+                self.complaints.say("a picture of the viewer could not be drawn", error)
+                return True
+        return False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nobody looks on."""
+        return not self._refinements
+
+    def _in_order(self) -> list[ProgressiveRendering]:
+        with self._lock:
+            return sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))

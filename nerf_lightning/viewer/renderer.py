@@ -1,0 +1,104 @@
+"""Render a view in slices: between two of them its owner may do something else, or drop it."""
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.clipping import Clip
+from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.geometry.surfaces import surface_depth
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import render_rays
+from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.viewer.camera_state import CameraState, camera_of
+
+# How long a slice takes, about: a person may change the wish between two.
+SLICE_SECONDS = 0.08
+# A picture is never smaller than this (pixels high).
+LEAST_HEIGHT = 32
+FIRST_RAYS = 512
+# How much a new measurement of the speed counts.
+FRESH = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What was rendered, and the camera that it was seen through."""
+
+    rgb: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    """Distance along the ray to what stopped the light (scene units); where nothing did, far."""
+    opacity: Float[Tensor, "height width"]
+    camera: Cameras
+
+
+class SlicedRenderer:
+    """Render looks with a model, and learn how fast that goes.
+
+    Args:
+        model: in evaluation mode while it renders.
+        scene: what a checkpoint knows of the capture.
+        background: what lies behind.
+        tile_points: most points at once.
+        share: of the time that goes by, so much is spent on rendering; 1 where there is nothing else to do.
+        moving_seconds: how long a picture may take while the camera moves.
+    """
+
+    def __init__(
+        self,
+        model: RadianceModel,
+        scene: SceneRecord,
+        background: Background,
+        tile_points: int,
+        share: float = 1.0,
+        moving_seconds: float = 0.1,
+    ):
+        self.model, self.scene, self.background = model, scene, background
+        self.tile_points = tile_points
+        self.share, self.moving_seconds = share, moving_seconds
+        self.rays_per_second: float | None = None
+
+    def height_while_moving(self, look: CameraState) -> int:
+        """Return how high a picture can be so that several come in a second."""
+        rays = (self.rays_per_second or FIRST_RAYS) * self.share * self.moving_seconds
+        return max(LEAST_HEIGHT, int((rays * look.height / look.width) ** 0.5))
+
+    def slices(self, look: CameraState, height: int) -> Generator[None, None, View]:
+        """Render a look at about this height (pixels): yields after each slice, and returns the view."""
+        cameras, near, far = camera_of(look, self.scene, height)
+        pixels = all_pixels(cameras, 0)
+        shape, pixels = pixels.x.shape, pixels.map(torch.flatten)
+        rays = rays_through_pixels(cameras, pixels, near, far)
+        if look.crop is not None:
+            rays = Clip(box=look.crop)(rays, rays, ndc=False)
+        parts, start, total = [], 0, rays.near.numel()
+        while start < total:
+            stop = start + self._rays_in_a_slice(total - start)
+            began = time.perf_counter()
+            with torch.no_grad():
+                parts.append(render_rays(self.model, rays[start:stop], self.background, self.tile_points))
+            self._learn(stop - start, time.perf_counter() - began)
+            start = stop
+            yield
+        rgb, depth, opacity = (torch.cat(column) for column in list(zip(*parts, strict=True))[:3])
+        depth = surface_depth(depth, opacity, rays.far)
+        if cameras.ndc is not None:
+            straight = rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)
+            depth = world_distance(straight, depth / rays.far)
+        return View(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape), cameras)
+
+    def _rays_in_a_slice(self, left: int) -> int:
+        rays = max(64, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS))
+        # No crumb at the end: it would cost as much as a slice.
+        return left if left < 1.5 * rays else rays
+
+    def _learn(self, rays: int, seconds: float) -> None:
+        measured = rays / max(seconds, 1e-6)
+        before = self.rays_per_second
+        self.rays_per_second = measured if before is None else (1 - FRESH) * before + FRESH * measured

@@ -1,0 +1,178 @@
+"""Pictures: floats to bytes, scalars to colours, panels side by side.
+
+A picture is uint8 (height, width, 3) on the CPU, row 0 on top; colours before that are floats in [0, 1].
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.files.atomic import whole_file
+
+ERROR_SCALE = 0.25
+"""Absolute error that gets the brightest colour: always the same, so that two runs can be compared."""
+
+_PAPER = 255
+_INK = (64, 64, 64)
+_BACKDROP = 0.93
+"""Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far."""
+
+
+def to_bytes(rgb: Float[Tensor, "*h w 3"]) -> UInt8[Tensor, "*h w 3"]:
+    """Return colours in [0, 1] as bytes on the CPU: clamped, then rounded to the nearest; NaN becomes black.
+
+    >>> to_bytes(torch.tensor([[-1.0, 0.5, 2.0]])).tolist()
+    [[0, 128, 255]]
+    """
+    return (torch.nan_to_num(rgb.detach().float()).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def save_png(path: Path, picture: UInt8[Tensor, "height width 3"]) -> None:
+    """Write a picture as PNG: whole or not at all. Missing folders are made."""
+    with whole_file(path) as part:
+        Image.fromarray(picture.numpy()).save(part, format="PNG")
+
+
+def color_map(values: Float[Tensor, "height width"], low: float, high: float) -> Float[Tensor, "height width 3"]:
+    """Return colours, dark at `low` and bright at `high`, perceptually uniform between (matplotlib's magma).
+
+    `low` may exceed `high`: `color_map(depth, far, near)` shows what is near as bright. Values outside the
+    range take its end colours; NaN takes the colour of `low`.
+    """
+    span = high - low if high != low else 1.0
+    place = torch.nan_to_num((values.detach().float().cpu() - low) / span, nan=0.0).clamp(0, 1)
+    return _colors()[(place * (len(_colors()) - 1)).round().long()]
+
+
+def side_by_side(pictures: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int = 4) -> UInt8[Tensor, "height width 3"]:
+    """Return pictures in one row, `gap` white pixels between them; shorter ones stand at the bottom."""
+    height = max(picture.shape[0] for picture in pictures)
+    width = sum(picture.shape[1] for picture in pictures) + gap * (len(pictures) - 1)
+    row = torch.full((height, width, 3), _PAPER, dtype=torch.uint8)
+    left = 0
+    for picture in pictures:
+        row[height - picture.shape[0] :, left : left + picture.shape[1]] = picture
+        left += picture.shape[1] + gap
+    return row
+
+
+def visible_range(depth: Float[Tensor, "height width"], opacity: Float[Tensor, "height width"]) -> tuple[float, float]:
+    """Return near and far (scene units) of what is visible: opacity above one half.
+
+    The outer 2 % at each end are left out, so that a few stray points do not take the scale. Where nothing is
+    visible it is the range of the whole picture.
+    """
+    seen = depth[(opacity > 0.5) & depth.isfinite()].detach().double().cpu().numpy()
+    if seen.size == 0:
+        seen = torch.nan_to_num(depth.detach().double(), posinf=0.0).cpu().numpy()
+    near, far = np.percentile(seen, [2, 98])
+    return float(near), float(far)
+
+
+def depth_picture(
+    depth: Float[Tensor, "height width"],
+    near: float,
+    far: float,
+    opacity: Float[Tensor, "height width"] | None = None,
+) -> UInt8[Tensor, "height wider 3"]:
+    """Return depth in colours, near bright, with its scale on the right.
+
+    Where `opacity` is given, what light passes through fades to pale grey.
+    """
+    colors = color_map(depth, low=far, high=near)
+    if opacity is not None:
+        colors = faded(colors, opacity)
+    return _with_scale(to_bytes(colors), top=near, bottom=far)
+
+
+def faded(
+    colors: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
+) -> Float[Tensor, "height width 3"]:
+    """Return colours that fade to pale grey where light passes through."""
+    shown = opacity.detach().float().cpu().clamp(0, 1)[..., None]
+    return colors * shown + _BACKDROP * (1 - shown)
+
+
+def error_picture(
+    truth: Float[Tensor, "height width 3"], render: Float[Tensor, "height width 3"]
+) -> UInt8[Tensor, "height wider 3"]:
+    """Return the absolute error (mean of the channels) in colours, 0 to `ERROR_SCALE`, with its scale."""
+    error = (truth.detach().float().cpu() - render.detach().float().cpu()).abs().mean(dim=-1)
+    return _with_scale(to_bytes(color_map(error, 0.0, ERROR_SCALE)), top=ERROR_SCALE, bottom=0.0)
+
+
+def mosaic(
+    truth: Float[Tensor, "height width 3"],
+    render: Float[Tensor, "height width 3"],
+    depth: Float[Tensor, "height width"],
+    opacity: Float[Tensor, "height width"],
+) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the validation picture: truth, render, depth and error in a row, a caption above each."""
+    near, far = visible_range(depth, opacity)
+    panels = {
+        "truth": to_bytes(truth),
+        "render": to_bytes(render),
+        "depth": depth_picture(depth, near, far, opacity),
+        "error": error_picture(truth, render),
+    }
+    size = letter_size(truth.shape[0])
+    row = side_by_side([with_caption(p, name, size) for name, p in panels.items()], gap=size)
+    return torch.nn.functional.pad(row, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)
+
+
+@cache
+def _colors() -> Float[Tensor, "256 3"]:
+    # Only here: the other pictures can do without matplotlib, which is slow to import.
+    from matplotlib import colormaps
+
+    return torch.tensor(colormaps["magma"](np.arange(256))[:, :3], dtype=torch.float32)
+
+
+def letter_size(height: int) -> int:
+    """Return a size of type (pixels), legible beside a small picture and not loud beside a large one."""
+    return max(10, round(0.03 * height))
+
+
+def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the picture under a line of text, in letters of `size` pixels."""
+    font, text = ImageFont.load_default(size), for_terminal(text)
+    height, width, _ = picture.shape
+    top = round(1.5 * size)
+    page = Image.new("RGB", (max(width, _length(font, text)), top + height), (_PAPER,) * 3)
+    page.paste(Image.fromarray(picture.numpy()), (0, top))
+    ImageDraw.Draw(page).text((0, round(1.1 * size)), text, fill=_INK, font=font, anchor="ls")
+    return _as_picture(page)
+
+
+def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
+    """Set a slim colour bar at the picture's right, from bright at `top` down to dark, with both numbers."""
+    height, width, _ = picture.shape
+    size = letter_size(height)
+    font = ImageFont.load_default(size)
+    texts = (f"{top:.3g}", f"{bottom:.3g}")
+    thick, space = max(4, size // 2), max(3, size // 3)
+    page = Image.new(
+        "RGB", (width + 3 * space + thick + max(_length(font, text) for text in texts), height), (_PAPER,) * 3
+    )
+    page.paste(Image.fromarray(picture.numpy()), (0, 0))
+    ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
+    page.paste(Image.fromarray(to_bytes(ramp).numpy()), (width + space, 0))
+    draw, left = ImageDraw.Draw(page), width + 2 * space + thick
+    draw.text((left, 0), texts[0], fill=_INK, font=font, anchor="lt")
+    draw.text((left, height), texts[1], fill=_INK, font=font, anchor="ls")
+    return _as_picture(page)
+
+
+def _length(font: ImageFont.FreeTypeFont | ImageFont.ImageFont, text: str) -> int:
+    return round(font.getlength(text) + 0.5)
+
+
+def _as_picture(page: Image.Image) -> UInt8[Tensor, "height width 3"]:
+    return torch.from_numpy(np.array(page))

@@ -1,0 +1,104 @@
+"""A checkpoint file is whole at every moment, the one before stays, and what goes wrong is said."""
+
+import os
+
+import pytest
+import torch
+from support.running import start_code
+
+from nerf_lightning.checkpoints.writing import sweep_leftovers, write_checkpoint
+from nerf_lightning.errors import InputError
+
+
+def steps(folder):
+    return {path.name: torch.load(path, weights_only=True)["step"] for path in sorted(folder.iterdir())}
+
+
+def test_the_last_two_are_kept(tmp_path):
+    for step in (1, 2, 3):
+        write_checkpoint({"step": step}, tmp_path / "last.ckpt")
+        write_checkpoint({"step": 10 * step}, tmp_path / "best.ckpt")
+    assert steps(tmp_path) == {"best.ckpt": 30, "last.ckpt": 3, "previous.ckpt": 2}
+
+
+def test_the_last_two_are_kept_where_files_cannot_be_linked(tmp_path, monkeypatch):
+    def refuse(*names):
+        raise OSError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    for step in (1, 2, 3):
+        write_checkpoint({"step": step}, tmp_path / "last.ckpt")
+    assert steps(tmp_path) == {"last.ckpt": 3, "previous.ckpt": 2}
+
+
+@pytest.mark.parametrize("function", ["fsync", "unlink", "link", "replace"])
+def test_whatever_fails_the_former_one_is_there(tmp_path, monkeypatch, function):
+    for step in (1, 2):
+        write_checkpoint({"step": step}, tmp_path / "last.ckpt")
+    real, calls = getattr(os, function), []
+
+    def fails_once(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError(5, "Input/output error")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(os, function, fails_once)
+    try:
+        write_checkpoint({"step": 3}, tmp_path / "last.ckpt")
+    except InputError:
+        assert steps(tmp_path)["last.ckpt"] == 2
+    else:
+        assert steps(tmp_path) == {"last.ckpt": 3, "previous.ckpt": 2}
+
+
+def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
+    """A real limit on the size of files, in a process of its own."""
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    write_checkpoint({"step": 1}, path)
+    code = (
+        "import resource, signal, torch, sys, pathlib\n"
+        "from nerf_lightning.checkpoints.writing import write_checkpoint\n"
+        "from nerf_lightning.errors import InputError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
+        "try:\n"
+        f"    write_checkpoint({{'step': torch.zeros(1_000_000)}}, pathlib.Path({str(path)!r}))\n"
+        "except InputError as error:\n"
+        "    print(error); sys.exit(2)\n"
+    )
+    process = start_code(code)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 2, errors
+    assert "could not be saved" in output
+    assert f"The former checkpoint {path} is unharmed" in output
+    assert steps(path.parent) == {"last.ckpt": 1}
+
+
+def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
+        write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(InputError, match=r"run/checkpoints can be written, then go on with resume="):
+        write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+
+
+def test_what_a_killed_process_left_is_swept(tmp_path):
+    (tmp_path / ".last.ckpt.123.tmp").write_text("half")
+    (tmp_path / "last.ckpt").write_text("whole")
+    sweep_leftovers(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_run_folder_that_is_gone_does_not_come_back(tmp_path):
+    with pytest.raises(InputError, match=r"could not be saved: .*No such file"):
+        write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert not (tmp_path / "run").exists()

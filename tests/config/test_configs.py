@@ -1,0 +1,168 @@
+"""Every yaml of conf/ composes and builds."""
+
+import inspect
+
+import pytest
+from hydra.errors import HydraException
+from hydra.utils import get_class, get_method
+from omegaconf import DictConfig, OmegaConf
+from support.configs import composed, loaded, options
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.export.base import Export
+from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
+
+BUILT = {
+    "encoder": "encoder",
+    "field": "field",
+    "model": "model",
+    "loss": "loss",
+    "scheduler": "scheduler",
+    "callbacks": "callbacks",
+    "viewer": "viewer",
+    "path": "path",
+    "evaluation": "evaluation",
+    "optimizer": "optimizer",
+}
+
+
+@pytest.mark.parametrize(("group", "option"), [(g, o) for g in BUILT for o in options(g)])
+def test_every_component_builds(group, option, tmp_path):
+    config = composed("train", f"{group}={option}")[BUILT[group]]
+    if OmegaConf.is_missing(config, "file"):
+        write_keyframes(tmp_path / "keys.yaml", [Keyframe((x, 0.0, 0.0), look_at=(0.0, 1.0, 0.0)) for x in (0.0, 1.0)])
+        config.file = str(tmp_path / "keys.yaml")
+    assert build(config) is not None
+
+
+@pytest.mark.parametrize("option", options("experiment"))
+def test_every_experiment_composes_and_its_model_builds(option):
+    config = composed("train", f"experiment={option}")
+    if OmegaConf.is_missing(config.scene, "root"):
+        config.scene.root = "somewhere"
+    assert build(config.model).points_per_ray(training=True) > 0
+    assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+PARTS = ("encoder", "encoder@direction_encoder", "field")
+SAMPLED = {"nerf": ("coarse", "fine"), "fast_proposal": ("proposal", "fine")}
+
+
+def builds_or_is_refused_in_words(*overrides):
+    """Build a model, or be told by one of its parts, in a sentence, what does not fit."""
+    config = composed("train", *overrides)
+    try:
+        reason = None if build(config.model).points_per_ray(training=True) > 0 else "no points"
+    except HydraException as error:
+        reason = error.__cause__
+    assert reason is None or (isinstance(reason, ValueError) and " " in str(reason)), overrides
+
+
+def choices(group):
+    return options(group.partition("@")[0])
+
+
+@pytest.mark.parametrize("model", options("model"))
+def test_a_model_writes_no_size_into_the_parts_that_it_chose(model):
+    """Else whoever chooses another part is told of a setting that it does not have."""
+    yaml = OmegaConf.to_container(loaded("model", model))
+    assert not {"encoder", "direction_encoder", "field"} & yaml.keys()
+    for level in yaml.get("model", {}).get("levels", {}).values():
+        assert level.keys() <= {"_target_", "field"}
+        assert level.get("field", "${field}") == "${field}"
+
+
+@pytest.mark.parametrize("model", options("model"))
+@pytest.mark.parametrize("part", ["encoder=gaussian_fourier", "encoder@direction_encoder=gaussian_fourier"])
+def test_every_model_takes_another_encoder(model, part):
+    assert build(composed("train", f"model={model}", part).model).points_per_ray(training=True) > 0
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [
+        ("nerf", ["field=hash", "encoder=hash_grid"]),
+        ("nerf_tiny", ["field=hash", "encoder=hash_grid_small"]),
+        ("nerf_occupancy", ["field=hash"]),
+        ("fast", ["field=nerf_mlp_small", "encoder=frequency"]),
+        ("fast_proposal", ["field=nerf_mlp_tiny", "encoder=frequency_small"]),
+    ],
+)
+def test_models_take_another_field(model, parts):
+    assert build(composed("train", f"model={model}", *parts).model).points_per_ray(training=True) > 0
+
+
+@pytest.mark.parametrize(
+    ("model", "level", "sampler"),
+    [("nerf", "coarse", "occupancy"), ("fast", "fine", "stratified"), ("fast_dense", "fine", "importance")],
+)
+def test_a_level_refuses_a_sampler_of_another_kind_in_words(model, level, sampler):
+    config = composed("train", f"model={model}", f"sampler@model.levels.{level}.sampler={sampler}")
+    with pytest.raises(HydraException) as refused:
+        build(config.model)
+    assert "choose another sampler, or a model with another level" in str(refused.value.__cause__)
+
+
+@pytest.mark.slow
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("model", options("model"))
+def test_every_part_of_every_model_builds_or_is_refused_in_words(model):
+    for group in PARTS:
+        for option in choices(group):
+            builds_or_is_refused_in_words(f"model={model}", f"{group}={option}")
+    for level in SAMPLED.get(model.partition("_")[0] if model not in SAMPLED else model, ("fine",)):
+        if level in composed("train", f"model={model}").model.levels:
+            for option in options("sampler"):
+                builds_or_is_refused_in_words(f"model={model}", f"sampler@model.levels.{level}.sampler={option}")
+
+
+@pytest.mark.parametrize("option", options("scene"))
+def test_every_scene_reader_builds(option):
+    keys = [key for key in loaded("scene", option) if OmegaConf.is_missing(loaded("scene", option), key)]
+    assert build(composed("train", f"scene={option}", *[f"scene.{key}=somewhere" for key in keys]).scene) is not None
+
+
+@pytest.mark.parametrize("option", [o for o in options("trainer") if o not in ("gpu", "mps", "tpu")])
+def test_every_trainer_builds(option):
+    assert build(composed("train", f"trainer={option}").trainer).max_steps > 0
+
+
+@pytest.mark.parametrize("option", options("what"))
+def test_every_export_builds(option):
+    assert isinstance(build(composed("export", f"what={option}").what), Export)
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view", "selftest"])
+def test_every_command_composes(command):
+    assert "trainer" in composed(command)
+
+
+def targets(node, path=""):
+    if isinstance(node, DictConfig):
+        if "_target_" in node:
+            yield path, node
+        for key in node:
+            if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
+                yield from targets(node[key], f"{path}.{key}")
+
+
+@pytest.mark.parametrize(
+    "group", ["encoder", "field", "sampler", "loss", "scheduler", "scene", "path", "evaluation", "trainer", "what"]
+)
+def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
+    """The signature is the schema: a setting that exists can be seen in the yaml, and no key is read by nobody."""
+    for option in options(group):
+        config = loaded(group, option)
+        if "_target_" not in config:
+            continue
+        target = config["_target_"]
+        try:
+            signature = inspect.signature(get_class(target))
+        except ValueError:
+            signature = inspect.signature(get_method(target))
+        # What its own defaults list chooses, by the key that it goes to.
+        chosen = {key.partition("@")[2] for each in config.get("defaults", []) if each != "_self_" for key in each}
+        assert (set(config) | chosen) - {"_target_", "_partial_", "defaults"} == set(signature.parameters) - {
+            "args",
+            "kwargs",
+        }, f"{group}/{option}"

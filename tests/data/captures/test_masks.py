@@ -1,0 +1,170 @@
+"""Masked pixels: they teach nothing and are not scored, and without masks no number changes by a bit."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import ball_scene, tiny_model
+from support.systems import gradients, make_system
+
+from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.evaluator import Scoring
+from nerf_lightning.evaluation.metrics import image_metrics, masked_out
+from nerf_lightning.evaluation.protocol import split_hash
+from nerf_lightning.nerf.kernels.carving.carve import possible_cells
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.callbacks.collapse_guard import is_constant
+
+
+def masked(scene, keep):
+    """Leave out all pixels whose number, over all views, `keep` does not take."""
+    mask = keep(torch.arange(len(scene.pixels.rgba))).to(torch.uint8)
+    return replace(scene, pixels=replace(scene.pixels, mask=mask))
+
+
+def garbled(scene):
+    """Change the colours of the masked pixels."""
+    rgba = scene.pixels.rgba.clone()
+    rgba[scene.pixels.mask == 0] = torch.tensor([255, 0, 255, 255], dtype=torch.uint8)
+    return replace(scene, pixels=replace(scene.pixels, rgba=rgba))
+
+
+class PlainMean(MeanSquaredError):
+    """The loss without weights."""
+
+    def forward(self, renderings, target, weight):
+        assert float(weight.mean()) == 1.0
+        return [(rendering.rgb - target).square().mean() for rendering in renderings]
+
+
+@pytest.mark.parametrize("tile_points", [None, 100])
+def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(tile_points):
+    model = tiny_model(density_bias=0.5)
+    plain_system = make_system(tile_points, copy.deepcopy(model))
+    plain_system.loss = PlainMean()
+    plain, losses = gradients(plain_system, ball_scene())
+    weighted, weighted_losses = gradients(make_system(tile_points, copy.deepcopy(model)), ball_scene())
+    assert torch.equal(weighted, plain)
+    assert torch.equal(weighted_losses, losses)
+    keep_all = masked(ball_scene(), lambda number: number >= 0)
+    assert torch.equal(gradients(make_system(tile_points, copy.deepcopy(model)), keep_all)[0], plain)
+
+
+def test_the_loss_is_the_mean_over_unmasked_pixels():
+    system, scene = make_system(None), masked(ball_scene(), lambda number: number % 3 > 0)
+    batch = RayBatches(scene, Progress(), 0, 64, 10).at(0, 0)
+    kept = batch.weight > 0
+    assert 0 < int(kept.sum()) < 64
+    seen = system.accumulate_gradients(batch, lambda loss: loss.backward())
+    error = []
+    system.loss.forward = lambda renderings, target, weight: [
+        error.append((r.rgb - target).square()[kept].mean()) or error[-1] for r in renderings
+    ]
+    system.accumulate_gradients(batch, lambda loss: None)
+    torch.testing.assert_close(seen["losses"], torch.stack(error))
+
+
+@pytest.mark.parametrize("tile_points", [16, 100])
+def test_the_normaliser_is_the_batchs_not_the_tiles(tile_points):
+    # Tiles then hold very different numbers of unmasked rays, some none.
+    scene, model = masked(ball_scene(), lambda number: number % 7 == 0), tiny_model(density_bias=0.5)
+    whole, losses = gradients(make_system(None, copy.deepcopy(model)), scene)
+    tiled, tiled_losses = gradients(make_system(tile_points, copy.deepcopy(model)), scene)
+    torch.testing.assert_close(tiled, whole, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(tiled_losses, losses, rtol=1e-5, atol=1e-7)
+    assert float(whole.norm()) > 0
+
+
+def test_the_colours_of_masked_pixels_do_not_matter():
+    scene, model = masked(ball_scene(), lambda number: number % 2 > 0), tiny_model(density_bias=0.5)
+    one, _ = gradients(make_system(None, copy.deepcopy(model)), scene)
+    other, _ = gradients(make_system(None, copy.deepcopy(model)), garbled(scene))
+    assert torch.equal(one, other)
+
+
+def test_a_batch_of_masked_pixels_alone_has_no_gradient():
+    gradient, losses = gradients(make_system(None), masked(ball_scene(), lambda number: number < 0))
+    assert float(gradient.abs().max()) == 0
+    assert losses.tolist() == [0.0, 0.0]
+
+
+def test_gathering_gives_masked_pixels_no_weight():
+    scene = masked(ball_scene(), lambda number: number % 5 > 1)
+    pixels = PixelDomain(scene, scene.splits["train"]).locate(torch.arange(20))
+    assert gather_batch(scene, pixels).weight.tolist() == [float(number % 5 > 1) for number in range(20)]
+    assert gather_batch(ball_scene(), pixels).weight.tolist() == [1.0] * 20
+
+
+def validation_psnr(scene):
+    system = make_system(None)
+    logged = {}
+    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
+    system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
+    system.log = lambda name, value, **options: None
+    with torch.no_grad():
+        for batch in FixedRays(scene, "val", 200, 64):
+            system.validation_step(batch, 0)
+        system.on_validation_epoch_end()
+    return logged["val/psnr"]
+
+
+def test_validation_looks_at_unmasked_pixels():
+    scene = masked(ball_scene(), lambda number: number % 2 > 0)
+    assert validation_psnr(scene) == validation_psnr(garbled(scene)) != validation_psnr(ball_scene())
+
+
+def test_a_validation_subset_without_unmasked_pixels_is_refused():
+    scene = masked(ball_scene(), lambda number: number < 3 * 144)  # the training views
+    with pytest.raises(InputError, match=r"masks of ball leave out all 50 pixels.* Raise data.val_rays"):
+        FixedRays(scene, "val", 50, 20)
+    FixedRays(scene, "train", 50, 20)
+    FixedRays(masked(ball_scene(), lambda number: number == 3 * 144), "val", 10**6, 20)
+
+
+def test_masked_rays_do_not_tell_the_guard_that_the_run_lives():
+    kept = torch.arange(64) % 2 == 0
+    light = torch.where(kept[:, None], 0.0, torch.rand(64, 3))
+    step = {"target": torch.rand(64, 3), "foreground": light}
+    assert is_constant(step | {"weight": kept.float()}, 0.02)
+    assert not is_constant(step | {"weight": torch.ones(64)}, 0.02)
+    assert not is_constant(step | {"weight": torch.zeros(64)}, 0.02)
+
+
+def test_psnr_is_that_of_unmasked_pixels_and_ssim_sees_no_other_difference():
+    truth = torch.rand(16, 16, 3)
+    kept = torch.zeros(16, 16, dtype=torch.bool)
+    kept[:, :4] = True
+    render = truth + torch.where(kept[..., None], 0.0, 0.9)
+    assert image_metrics(render, truth, kept) == {"psnr": pytest.approx(100.0), "ssim": pytest.approx(1.0)}
+    truth = torch.full((16, 16, 3), 0.3)
+    off = truth + 0.1
+    assert image_metrics(off, truth, kept)["psnr"] == pytest.approx(20.0, abs=1e-3)
+    noisy = truth + 0.2 * torch.rand(16, 16, 3)
+    assert image_metrics(noisy, truth, kept)["ssim"] > image_metrics(noisy, truth)["ssim"]
+    assert image_metrics(off, truth, torch.ones_like(kept)) == image_metrics(off, truth)
+    assert masked_out(off, truth, None) is off
+
+
+def test_scores_leave_masked_pixels_out_and_say_so(tmp_path):
+    model = tiny_model(density_bias=0.5).eval()
+    scene = masked(ball_scene(), lambda number: number % 2 > 0)
+    scoring = Scoring(num_pictures=0)
+    results = [scoring.score(model, each, "white", 1000, tmp_path) for each in (scene, garbled(scene), ball_scene())]
+    assert results[0]["psnr"] == results[1]["psnr"] != results[2]["psnr"]
+    assert results[0]["protocol"]["masks"] == "left out"
+    assert results[2]["protocol"]["masks"] == "none"
+    views = [3, 4]
+    assert split_hash(scene, views) != split_hash(ball_scene(), views)
+
+
+def test_what_is_masked_carves_nothing(generator):
+    scene = ball_scene(num_views=8, size=24)
+    opaque = replace(scene, pixels=replace(scene.pixels, has_transparency=False))
+    centers = 1.2 * torch.rand(500, 3, generator=generator) - 0.6
+    centers[:, 2] += 0.8
+    seen = possible_cells(opaque, centers, 0.05)
+    assert torch.equal(possible_cells(masked(scene, lambda number: number < 0), centers, 0.05), seen)
+    assert int(possible_cells(scene, centers, 0.05).sum()) < int(seen.sum())

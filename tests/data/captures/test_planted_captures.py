@@ -1,0 +1,394 @@
+"""Captures from strangers: nothing outside their folder is read, and nothing in them is larger than it looks."""
+
+import io
+import json
+import struct
+import sys
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.captures import npz_content, write_blender, write_npz
+from support.malformed import MODEL, WRITERS, edit_bytes, edit_frame, edit_json
+from support.planted import Payload, peak_of
+from support.posed_captures import read
+
+from nerf_lightning.data.bricks.cache import Rendered, cached
+from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.errors import InputError
+from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.video_frames import count_frames
+
+MEGABYTE = 2**20
+OUT = r"leads to \S+secret\S*, outside of the capture's folder .*scene.allow_outside=true"
+NAMES = {"llff": "llff", "colmap": "colmap", "text": "colmap", "transforms": "transforms"}
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A picture, and what else a capture would like to read, beside the capture's folder."""
+    (tmp_path / "secret").mkdir()
+    Image.fromarray(np.full((12, 16, 3), 200, np.uint8)).save(tmp_path / "secret" / "p_3.png")
+    return tmp_path / "secret"
+
+
+def move_out(path, secret):
+    """Put a link in the place of a file or folder, which is moved beside the capture."""
+    path.rename(secret / path.name)
+    path.symlink_to(secret / path.name)
+
+
+def refused_until_allowed(kind, root, message=OUT):
+    with pytest.raises(InputError, match=message):
+        read(NAMES[kind], root)
+    assert not (root.parent / "cache").exists()
+    assert len(read(NAMES[kind], root, allow_outside=True).view_names) == 9
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("place", ["images", "images/p_3.png"])
+def test_links_out_of_a_capture(tmp_path, secret, kind, place):
+    root = WRITERS[kind](tmp_path / "capture")
+    (secret / "p_3.png").unlink()
+    move_out(root / place, secret)
+    refused_until_allowed(kind, root)
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    [
+        ("llff", "poses_bounds.npy"),
+        ("colmap", "sparse"),
+        ("colmap", "sparse/0"),
+        ("colmap", "sparse/0/images.bin"),
+        ("text", "sparse/0/cameras.txt"),
+        ("transforms", "transforms.json"),
+    ],
+)
+def test_links_in_the_place_of_a_captures_own_files(tmp_path, secret, kind, place):
+    root = WRITERS[kind](tmp_path / "capture")
+    move_out(root / place, secret)
+    refused_until_allowed(kind, root)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_capture_that_is_a_link_itself_and_links_inside_of_it(tmp_path, kind):
+    root = WRITERS[kind](tmp_path / "capture")
+    (root / "images").rename(root / "photos")
+    (root / "images").symlink_to("photos")
+    (tmp_path / "link").symlink_to(root)
+    assert len(read(NAMES[kind], tmp_path / "link").view_names) == 9
+
+
+def test_a_folder_of_photographs_that_the_user_names(tmp_path, secret):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    (root / "images").rename(secret / "images")
+    for name in ("../secret/images", str(secret / "images")):
+        assert len(read("colmap", root, images=name).view_names) == 9
+
+
+@pytest.mark.parametrize("name", ["../secret/p_3.png", "images/../../secret/p_3", "..\\secret\\p_3.png", "ABSOLUTE"])
+def test_paths_out_of_a_transforms_file(tmp_path, secret, name):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    edit_frame(root, 3, file_path=name.replace("ABSOLUTE", str(secret / "p_3.png")))
+    refused_until_allowed("transforms", root)
+
+
+@pytest.mark.parametrize("name", ["../secret/p_3.png", "ABSOLUTE"])
+def test_masks_out_of_a_transforms_file(tmp_path, secret, name):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    edit_frame(root, 3, mask_path=name.replace("ABSOLUTE", str(secret / "p_3.png")))
+    refused_until_allowed("transforms", root)
+
+
+def test_masks_that_are_links(tmp_path, secret):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    (root / "masks").mkdir()
+    for view in range(9):
+        (root / "masks" / f"p_{view}.png").symlink_to(secret / "p_3.png")
+    with pytest.raises(InputError, match=OUT):
+        read("colmap", root, masks="masks")
+    (secret / "masks").mkdir()
+    for view in range(9):
+        Image.fromarray(np.full((12, 16), 255, np.uint8)).save(secret / "masks" / f"p_{view}.png")
+    assert read("colmap", root, masks="../secret/masks").pixels.mask is not None
+
+
+@pytest.mark.parametrize("name", ["../../secret/p_3.png", "ABSOLUTE"])
+@pytest.mark.parametrize("kind", ["colmap", "text"])
+def test_names_out_of_a_colmap_model(tmp_path, secret, kind, name):
+    root = WRITERS[kind](tmp_path / "capture")
+    name = name.replace("ABSOLUTE", str(secret / "p_3.png"))
+    edit_bytes(root, "images.bin" if kind == "colmap" else "images.txt", b"p_3.png", name.encode())
+    refused_until_allowed(kind, root)
+
+
+@pytest.mark.parametrize("name", ["../secret/p_3", "ABSOLUTE"])
+def test_paths_out_of_a_blender_file(tmp_path, secret, name):
+    root = tmp_path / "capture"
+    write_blender(root, {"train": 9, "val": 2, "test": 2}, width=16, height=12)
+    path = root / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"][3]["file_path"] = name.replace("ABSOLUTE", str(secret / "p_3"))
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=OUT):
+        BlenderReader(str(root)).read()
+    assert len(BlenderReader(str(root), allow_outside=True).read().view_names) == 13
+
+
+@pytest.mark.parametrize("name", ["a\0b.png", "\ud800.png", "x" * 5000, "/dev/zero", "/proc/self/environ", "."])
+def test_names_that_are_none(tmp_path, name):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    edit_frame(root, 3, file_path=name)
+    with pytest.raises(InputError):
+        read("transforms", root)
+
+
+def test_links_in_a_folder_of_photographs(tmp_path, secret):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for view in range(3):
+        Image.fromarray(np.zeros((80, 90, 3), np.uint8)).save(folder / f"{view}.png")
+    Image.fromarray(np.zeros((80, 90, 3), np.uint8)).save(secret / "mine.png")
+    (folder / "3.png").symlink_to(secret / "mine.png")
+    with pytest.raises(InputError, match=r"3.png are symbolic links out of this folder.*allow_outside=true"):
+        find_photographs(folder)
+    assert len(find_photographs(folder, allow_outside=True)) == 4
+    (tmp_path / "link").symlink_to(folder)
+    (folder / "3.png").unlink()
+    assert len(find_photographs(tmp_path / "link")) == 3
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile:///etc/passwd\n#EXT-X-ENDLIST\n",
+        "ffconcat version 1.0\nfile /etc/passwd\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\n",
+        "<?xml version='1.0'?><MPD><BaseURL>file:///etc/passwd</BaseURL></MPD>",
+        "",
+    ],
+)
+def test_playlists_that_are_called_videos(tmp_path, text):
+    (tmp_path / "a.mp4").write_text(text)
+    with pytest.raises(InputError, match=r"a.mp4 is not a video that is read here.*not followed"):
+        count_frames(tmp_path / "a.mp4")
+
+
+def test_pickles_in_arrays(tmp_path):
+    mark = tmp_path / "ran"
+    evil = np.array([Payload(open, str(mark), "w")], dtype=object)
+    for key in ("images", "poses", "focal"):
+        with pytest.raises(InputError, match=r"not a numpy .npz archive, or is damaged: Object arrays cannot be"):
+            NpzReader(str(write_npz(tmp_path / "a.npz", **{key: evil}))).read()
+    root = WRITERS["llff"](tmp_path / "capture")
+    np.save(root / "poses_bounds.npy", evil, allow_pickle=True)
+    with pytest.raises(InputError, match="Object arrays cannot be loaded"):
+        read("llff", root)
+    np.savez(tmp_path / "cache.npz", rgba=evil, depth=evil, normals=evil)
+    sound = Rendered(np.zeros((1, 4), np.uint8), np.zeros(1, np.float32), np.zeros((1, 3), np.float32))
+    assert cached(tmp_path / "cache.npz", 1, lambda: sound) is sound
+    assert not mark.exists()
+
+
+def test_what_an_archive_may_unpack_to_is_a_setting(tmp_path):
+    path = write_npz(tmp_path / "a.npz")
+    with pytest.raises(
+        InputError, match=r"a.npz .* unpacks to 0.00 GB, and 1e-06 GB are allowed.*scene.max_gigabytes=N"
+    ):
+        NpzReader(str(path), max_gigabytes=1e-6).read()
+    assert NpzReader(str(path), max_gigabytes=1e-3).read().view_names
+
+
+def npy(shape, dtype="<f4"):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def zip_bomb(path, header, size, key="images"):
+    """Write an archive with one array of a header and that many zeros."""
+    np.savez(path, **{name: array for name, array in npz_content().items() if name != key})
+    with (
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(f"{key}.npy", "w", force_zip64=True) as file,
+    ):
+        file.write(header)
+        for _ in range(size // MEGABYTE):
+            file.write(bytes(MEGABYTE))
+    return path
+
+
+def png(width, height):
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    )
+
+
+def bombs(tmp_path):
+    """Small files that ask for much memory: the arguments of `read`, and words of the refusal."""
+    zip_bomb(tmp_path / "large.npz", npy((100, 1024, 1024, 1), "|u1"), 100 * MEGABYTE)
+    zip_bomb(tmp_path / "lying.npz", npy((10**6, 800, 800, 3)), 10 * MEGABYTE)
+    zip_bomb(tmp_path / "focal.npz", npy((10**9,)), 10 * MEGABYTE, key="focal")
+    yield "npz", tmp_path / "large.npz", "unpacks to 0.10 GB"
+    yield "npz", tmp_path / "lying.npz", "its header announces"
+    yield "npz", tmp_path / "focal.npz", "its header announces"
+    root = WRITERS["llff"](tmp_path / "llff")
+    (root / "poses_bounds.npy").write_bytes(npy((10**10, 17)) + bytes(136))
+    yield "llff", root, "its header announces"
+    for side in (60_000, 2**31 - 1):
+        root = WRITERS["colmap"](tmp_path / f"png{side}")
+        (root / "images" / "p_3.png").write_bytes(png(side, side))
+        yield "colmap", root, "more than 178 megapixels|cannot be read"
+    root = WRITERS["colmap"](tmp_path / "tiff")
+    tags = [(256, 60_000), (257, 60_000), (258, 8), (259, 1), (262, 1), (273, 8), (278, 60_000), (279, 10)]
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    (root / "images" / "p_3.png").write_bytes(b"II*\0\x08\0\0\0" + struct.pack("<H", len(tags)) + entries + bytes(4))
+    yield "colmap", root, "more than 178 megapixels"
+    for name, most in (("cameras", 2**63), ("images", 10**12), ("points3D", 10**12)):
+        root = WRITERS["colmap"](tmp_path / name)
+        path = root / MODEL / f"{name}.bin"
+        path.write_bytes(struct.pack("<Q", most) + path.read_bytes()[8:])
+        yield "colmap", root, "in the middle of what it announces"
+    root = WRITERS["colmap"](tmp_path / "sparse")
+    with (root / MODEL / "points3D.bin").open("r+b") as file:
+        file.truncate(50_000_000_000)
+    yield "colmap", root, "goes on for"
+    root = WRITERS["text"](tmp_path / "line")
+    with (root / MODEL / "images.txt").open("r+b") as file:
+        file.truncate(20_000_000_000)
+    yield "colmap", root, "has more than 16,777,216 characters"
+    root = WRITERS["text"](tmp_path / "lines")
+    (root / MODEL / "points3D.txt").write_bytes(b"\n" * 4 * MEGABYTE + b"1 x\n")
+    yield "colmap", root, "should hold 3 numbers"
+    for name, text in (("deep", "[" * 10**6), ("nested", '{"frames": ' + "[" * 500 + "]" * 500 + "}")):
+        root = WRITERS["transforms"](tmp_path / name)
+        (root / "transforms.json").write_text(text)
+        yield "transforms", root, "nests its brackets too deeply"
+    root = WRITERS["transforms"](tmp_path / "long")
+    with (root / "transforms.json").open("r+b") as file:
+        file.truncate(20_000_000_000)
+    yield "transforms", root, "more than 67,108,864 are not read here"
+
+
+READ = """
+import json, re
+from pathlib import Path
+sys.path.insert(0, "tests")
+from support.posed_captures import read
+from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.errors import InputError
+kinds, good = json.load(open(sys.argv[1])), sys.argv[2]
+read("colmap", Path(good))
+# begin
+for kind, place, words in kinds:
+    try:
+        NpzReader(place, max_gigabytes=0.1).read() if kind == "npz" else read(kind, Path(place))
+        print(place, "was read")
+    except InputError as error:
+        if not re.search(words, str(error)):
+            print(place, words, str(error)[:300])
+    if peak() - start > 120 * 2**20:
+        print(place, "took", peak() - start)
+        start = peak()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.slow
+def test_bombs_stay_small(tmp_path):
+    listed = tmp_path / "bombs.json"
+    listed.write_text(json.dumps([(kind, str(place), words) for kind, place, words in bombs(tmp_path)]))
+    grown, lines = peak_of(READ, listed, WRITERS["colmap"](tmp_path / "good"))
+    assert lines == []
+    assert grown < 120 * MEGABYTE
+
+
+def test_many_frames_of_one_picture_are_counted(tmp_path):
+    """A picture of 100 megapixels is small on the disk, and a json may name it a thousand times."""
+    root = tmp_path / "capture"
+    write_blender(root, {"train": 2, "val": 1, "test": 1})
+    Image.new("1", (10_000, 10_000)).save(root / "big.png")
+    for split in ("train", "val", "test"):
+        path = root / f"transforms_{split}.json"
+        content = json.loads(path.read_text())
+        frame, up = content["frames"][0], "train/../"
+        content["frames"] = [frame | {"file_path": f"{number * up}big"} for number in range(300)]
+        path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"900 pictures of 90,000 megapixels in all need 360.0 GB of memory"):
+        BlenderReader(str(root)).read()
+
+
+def headers(folder):
+    return list(folder.glob("*.json"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sizes": [[-16, -12]] * 9},
+        {"sizes": [[2**40, 2**40]]},
+        {"sizes": [[16.0, 12.0]] * 9},
+        {"sizes": "x"},
+        {"masked": "yes"},
+        {"spots": None},
+    ],
+    ids=str,
+)
+def test_a_planted_cache_is_not_believed(tmp_path, change):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    before = read("colmap", root).pixels
+    (header,) = headers(tmp_path / "cache")
+    header.write_text(json.dumps(json.loads(header.read_text()) | change))
+    pixels = read("colmap", root).pixels
+    assert pixels.width.tolist() == before.width.tolist()
+    assert bool((pixels.view(3) == before.view(3)).all())
+
+
+def test_a_cache_of_other_photographs_is_refused(tmp_path):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    read("colmap", root)
+    (header,) = headers(tmp_path / "cache")
+    header.write_text(json.dumps(json.loads(header.read_text()) | {"sizes": [[144, 12]]}))
+    with pytest.raises(InputError, match=r"holds 1 photographs where 9 belong.*Remove"):
+        read("colmap", root)
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    read("colmap", root)
+    (header,) = headers(tmp_path / "cache")
+    header.unlink()
+    (tmp_path / "victim").write_text("precious")
+    lock = header.with_suffix(".lock")
+    lock.unlink(missing_ok=True)
+    lock.symlink_to(tmp_path / "victim")
+    with pytest.raises(InputError, match="cannot be kept in"):
+        read("colmap", root)
+    assert (tmp_path / "victim").read_text() == "precious"
+
+
+def test_parts_that_are_links_are_not_written_through(tmp_path):
+    root = WRITERS["colmap"](tmp_path / "capture")
+    read("colmap", root)
+    (header,) = headers(tmp_path / "cache")
+    header.unlink()
+    (tmp_path / "victim").write_text("precious")
+    for ending in (".part", ".json.part"):
+        header.with_suffix(ending).symlink_to(tmp_path / "victim")
+    assert len(read("colmap", root).view_names) == 9
+    assert (tmp_path / "victim").read_text() == "precious"
+
+
+def test_a_json_that_is_edited_keeps_its_meaning(tmp_path):
+    """The bounds on depth are far from what captures have."""
+    root = WRITERS["transforms"](tmp_path / "capture")
+    edit_json(root, lambda content: content | {"notes": [[[[{"a": [1]}]]]]})
+    assert len(read("transforms", root).view_names) == 9

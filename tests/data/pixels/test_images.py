@@ -1,0 +1,225 @@
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.budget import budget
+from support.captures import picture
+
+from nerf_lightning.data.pixels.images import (
+    area_downscale,
+    crop_to_multiple,
+    downscaled_size,
+    image_size,
+    read_mask,
+    read_rgba,
+    whole_blocks,
+)
+from nerf_lightning.errors import InputError
+
+
+def slow_downscale(rgba, factor):
+    """Average premultiplied colour block by block, in floating point."""
+    height, width = rgba.shape[0] // factor, rgba.shape[1] // factor
+    out = np.zeros((height, width, 4), dtype=np.uint8)
+    for y in range(height):
+        for x in range(width):
+            block = rgba[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor].reshape(-1, 4)
+            colour, alpha = np.zeros(3), 0.0
+            for pixel in block.astype(np.float64):
+                colour += pixel[:3] * pixel[3] / factor**2
+                alpha += pixel[3] / factor**2
+            if np.floor(alpha + 0.5) > 0:
+                out[y, x] = np.floor(np.array([*(colour / alpha), alpha]) + 0.5 + 1e-9)
+    return out
+
+
+def png_16_bit(values):
+    """Return a 16-bit RGB png of one row, which PIL cannot write."""
+
+    def chunk(kind, content):
+        check = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    header = struct.pack(">IIBBBBB", len(values), 1, 16, 2, 0, 0, 0)
+    row = b"\0" + b"".join(struct.pack(">3H", *value) for value in values)
+    chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(row)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 6])
+def test_area_filter_equals_the_slow_loop(factor):
+    rgba = picture(1, width=18, height=12)
+    rgba[:6, :6, 3] = 0
+    rgba[0, 0] = (250, 120, 3, 1)
+    expected = rgba if factor == 1 else slow_downscale(rgba, factor)
+    assert np.array_equal(area_downscale(rgba, factor), expected)
+
+
+def test_transparent_neighbours_do_not_darken_an_edge():
+    rgba = np.array([[[200, 100, 50, 255], [0, 0, 0, 0]]] * 2, dtype=np.uint8)
+    assert area_downscale(rgba, 2).tolist() == [[[200, 100, 50, 128]]]
+
+
+def test_colour_is_zero_where_alpha_is():
+    rgba = np.full((2, 2, 4), [90, 80, 70, 0], dtype=np.uint8)
+    rgba[0, 0, 3] = 1
+    assert area_downscale(rgba, 2).tolist() == [[[0, 0, 0, 0]]]
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
+def test_modes_with_a_plain_reading(tmp_path, mode):
+    path = tmp_path / "a.png"
+    image = Image.fromarray(picture(2)).convert("RGB" if mode == "P" else "RGBA").convert(mode)
+    image.save(path)
+    rgba = read_rgba(path)
+    assert np.array_equal(rgba, np.asarray(image.convert("RGBA")))
+    if mode not in ("LA", "RGBA"):
+        assert rgba[..., 3].min() == 255
+
+
+def test_palette_with_transparency(tmp_path):
+    image = Image.new("P", (2, 1))
+    image.putpalette([10, 20, 30, 40, 50, 60])
+    image.putpixel((1, 0), 1)
+    image.save(tmp_path / "a.png", transparency=1)
+    assert read_rgba(tmp_path / "a.png").tolist() == [[[10, 20, 30, 255], [40, 50, 60, 0]]]
+
+
+def test_sixteen_bit_colour_keeps_the_upper_byte(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_16_bit([(0, 257 * 128, 65535), (257, 513, 255)]))
+    assert read_rgba(tmp_path / "a.png").tolist() == [[[0, 128, 255, 255], [1, 2, 0, 255]]]
+
+
+def test_sixteen_bit_grey_keeps_the_upper_byte(tmp_path):
+    values = np.array([[0, 255, 256, 257 * 128, 65535]], dtype=np.uint16)
+    Image.fromarray(values).save(tmp_path / "a.png")
+    assert read_rgba(tmp_path / "a.png")[0].tolist() == [[v, v, v, 255] for v in (0, 0, 1, 128, 255)]
+
+
+def test_refuses_floating_point_by_name(tmp_path):
+    Image.fromarray(np.full((2, 2), 0.5, dtype=np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(InputError, match=r"a.tif has the pixel mode 'F'.* Save it as an 8-bit RGB or RGBA PNG"):
+        image_size(tmp_path / "a.tif")
+
+
+def test_refuses_cmyk_by_name(tmp_path):
+    Image.new("CMYK", (4, 4)).save(tmp_path / "a.jpg")
+    with pytest.raises(InputError, match=r"a.jpg has CMYK colours.* `magick a.jpg -colorspace sRGB a.png`"):
+        image_size(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("ending", ["webp", "png", "tif"])
+def test_refuses_files_of_several_pictures(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    pages = [Image.fromarray(picture(view)[..., :3]) for view in range(3)]
+    pages[0].save(path, save_all=True, append_images=pages[1:])
+    with pytest.raises(InputError, match=rf"a.{ending} holds 3 pictures.* Save each as a file of its own"):
+        image_size(path)
+
+
+def test_the_preview_that_a_phone_appends_to_its_jpeg_is_no_second_picture(tmp_path):
+    first, second = (Image.fromarray(picture(view)[..., :3]) for view in range(2))
+    first.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[second])
+    first.save(tmp_path / "b.jpg")
+    with Image.open(tmp_path / "a.jpg") as image:
+        assert image.n_frames == 2
+    assert np.array_equal(read_rgba(tmp_path / "a.jpg"), read_rgba(tmp_path / "b.jpg"))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_webp(tmp_path, mode):
+    image = Image.fromarray(picture(3)).convert(mode)
+    image.save(tmp_path / "a.webp", lossless=True, exact=True)
+    assert image_size(tmp_path / "a.webp") == (8, 8)
+    assert np.array_equal(read_rgba(tmp_path / "a.webp"), np.asarray(image.convert("RGBA")))
+
+
+def test_refuses_a_picture_without_pixels(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_16_bit([]))
+    with pytest.raises(InputError, match=r"a.png is not an image that can be read"):
+        image_size(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "webp", "tif"])
+def test_a_truncated_file_is_named(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    Image.fromarray(picture(0, 64, 64)[..., :3]).save(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(InputError, match=rf"a.{ending} (cannot be read|is not an image).* Copy or render it again"):
+        read_rgba(path)
+
+
+def test_a_mask_keeps_what_is_brighter_than_127(tmp_path):
+    Image.fromarray(np.array([[0, 1, 127, 128, 255]], dtype=np.uint8)).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png").tolist() == [[False, False, False, True, True]]
+    Image.fromarray(np.array([[True, False]])).save(tmp_path / "one_bit.png")
+    assert read_mask(tmp_path / "one_bit.png").tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize("pixel", [(255, 255, 254, 255), (255, 0, 255, 255), (9, 9, 9, 0)])
+def test_a_mask_with_colour_or_alpha_is_refused(tmp_path, pixel):
+    Image.new("RGBA", (2, 2), pixel).save(tmp_path / "m.png")
+    with pytest.raises(InputError, match=r"mask .*m.png has colours or transparent pixels.* white is kept"):
+        read_mask(tmp_path / "m.png")
+
+
+def test_a_factor_that_does_not_divide_crops_right_and_bottom():
+    rgba = picture(4, width=11, height=8)
+    assert downscaled_size(11, 8, 3) == (3, 2)
+    assert np.array_equal(area_downscale(crop_to_multiple(rgba, 3), 3), slow_downscale(rgba[:6, :9], 3))
+    with pytest.raises(InputError, match=r"scene.downscale=9 leaves nothing of a photograph of 11 x 8.* from 1 to 8"):
+        downscaled_size(11, 8, 9)
+
+
+def test_a_block_is_kept_if_all_of_it_is():
+    kept = np.ones((5, 7), dtype=bool)
+    kept[0, 3] = kept[4, 6] = False
+    assert whole_blocks(kept, 2).tolist() == [[True, False, True], [True, True, True]]
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "webp"])
+def test_refuses_pictures_that_are_stored_turned(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(picture(0)[..., :3]).save(path, exif=exif)
+    with pytest.raises(
+        InputError, match=rf"a.{ending} carries the EXIF orientation 6.* remove the tag alone .* turn the pixels"
+    ):
+        read_rgba(path)
+
+
+def test_refuses_formats_that_start_other_programs(tmp_path):
+    Image.fromarray(picture(0)[..., :3]).save(tmp_path / "a.eps")
+    with pytest.raises(InputError, match=r"a.eps is not an image that can be read"):
+        image_size(tmp_path / "a.eps")
+
+
+def test_refuses_decompression_bombs(tmp_path):
+    Image.new("1", (1200, 1000)).save(tmp_path / "a.png")
+    assert image_size(tmp_path / "a.png") == (1200, 1000)
+    with budget(megapixels=1), pytest.raises(InputError, match=r"announces more than 1 megapixels; .*budgets.megapix"):
+        image_size(tmp_path / "a.png")
+
+
+def test_size_is_width_then_height(tmp_path):
+    Image.fromarray(picture(0, width=5, height=3)).save(tmp_path / "a.png")
+    assert image_size(tmp_path / "a.png") == (5, 3)
+
+
+def test_absent_file(tmp_path):
+    with pytest.raises(InputError, match=r"a.png cannot be read: .*No such file"):
+        read_rgba(tmp_path / "a.png")
+
+
+def test_a_page_without_a_size_is_damage(tmp_path):
+    Image.fromarray(picture(0)[..., :3]).save(tmp_path / "a.tif")
+    content = (tmp_path / "a.tif").read_bytes()
+    (first,) = struct.unpack_from("<I", content, 4)
+    (tags,) = struct.unpack_from("<H", content, first)
+    end = first + 2 + 12 * tags
+    (tmp_path / "a.tif").write_bytes(content[:end] + struct.pack("<I", len(content)) + content[end + 4 :] + bytes(6))
+    with pytest.raises(InputError, match=r"a.tif cannot be read: Missing dimensions. It is damaged"):
+        image_size(tmp_path / "a.tif")

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+import torch
+from support.captures import npz_content, picture, pose, real_capture, write_npz
+
+from nerf_lightning.data.pixels.images import area_downscale
+from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import project
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write_npz(tmp_path / "toy.npz")
+
+
+def refused(path, message, **settings):
+    with pytest.raises(InputError, match=message):
+        NpzReader(str(path), **settings).read()
+
+
+def test_reads_pictures_poses_and_focal(path):
+    scene = NpzReader(str(path), name="toy").read()
+    assert scene.splits == {"train": tuple(range(8)), "val": (8, 9), "test": (8, 9)}
+    assert np.array_equal(scene.pixels.view(3)[..., :3].numpy(), picture(3, 6, 4)[..., :3])
+    assert scene.pixels.rgba[:, 3].min() == 255
+    assert torch.allclose(scene.cameras.c2w[2], torch.tensor(pose(2))[:3])
+    assert scene.cameras.focal.unique().tolist() == [7.5]
+    assert (scene.cameras.width[0], scene.cameras.height[0]) == (6, 4)
+    assert (scene.name, scene.background, scene.truth) == ("toy", "black", None)
+    assert scene.view_names[9] == "9"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float16, np.float64])
+def test_reads_colours_of_other_types(path, dtype):
+    images = npz_content()["images"]
+    changed = np.rint(images * 255).astype(dtype) if dtype == np.uint8 else images.astype(dtype)
+    pixels = NpzReader(str(write_npz(path, images=changed))).read().pixels
+    assert np.array_equal(pixels.view(3)[..., :3].numpy(), picture(3, 6, 4)[..., :3])
+
+
+def test_colours_are_rounded_not_cut(path):
+    write_npz(path, images=np.full((10, 2, 2, 3), 0.4999, dtype=np.float32))
+    assert NpzReader(str(path)).read().pixels.rgba[0].tolist() == [127, 127, 127, 255]
+    write_npz(path, images=np.full((10, 2, 2, 3), 0.4978, dtype=np.float32))
+    assert NpzReader(str(path)).read().pixels.rgba[0].tolist() == [127, 127, 127, 255]
+
+
+def test_every_kth_view_is_held_out(path):
+    scene = NpzReader(str(path), hold_every=4).read()
+    assert scene.splits == {"train": (1, 2, 3, 5, 6, 7, 9), "val": (0, 4, 8), "test": (0, 4, 8)}
+
+
+def test_downscale_moves_every_projected_point_with_the_pixels(path):
+    full, small = (NpzReader(str(path), downscale=factor).read() for factor in (1, 2))
+    point = torch.tensor([0.4, -0.3, 0.2])
+    assert torch.allclose(project(small.cameras, 1, point), project(full.cameras, 1, point) / 2)
+    assert np.array_equal(small.pixels.view(5).numpy(), area_downscale(full.pixels.view(5).numpy(), 2))
+    assert small.protocol == {"downscale": "2", "filter": "area", "test_views": "after the first 80%"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"downscale": -1}, r"scene.downscale is -1, but it must be 1"),
+        ({"downscale": 4}, r"downscale=4 does not divide .* 6 x 4 pixels. Choose one of 1, 2\."),
+        ({"near": 7.0}, r"scene.near is 7.0 and scene.far is 6.0"),
+        ({"background": "grey"}, r"scene.background is 'grey'"),
+        ({"hold_every": -2}, r"scene.hold_every is -2, but it must be 0"),
+        ({"hold_every": 1}, r"leaves 0 to learn from and 10 to judge by"),
+        ({"train_fraction": 1.0}, r"leaves 10 to learn from and 0 to judge by"),
+        ({"aabb_half": -1.0}, r"scene.aabb_half is -1.0"),
+    ],
+)
+def test_refuses_settings(path, settings, message):
+    refused(path, message, **settings)
+
+
+ONE_NAN = npz_content()["images"]
+ONE_NAN[2, 0, 0, 0] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"focal": None, "poses": None},
+            r"toy.npz lacks poses, focal; it has images. It needs images \(n, h",
+        ),
+        ({"poses": np.zeros((9, 4, 4))}, r"has 10 images but 9 poses; there must be one pose per image"),
+        ({"poses": np.array(1.0)}, r"has 10 images but 1 poses"),
+        ({"poses": np.zeros((10, 4, 4))}, r"toy.npz: poses\[0\] is not a camera pose"),
+        ({"poses": np.zeros((10, 3, 4))}, r"poses\[0\] must be a 4 x 4 matrix, but it is 3 x 4"),
+        ({"poses": np.full((10, 4, 4), np.nan)}, r"poses\[0\] holds NaN"),
+        ({"poses": np.full((10, 4, 4), "a")}, r"poses\[0\] is not a 4 x 4 matrix of numbers"),
+        ({"images": np.zeros((10, 4, 6, 4))}, r"images has the shape \(10, 4, 6, 4\). It needs"),
+        ({"images": np.zeros((10, 4, 6, 3), dtype=np.int64)}, r"images has the type int64, but it must be"),
+        (
+            {"images": np.full((10, 4, 6, 3), 200.0)},
+            r"images\[0\] has values outside 0..1 or NaN. Divide 0..255",
+        ),
+        ({"images": ONE_NAN}, r"images\[2\] has values outside 0..1 or NaN"),
+        ({"focal": np.array([1.0, 2.0])}, r"focal must be one number above 0, from 0.001 to"),
+        ({"focal": np.array(-1.0)}, r"focal must be one number above 0"),
+        ({"focal": np.array("far")}, r"focal must be one number above 0"),
+        ({"focal": np.array({"a": 1})}, r"is not a numpy .npz archive, or is damaged: Object arrays"),
+    ],
+)
+def test_refuses_content(path, changed, message):
+    refused(write_npz(path, **changed), message)
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 cut short"])
+def test_refuses_files_that_are_no_npz(tmp_path, content):
+    (tmp_path / "a.npz").write_bytes(content)
+    refused(tmp_path / "a.npz", r"a.npz is not a numpy .npz archive, or is damaged: .*Remove it, and copy")
+
+
+def test_refuses_a_cut_npz(path):
+    path.write_bytes(path.read_bytes()[:2000])
+    refused(path, r"toy.npz is not a numpy .npz archive, or is damaged")
+
+
+def test_refuses_a_single_array(tmp_path):
+    with (tmp_path / "a.npz").open("wb") as file:
+        np.save(file, np.zeros(3))
+    refused(tmp_path / "a.npz", r"is not a numpy .npz archive: it holds a single array. It needs images")
+
+
+def test_refuses_an_absent_file(tmp_path):
+    refused(tmp_path / "a.npz", r"The file \S+a.npz does not exist. Set scene.path")
+
+
+@pytest.mark.data
+def test_reads_the_tiny_lego():
+    scene = NpzReader(str(real_capture("lego_tiny") / "tiny_nerf_data.npz")).read()
+    assert len(scene.view_names) == 106
+    assert scene.splits["train"] == tuple(range(84))
+    assert scene.splits["val"] == scene.splits["test"] == tuple(range(84, 106))
+    assert scene.cameras.focal[0].tolist() == pytest.approx([138.888] * 2, abs=1e-3)
+    assert scene.pixels.rgba.shape == (106 * 100 * 100, 4)

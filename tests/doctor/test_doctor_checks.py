@@ -1,0 +1,201 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from support.captures import real_capture
+from support.doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
+from support.scenes import ball_scene
+
+from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.llff import LlffReader
+from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.doctor.examine import examine, gather_evidence
+from nerf_lightning.doctor.view_statistics import sharpness_of
+
+
+def judged(evidence, name, verdict, *fragments):
+    check = but_poses(evidence)[name]
+    assert check.verdict == verdict, check
+    for fragment in fragments:
+        assert fragment in check.message + " " + check.cure
+    return check
+
+
+def smeared(picture, radius=4):
+    soft = torch.nn.functional.avg_pool2d(picture[..., :3].float().permute(2, 0, 1), 2 * radius + 1, 1, radius)
+    picture[..., :3] = soft.permute(1, 2, 0).to(torch.uint8)
+
+
+def test_a_blurred_photograph_is_named():
+    def blur(rgba):
+        smeared(rgba[7])
+        return rgba
+
+    judged(with_pictures(blur), "sharpness", "look", "view 7.png", "1 of 12")
+
+
+def test_sharpness_does_not_depend_on_contrast():
+    pixels = corner_scene().pixels
+    flat = replace(pixels, rgba=torch.cat([pixels.rgba[:, :3] // 2 + 50, pixels.rgba[:, 3:]], dim=1))
+    assert float(sharpness_of(flat, 0)) == pytest.approx(float(sharpness_of(pixels, 0)), rel=0.1)
+
+
+def test_a_dark_photograph_is_named():
+    def darken(rgba):
+        rgba[4, ..., :3] = (rgba[4, ..., :3].float() * 0.55).to(torch.uint8)
+        return rgba
+
+    check = judged(with_pictures(darken), "exposure", "look", "view 4.png differ in brightness")
+    assert float(check.message.split("(")[1].split()[0]) == pytest.approx(0.55, abs=0.04)
+
+
+def test_another_white_balance_is_named():
+    def tint(rgba):
+        rgba[4, ..., 0] = (rgba[4, ..., 0].float() * 0.7).to(torch.uint8)
+        return rgba
+
+    judged(with_pictures(tint), "exposure", "look", "view 4.png differ in white balance")
+
+
+def test_a_duplicate_is_named_and_its_leak_into_the_held_out_views():
+    def copy(rgba):
+        rgba[1] = rgba[0]
+        return rgba
+
+    judged(with_pictures(copy), "duplicates", "look", "view 0.png and view 1.png", "scores will be too good")
+
+
+def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits():
+    evidence = with_scene(near=torch.full((VIEWS,), 8.0))
+    check = judged(evidence, "near and far", "wrong", "in front of near", "Set scene.near=")
+    near = float(check.cure.split("near=")[1].split()[0])
+    judged(with_scene(near=torch.full((VIEWS,), near)), "near and far", "ok")
+
+
+def test_a_far_plane_before_the_content_is_wrong():
+    judged(with_scene(far=torch.full((VIEWS,), 0.9)), "near and far", "wrong", "behind far")
+
+
+def test_near_and_far_in_inches_are_named():
+    scene = corner_scene()
+    found = but_poses(corner_evidence())["near and far"].message
+    low, high = (float(found.split("lies ")[1].split()[place]) for place in (0, 2))
+    near, far = torch.full((VIEWS,), 39.37 * low), torch.full((VIEWS,), 39.37 * high)
+    judged(with_scene(near=near, far=far), "near and far", "wrong", "inches", "too large")
+    assert scene.near[0] < low
+
+
+def test_photographs_without_a_pose_are_reported():
+    judged(with_scene(left_out=("a.jpg", "b.jpg")), "photographs without pose", "look", "2 of 14", "a.jpg, b.jpg")
+
+
+def test_views_in_both_splits_are_wrong():
+    splits = {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}
+    judged(with_scene(splits=splits), "split", "wrong", "view 2.png")
+
+
+def test_too_few_views_are_wrong():
+    judged(with_scene(splits={"train": (1, 2), "val": (0,), "test": (0,)}), "number of views", "wrong", "2 to learn")
+
+
+def test_a_background_that_is_baked_in_is_named():
+    scene = ball_scene(8, 24, background="black")
+    rgba = scene.pixels.rgba.clone()
+    rgba[rgba[:, 3] == 0] = 255
+    pixels = replace(scene.pixels, rgba=rgba, has_transparency=False)
+    evidence = gather_evidence(replace(scene, pixels=pixels))
+    judged(evidence, "background", "wrong", "opaque on a background that is white", "scene.background=white")
+    judged(replace(evidence, scene=replace(evidence.scene, background="white")), "background", "ok")
+
+
+def test_colours_multiplied_by_alpha_are_named():
+    def fade(rgba, straight):
+        alpha = torch.arange(rgba.shape[2]).float() / rgba.shape[2]
+        colour = torch.full_like(rgba[..., :3], 230).float()
+        rgba[..., :3] = (colour if straight else colour * alpha[:, None]).to(torch.uint8)
+        rgba[..., 3] = (255 * alpha).to(torch.uint8)
+        return rgba
+
+    faded = with_pictures(lambda rgba: fade(rgba, straight=False))
+    white = replace(faded, scene=replace(faded.scene, background="white"))
+    judged(white, "transparency", "look", "multiplied by alpha", "straight alpha")
+    faded = with_pictures(lambda rgba: fade(rgba, straight=True))
+    judged(replace(faded, scene=replace(faded.scene, background="white")), "transparency", "ok")
+
+
+def test_masks_that_keep_nothing_are_named():
+    scene = corner_scene()
+    mask = torch.ones(len(scene.pixels.rgba), dtype=torch.uint8)
+    mask[: len(mask) // VIEWS] = 0
+    evidence = gather_evidence(replace(scene, pixels=replace(scene.pixels, mask=mask)))
+    judged(evidence, "masks", "look", "view 0.png", "invert them")
+
+
+def with_cameras(**changes):
+    return with_scene(cameras=replace(corner_scene().cameras, **changes))
+
+
+def test_a_principal_point_of_another_size_is_named():
+    check = judged(with_cameras(center=corner_scene().cameras.center * 0.5), "principal point", "wrong")
+    assert "photographs of 0.5 times the size" in check.message
+
+
+def test_fields_of_view_that_no_lens_has_are_wrong():
+    focal = corner_scene().cameras.focal
+    judged(with_cameras(focal=focal * 30), "field of view", "wrong")
+    judged(with_cameras(focal=focal * 0.05), "field of view", "wrong")
+    judged(with_cameras(focal=focal * torch.tensor([1.0, 1.3])), "field of view", "look", "not square")
+
+
+def test_cameras_that_look_away_are_wrong_without_any_detail():
+    scene = ball_scene(10, 12)
+    flipped = torch.cat([scene.cameras.c2w[..., :3] * torch.tensor([1.0, -1, -1]), scene.cameras.c2w[..., 3:]], dim=-1)
+    evidence, _ = examine(replace(scene, cameras=replace(scene.cameras, c2w=flipped)))
+    judged(evidence, "common middle", "wrong", "OpenCV's axes rather than OpenGL's")
+    judged(evidence, "box in view", "wrong")
+
+
+def test_photographs_on_their_side_or_head_are_noted():
+    c2w = corner_scene().cameras.c2w
+    right, up, back, center = c2w.unbind(dim=-1)
+    judged(with_poses(torch.stack([-up, right, back, center], dim=-1)), "upright", "look", "on their side")
+    judged(with_poses(torch.stack([-right, -up, back, center], dim=-1)), "upright", "look", "on their head")
+
+
+def test_cameras_at_one_place_and_mirrored_poses_are_wrong():
+    c2w = corner_scene().cameras.c2w.clone()
+    judged(with_poses(c2w * torch.tensor([1.0, 1, 1, 0])), "rotations", "wrong", "stand at one place")
+    judged(with_poses(c2w * torch.tensor([-1.0, 1, 1, 1])), "rotations", "wrong", "no rotations")
+
+
+@pytest.mark.parametrize(("factor", "says"), [(0.1, "within it"), (40.0, "a dot")])
+def test_a_capture_of_another_scale_than_its_box_is_wrong(factor, says):
+    scene = ball_scene(10, 12)
+    c2w = scene.cameras.c2w * torch.tensor([1.0, 1, 1, factor])
+    evidence = gather_evidence(replace(scene, cameras=replace(scene.cameras, c2w=c2w)))
+    judged(evidence, "scale", "wrong", says)
+
+
+def test_a_hole_in_a_ring_of_views_is_noted():
+    scene = ball_scene(16, 12)
+    judged(gather_evidence(scene), "coverage", "ok", "seen from 33")
+    kept = torch.arange(12)
+    cameras = replace(scene.cameras[kept], lens_model="pinhole")
+    evidence = gather_evidence(ball_scene(12, 12))
+    evidence = replace(evidence, scene=replace(evidence.scene, cameras=cameras))
+    judged(evidence, "coverage", "look", "gap of 112 degrees", "Photographs are missing around")
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("reader", "name", "looks"),
+    [
+        (LlffReader, "fern", set()),
+        pytest.param(TransformsReader, "fox", set(), marks=pytest.mark.exhaustive),
+        pytest.param(ColmapReader, "cup_colmap", {"upright"}, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_good_captures_raise_no_alarm(reader, name, looks):
+    _, checks = examine(reader(root=str(real_capture(name))).read())
+    assert {check.name: check.message for check in checks if check.verdict == "wrong"} == {}
+    assert {check.name for check in checks if check.verdict == "look"} <= looks

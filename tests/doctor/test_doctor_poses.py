@@ -1,0 +1,136 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from support.doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
+
+from nerf_lightning.doctor.conventions import axes, inverted, numeric_order, transposed
+from nerf_lightning.doctor.epipolar import agreeing, distances, parallax, places
+from nerf_lightning.doctor.examine import gather_evidence
+from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.nerf.geometry.cameras import project
+
+POSES = ("axes", "mirrored photographs", "order of photographs", "poses and pixels", "single poses", "focal length")
+
+
+def c2w():
+    return corner_scene().cameras.c2w
+
+
+def moved(view):
+    poses = c2w().clone()
+    poses[view, :, 3] += torch.tensor([0.4, -0.5, 0.6])
+    return poses
+
+
+def swapped(first, second):
+    order = list(range(VIEWS))
+    order[first], order[second] = order[second], order[first]
+    return c2w()[order]
+
+
+def test_a_sound_capture_has_nothing_wrong():
+    checks = outcome(corner_evidence())
+    assert {check.name: check.message for check in checks.values() if check.verdict == "wrong"} == {}
+    assert all(checks[name].verdict == "ok" and not checks[name].cure for name in POSES)
+    assert corner_evidence().agreement > 0.7
+
+
+@pytest.mark.parametrize(
+    ("poses", "name", "says", "cure"),
+    [
+        (axes(c2w(), (1.0, -1.0, -1.0)), "axes", "OpenCV", "Negate the second and third column"),
+        (inverted(c2w()), "axes", "look like world-to-camera rather", "Invert every pose matrix."),
+        (
+            inverted(axes(c2w(), (1.0, -1.0, -1.0))),
+            "axes",
+            "as COLMAP writes them",
+            "Invert every pose matrix, then negate",
+        ),
+        (transposed(c2w()), "axes", "rotations were transposed", "Transpose every rotation"),
+        (axes(c2w(), (-1.0, -1.0, 1.0)), "axes", "axes x and y of the cameras", "Negate columns 1 and 2"),
+        (axes(c2w(), (-1.0, 1.0, -1.0)), "axes", "axes x and z of the cameras", "Negate columns 1 and 3"),
+        (c2w().roll(1, 0), "order of photographs", "pose of the next one", "by one"),
+        (c2w().roll(-1, 0), "order of photographs", "pose of the previous one", "by one"),
+        (c2w().flip(0), "order of photographs", "reversed", "Reverse"),
+        (c2w()[torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3))], "poses and pixels", "%", "anew"),
+        (moved(5), "single poses", "view 5.png contradicts", "Remove these views"),
+        (swapped(2, 8), "single poses", "view 2.png fits the camera of view 8.png", "swap them back"),
+    ],
+)
+def test_wrong_poses_are_named_with_their_cure(poses, name, says, cure):
+    check = outcome(with_poses(poses))[name]
+    assert check.verdict == "wrong"
+    assert says in check.message
+    assert cure in check.cure
+
+
+def test_rows_in_numeric_order_are_named():
+    names = corner_scene().view_names
+    by_text = sorted(range(VIEWS), key=lambda view: names[view])
+    # The reader pairs row k with the k-th name as text, but the rows' maker counted.
+    views = torch.tensor(by_text)
+    sound = corner_evidence()
+    back = torch.empty(VIEWS, dtype=torch.long)
+    back[views] = torch.arange(VIEWS)
+    matches = replace(sound.matches, view=back[sound.matches.view], views=tuple(range(VIEWS)))
+    scene = replace(sound.scene, view_names=tuple(names[view] for view in by_text))
+    evidence = replace(sound, scene=scene, matches=matches, agrees=agreeing(matches, scene.cameras.c2w))
+    check = outcome(evidence)["order of photographs"]
+    assert check.verdict == "wrong"
+    assert "numbers in the photographs' names" in check.message
+
+
+def test_numeric_order_undoes_the_mistake():
+    cameras = corner_scene().cameras
+    assert numeric_order(cameras, ("1", "10", "2")).tolist() == [0, 2, 1]
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_focal_length_of_another_resolution_is_named(factor):
+    scene = corner_scene()
+    cameras = replace(scene.cameras, focal=scene.cameras.focal * factor)
+    check = outcome(gather_evidence(replace(scene, cameras=cameras)))["focal length"]
+    assert check.verdict == "wrong"
+    told = float(check.cure.split("about ")[1].split()[0])
+    assert told == pytest.approx(300.0, rel=0.11)
+
+
+def test_mirrored_photographs_are_named():
+    check = outcome(with_pictures(lambda rgba: rgba.flip(2)))["mirrored photographs"]
+    assert check.verdict == "wrong"
+    assert "left to right" in check.message
+
+
+def exact_matches(first, second):
+    """Places in two views of the same random points, computed by `project`."""
+    cameras = corner_scene().cameras
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    view = torch.tensor([first, second]).expand(50, 2)
+    seen = [(project(cameras, each, points) - cameras.center[each]) / cameras.focal[each] for each in (first, second)]
+    focal = torch.full((50, 2), 300.0)
+    return Matches(view, torch.stack(seen, dim=1), focal, torch.zeros(50, 2, 3), (first, second)), points
+
+
+def test_exact_matches_agree_and_lie_where_the_points_are():
+    matches, points = exact_matches(0, 5)
+    assert bool(agreeing(matches, c2w()).all())
+    torch.testing.assert_close(places(matches, c2w()), points, atol=1e-3, rtol=0)
+    eyes = c2w()[[0, 5], :, 3]
+    torch.testing.assert_close(distances(matches, c2w()), torch.cdist(points, eyes), atol=1e-3, rtol=0)
+    assert bool((parallax(matches, c2w()) > 0.1).all())
+
+
+def test_matches_behind_the_cameras_do_not_agree():
+    matches, _ = exact_matches(0, 5)
+    assert not bool(agreeing(matches, axes(c2w(), (-1.0, 1.0, -1.0))).any())
+    mirrored = replace(matches, plane=-matches.plane)
+    assert not bool(agreeing(mirrored, axes(c2w(), (1.0, -1.0, -1.0))).all())
+
+
+def test_a_match_off_its_line_does_not_agree():
+    matches, _ = exact_matches(0, 5)
+    plane = matches.plane.clone()
+    # The cameras move sideways, so lines are roughly level: four pixels up leave them.
+    plane[:, 1, 1] += 4.0 / 300.0
+    assert float(agreeing(replace(matches, plane=plane), c2w()).float().mean()) < 0.3

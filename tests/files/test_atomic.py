@@ -1,0 +1,84 @@
+"""Files that are whole or not there, and what processes that were killed leave of them."""
+
+import errno
+
+import pytest
+from support.running import start_code
+
+from nerf_lightning.files import atomic
+from nerf_lightning.files.atomic import whole_file
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from nerf_lightning.files.atomic import whole_file
+
+with whole_file(Path(sys.argv[1])) as part:
+    part.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(atomic.fcntl is None, reason="files have no owners there that could be asked for")
+def test_what_killed_processes_left_is_removed(tmp_path):
+    for name in ("video.mp4", "video.mp4", "metrics.json"):
+        with start_code(KILLED, tmp_path / name) as process:
+            assert process.wait() == -9
+    assert len(list(tmp_path.iterdir())) in (1, 2)  # each removes what was left before
+    with whole_file(tmp_path / "other.txt") as part:
+        part.write_text("whole")
+    assert [file.name for file in tmp_path.iterdir()] == ["other.txt"]
+
+
+def test_what_is_being_written_stays(tmp_path):
+    with whole_file(tmp_path / "a.txt") as ours:
+        ours.write_text("whole")
+        atomic._sweep.cache_clear()  # as another process
+        with whole_file(tmp_path / "b.txt") as theirs:
+            theirs.write_text("whole")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt", "b.txt"]
+
+
+@pytest.mark.skipif(atomic.fcntl is None, reason="files have no owners there that could be asked for")
+def test_a_file_that_is_made_and_not_yet_locked_is_not_lost(tmp_path, monkeypatch):
+    """Another process that begins in between takes it for a dead one's."""
+    flock = atomic.fcntl.flock
+
+    def sweep_first(handle, operation):
+        monkeypatch.setattr(atomic.fcntl, "flock", flock)
+        atomic._sweep.cache_clear()
+        atomic._sweep(tmp_path)
+        flock(handle, operation)
+
+    (tmp_path / "a.txt").touch()
+    atomic._sweep(tmp_path)
+    monkeypatch.setattr(atomic.fcntl, "flock", sweep_first)
+    with whole_file(tmp_path / "a.txt") as part:
+        assert part.exists()
+        atomic._sweep.cache_clear()
+        atomic._sweep(tmp_path)
+        part.write_text("whole")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["whole"]
+
+
+def test_what_a_person_has_beside_it_stays(tmp_path):
+    kept = (".notes.part.txt", "a.12.part.txt", ".profile", ".12.party")
+    for name in kept:
+        (tmp_path / name).write_text("mine")
+    (tmp_path / ".a.12.part").mkdir()
+    with whole_file(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    assert {file.name for file in tmp_path.iterdir()} == {*kept, ".a.12.part", "a.txt"}
+
+
+def test_a_failed_block_leaves_what_was_there_and_a_full_disk_is_said_of_its_file(tmp_path):
+    (tmp_path / "a.txt").write_text("former")
+    with pytest.raises(OSError, match=r"No space left on device: .*/a.txt"):
+        write_half(tmp_path / "a.txt")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["former"]
+
+
+def write_half(path):
+    with whole_file(path) as part:
+        part.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,7 +1,0 @@
-from nerf_lightning.kernels import backends
-from nerf_lightning.kernels.compile import compile_kernels
-
-
-def test_every_cpu_kernel_compiles():
-    compile_kernels()
-    assert all(backends.twin(f"{name}_numba") for name in ("hash_grid", "march", "packed", "adam", "carving"))

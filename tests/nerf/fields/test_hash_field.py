@@ -1,0 +1,92 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import ball_scene
+
+from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.hash_field import HashField, _TruncatedExponential
+
+
+def a_field(**settings):
+    torch.manual_seed(2)
+    encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40)
+    torch.nn.init.normal_(encoder.table)
+    return HashField(encoder, SphericalHarmonicsEncoder(3), width=16, **settings)
+
+
+def test_a_box_is_only_a_change_of_units():
+    """The field of a scene that is moved and scaled is the same field, moved and scaled."""
+    field, points = a_field(density_bias=-1.0), 2 * torch.rand(40, 3) - 1
+    before = field.density(points)
+    shift, scale = torch.tensor([3.0, -1.0, 7.0]), torch.tensor([2.0, 0.5, 4.0])
+    field.fit_to(replace(ball_scene(), aabb=torch.stack([shift - scale, shift + scale])))
+    torch.testing.assert_close(field.density(points * scale + shift), before, rtol=1e-3, atol=1e-4)
+
+
+def test_outside_of_the_box_there_is_nothing_unless_space_is_contracted():
+    points = torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])
+    assert bool((a_field().density(points) == 0).all())
+    far = a_field(contraction=True)
+    assert bool((far.density(points) > 0).all())
+    assert far.density(points[:1]) != far.density(2 * points[:1])
+
+
+def test_the_exponential_and_its_gradient_stay_finite():
+    raw = torch.tensor([-200.0, -1.0, 0.0, 14.0, 80.0, 1e6], requires_grad=True)
+    density = _TruncatedExponential.apply(raw)
+    density.sum().backward()
+    assert bool(density.isfinite().all())
+    assert bool(raw.grad.isfinite().all())
+    torch.testing.assert_close(density[1:4].detach(), raw.detach()[1:4].exp())
+    torch.testing.assert_close(raw.grad[1:4], raw.detach()[1:4].exp())
+
+
+@pytest.mark.parametrize("encoder", [FrequencyEncoder(3), HashGridEncoder(num_levels=2, log2_table_size=8)])
+def test_screened_points_are_recalled_with_the_same_result(encoder):
+    field = HashField(encoder, SphericalHarmonicsEncoder(2), width=8)
+    positions = 2 * torch.rand(30, 3) - 1
+    directions = torch.nn.functional.normalize(torch.randn(30, 1, 3), dim=-1)
+    with torch.no_grad():
+        density, features = field.screen(positions)
+    whole = field(positions[:, None], directions, None)
+    again = field.recall(positions[:, None], directions, None, features[:, None])
+    torch.testing.assert_close(density, whole.density[:, 0])
+    torch.testing.assert_close(again.rgb, whole.rgb)
+    torch.testing.assert_close(again.density, whole.density)
+
+
+def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothing_does():
+    """The fault: a dense start on a black background stays, as black fog."""
+    scene = ball_scene()
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    baked = replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
+    densities = []
+    for given in (scene, baked):
+        field = a_field()
+        torch.nn.init.zeros_(field.position_encoder.table)
+        field.fit_to(given)
+        densities.append(float(field.density(torch.zeros(1, 3)).detach()))
+    assert densities[0] == pytest.approx(2.718281828**3, rel=1e-4)
+    assert densities[1] == pytest.approx(2.718281828**-1, rel=1e-4)
+
+
+@pytest.mark.parametrize(("space", "everywhere"), [("bounded", False), ("ndc", False), ("contracted", True)])
+def test_the_scene_says_whether_there_is_something_outside_of_its_box(space, everywhere):
+    field = a_field()
+    field.fit_to(replace(ball_scene(), space=space))
+    assert bool((field.density(torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])) > 0).all()) is everywhere
+    stubborn = a_field(contraction=False)
+    stubborn.fit_to(replace(ball_scene(), space=space))
+    assert bool((stubborn.density(torch.tensor([[1.2, 0.0, 0.0]])) == 0).all())
+
+
+def test_the_space_travels_in_the_state_dict():
+    field, other = a_field(), a_field()
+    field.fit_to(replace(ball_scene(), space="contracted"))
+    other.load_state_dict(field.state_dict())
+    points = 5 * torch.rand(20, 3)
+    assert torch.equal(other.density(points), field.density(points))

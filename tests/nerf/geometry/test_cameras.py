@@ -1,0 +1,88 @@
+import math
+
+import pytest
+import torch
+
+from nerf_lightning.nerf.geometry.cameras import (
+    all_pixels,
+    focal_from_fov,
+    pinhole_cameras,
+    project,
+    rays_through_pixels,
+    resized,
+)
+from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
+from nerf_lightning.nerf.types.rays import PixelIndex
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+@pytest.fixture
+def cameras():
+    eyes = torch.tensor([[4.0, 0.0, 1.0], [0.0, -3.0, 2.0]], dtype=torch.float64)
+    return pinhole_cameras(look_at(eyes, torch.zeros_like(eyes), UP), 30.0, 24, 16)
+
+
+def rays_of(cameras, view):
+    views = cameras.c2w.shape[0]
+    return rays_through_pixels(cameras, all_pixels(cameras, view), torch.zeros(views), torch.ones(views))
+
+
+def test_projecting_a_point_on_a_ray_gives_the_pixels_centre(cameras):
+    """The fault: rays through the corners of pixels."""
+    for view in range(2):
+        rays = rays_of(cameras, view)
+        pixels = project(cameras, view, rays.origins + 2.5 * rays.directions)
+        index = all_pixels(cameras, view)
+        torch.testing.assert_close(pixels, torch.stack([index.x, index.y], -1) + 0.5, check_dtype=False)
+
+
+def test_directions_have_unit_length_even_at_wide_angles():
+    wide = pinhole_cameras(torch.eye(4, dtype=torch.float64)[None, :3], 5.0, 40, 40)
+    norms = rays_of(wide, 0).directions.norm(dim=-1)
+    torch.testing.assert_close(norms, torch.ones_like(norms))
+
+
+def test_a_camera_looks_along_minus_z_with_x_right_and_row_0_on_top():
+    camera = pinhole_cameras(torch.eye(4, dtype=torch.float64)[None, :3], 10.0, 3, 3)
+    directions = rays_of(camera, 0).directions
+    torch.testing.assert_close(directions[1, 1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
+    assert float(directions[1, 2, 0]) > 0  # right column looks right
+    assert float(directions[0, 1, 1]) > 0  # top row looks up
+
+
+def test_rotating_a_camera_rotates_its_rays(cameras):
+    angle = torch.tensor(0.7, dtype=torch.float64)
+    turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]], dtype=torch.float64)
+    turned = pinhole_cameras(turn @ cameras.c2w, 30.0, 24, 16)
+    torch.testing.assert_close(rays_of(turned, 0).directions, rays_of(cameras, 0).directions @ turn.T)
+
+
+def test_the_focal_length_follows_the_size_of_the_picture(cameras):
+    """The fault: half the picture with the whole focal length. A point must appear at half the coordinates."""
+    half = resized(cameras, cameras.width // 2, cameras.height // 2)
+    point = torch.tensor([[0.3, -0.2, 0.1]], dtype=torch.float64)
+    torch.testing.assert_close(project(half, 0, point), project(cameras, 0, point) / 2)
+    assert float(half.focal[0, 0]) == 15.0
+
+
+def test_focal_from_field_of_view():
+    assert abs(focal_from_fov(200, math.pi / 2) - 100.0) < 1e-9
+
+
+def test_look_at_is_rigid_and_looks_at_the_target(cameras):
+    assert bool(is_rigid(cameras.c2w).all())
+    center = PixelIndex(view=torch.tensor([0]), x=torch.tensor([12]), y=torch.tensor([8]))
+    assert torch.allclose(
+        project(cameras, 0, torch.zeros(1, 3, dtype=torch.float64)), torch.tensor([[12.0, 8.0]], dtype=torch.float64)
+    )
+    assert int(center.view) == 0
+
+
+def test_mirrors_shears_and_nan_are_not_rigid():
+    good = torch.eye(4)[None, :3]
+    mirror, shear, nan = good.clone(), good.clone(), good.clone()
+    mirror[0, 0, 0] = -1.0
+    shear[0, 0, 1] = 0.2
+    nan[0, 1, 3] = float("nan")
+    assert is_rigid(torch.cat([good, mirror, shear, nan])).tolist() == [True, False, False, False]

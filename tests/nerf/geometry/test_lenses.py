@@ -1,0 +1,227 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels, resized
+from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
+from nerf_lightning.nerf.geometry.poses import look_at
+
+FOX = [0.0578421, -0.0805099, 0.0, 0.0, -0.000980296, 0.00015575]
+STRONG = [-0.3, 0.1, 0.0, 0.0, 0.0, 0.0]
+GOPRO = [0.0348, 0.0040, -0.0029, 0.0006, 0.0, 0.0]
+# Model, coefficients, width and height, fx and fy, cx and cy.
+REAL = {
+    "fox": ("radial_tangential", FOX, (540, 960), (687.76, 687.245), (277.279, 482.634)),
+    "strong barrel": ("radial_tangential", STRONG, (1600, 1200), (800.0, 805.0), (790.0, 610.0)),
+    "pincushion": ("radial_tangential", [0.3, 0.1, 0, 0, 0.001, -0.002], (640, 480), (400.0, 402.0), (316.0, 244.0)),
+    "gopro": ("fisheye", GOPRO, (1920, 1440), (870.0, 870.0), (955.0, 722.0)),
+    "fisheye of 190 degrees": ("fisheye", [-0.01, 0.002, 0, 0, 0, 0], (800, 800), (241.0, 241.0), (400.0, 400.0)),
+}
+
+
+def lens_camera(name, dtype=torch.float64):
+    model, lens, size, focal, center = REAL[name]
+    eye = torch.tensor([[3.0, -1.0, 2.0]], dtype=dtype)
+    camera = pinhole_cameras(look_at(eye, torch.zeros_like(eye), eye.new_tensor([0.0, 0.0, 1.0])), 1.0, *size)
+    values = [torch.tensor([value], dtype=dtype) for value in (focal, center, lens)]
+    return replace(camera, focal=values[0], center=values[1], lens=values[2], lens_model=model)
+
+
+def pixels_of(cameras, view=0, step=7):
+    """Every `step`-th pixel of the image, and all of its border."""
+    index = all_pixels(cameras, view)
+    kept = (index.x % step == 0) & (index.y % step == 0)
+    kept[[0, -1]] = True
+    kept[:, [0, -1]] = True
+    return index.map(lambda x: x[kept])
+
+
+def rays_of(cameras, view=0):
+    views = cameras.c2w.shape[0]
+    return rays_through_pixels(cameras, pixels_of(cameras, view), torch.zeros(views), torch.ones(views))
+
+
+def places(count=200, most=0.9, seed=0):
+    return most * (2 * torch.rand(count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 1)
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-4), (torch.float32, 5e-3)])
+def test_pixels_of_the_whole_image_come_back_from_their_rays(name, dtype, tolerance):
+    cameras = lens_camera(name, dtype)
+    rays = rays_of(cameras)
+    # At the origin the camera's own place costs no digits.
+    centred = replace(cameras, c2w=torch.cat([cameras.c2w[..., :3], torch.zeros_like(cameras.c2w[..., 3:])], dim=-1))
+    index = pixels_of(cameras)
+    missed = project(centred, 0, rays.directions) - torch.stack([index.x, index.y], -1) - 0.5
+    assert float(missed.abs().max()) < tolerance
+    norms = rays.directions.norm(dim=-1)
+    torch.testing.assert_close(norms, torch.ones_like(norms))
+
+
+def test_points_along_a_ray_stay_at_its_pixel():
+    """The fault: the lens's axes taken for the camera's (y up, z back)."""
+    for name in REAL:
+        cameras = lens_camera(name)
+        rays, index = rays_of(cameras), pixels_of(cameras)
+        pixels = project(cameras, 0, rays.origins + 2.5 * rays.directions)
+        torch.testing.assert_close(pixels, torch.stack([index.x, index.y], -1).double() + 0.5, rtol=0, atol=1e-6)
+
+
+def test_without_coefficients_the_radial_model_is_the_pinhole():
+    cameras = lens_camera("fox")
+    none = replace(cameras, lens=torch.zeros_like(cameras.lens))
+    pinhole = replace(none, lens_model="pinhole")
+    assert torch.equal(rays_of(none).directions, rays_of(pinhole).directions)
+    points = torch.randn(50, 3, dtype=torch.float64)
+    torch.testing.assert_close(project(none, 0, points), project(pinhole, 0, points), rtol=0, atol=1e-9)
+
+
+def test_the_pinhole_is_what_it_was_to_the_bit():
+    cameras = replace(lens_camera("fox", torch.float32), lens_model="pinhole")
+    index = pixels_of(cameras)
+    x = (index.x + 0.5 - cameras.center[0, 0]) / cameras.focal[0, 0]
+    y = (index.y + 0.5 - cameras.center[0, 1]) / cameras.focal[0, 1]
+    world = (cameras.c2w[0, :, :3] @ torch.stack([x, -y, -torch.ones_like(x)], dim=-1)[..., None])[..., 0]
+    assert torch.equal(rays_of(cameras).directions, world / world.norm(dim=-1, keepdim=True))
+    plane = places()
+    assert unproject(plane, torch.zeros(6).double(), "pinhole").tolist() == [[u, v, 1.0] for u, v in plane.tolist()]
+
+
+def test_an_equidistant_fisheye_measures_angles():
+    none = torch.zeros(6, dtype=torch.float64)
+    angle = torch.tensor([0.0, 0.3, math.pi / 2, 2.0], dtype=torch.float64)
+    plane = torch.stack([torch.zeros_like(angle), angle], dim=-1)
+    expected = torch.stack([torch.zeros_like(angle), angle.sin(), angle.cos()], dim=-1)
+    torch.testing.assert_close(unproject(plane, none, "fisheye"), expected)
+    torch.testing.assert_close(project_plane(7.0 * expected, none, "fisheye"), plane)
+
+
+def test_the_formulas_of_opencv_in_numbers():
+    """Worked by hand at (u, v) = (0.5, -0.25), r^2 = 0.3125; the fisheye at 45 degrees."""
+    lens = torch.tensor([0.1, -0.2, 0.3, -0.4, 0.01, -0.02], dtype=torch.float64)
+    r2 = 0.3125
+    radial = 1 + 0.1 * r2 - 0.2 * r2**2 + 0.3 * r2**3 - 0.4 * r2**4
+    u = 0.5 * radial + 2 * 0.01 * 0.5 * -0.25 - 0.02 * (r2 + 2 * 0.25)
+    v = -0.25 * radial + 0.01 * (r2 + 2 * 0.0625) + 2 * -0.02 * 0.5 * -0.25
+    shown = project_plane(torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64), lens, "radial_tangential")
+    assert shown.tolist() == pytest.approx([u, v], abs=1e-12)
+    t = math.pi / 4
+    bent = t * (1 + 0.1 * t**2 - 0.2 * t**4 + 0.3 * t**6 - 0.4 * t**8)
+    direction = torch.tensor([0.6, 0.8, 1.0], dtype=torch.float64)
+    assert project_plane(direction, lens, "fisheye").tolist() == pytest.approx([0.6 * bent, 0.8 * bent], abs=1e-12)
+
+
+def bisected(distorted, k, highest):
+    """The radius that r (1 + k1 r^2 + ...) brings to `distorted`, in plain numbers."""
+    low, high = 0.0, highest
+    for _ in range(200):
+        r = 0.5 * (low + high)
+        low, high = (r, high) if r * (1 + sum(c * r ** (2 * i + 2) for i, c in enumerate(k))) < distorted else (low, r)
+    return low
+
+
+@pytest.mark.parametrize(("model", "lens"), [("radial_tangential", STRONG), ("fisheye", GOPRO)])
+def test_against_bisection_on_the_radius(model, lens):
+    for u, v in places(30).tolist():
+        plane, coefficients = (torch.tensor(values, dtype=torch.float64) for values in ([u, v], lens))
+        direction = unproject(plane, coefficients, model)
+        found = bisected(math.hypot(u, v), lens[:4], 3.0)
+        radius = math.tan(off_axis(direction)[0]) if model == "radial_tangential" else float(off_axis(direction)[0])
+        assert radius == pytest.approx(found, abs=1e-9)
+        assert math.atan2(direction[1], direction[0]) == pytest.approx(math.atan2(v, u), abs=1e-9)
+
+
+@pytest.mark.parametrize(("model", "lens"), [("radial_tangential", STRONG), ("fisheye", GOPRO)])
+def test_turning_the_image_turns_the_rays(model, lens):
+    lens, c, s = torch.tensor(lens).double(), math.cos(0.7), math.sin(0.7)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    plane = places()
+    turned = unproject(plane @ turn[:2, :2].T, lens, model)
+    torch.testing.assert_close(turned, unproject(plane, lens, model) @ turn.T)
+
+
+def test_each_view_has_its_own_lens():
+    """The fault: the first view's coefficients for all."""
+    one = lens_camera("fox")
+    both = one[torch.tensor([0, 0])]
+    both = replace(both, lens=torch.cat([one.lens, torch.tensor([STRONG], dtype=torch.float64)]))
+    alone = replace(one, lens=both.lens[1:])
+    assert both[0].lens_model == "radial_tangential"
+    assert torch.equal(rays_of(both, 0).directions, rays_of(one).directions)
+    assert torch.equal(rays_of(both, 1).directions, rays_of(alone).directions)
+    point = torch.tensor([[0.3, 0.2, -0.1]], dtype=torch.float64)
+    assert torch.equal(project(both, 1, point), project(alone, 0, point))
+
+
+def test_the_lens_does_not_change_with_the_images_size():
+    cameras = lens_camera("fox")
+    half = resized(cameras, cameras.width // 2, cameras.height // 2)
+    point = torch.tensor([[0.3, -0.2, 0.1]], dtype=torch.float64)
+    torch.testing.assert_close(project(half, 0, point), project(cameras, 0, point) / 2)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "radial_tangential", "fisheye"])
+def test_gradients_are_those_of_differences(model):
+    directions = torch.cat([places(6), 0.5 + places(6)[:, :1].abs()], dim=-1).requires_grad_()
+    lens = torch.tensor([0.1, -0.05, 0.02, -0.01, 0.01, -0.02], dtype=torch.float64, requires_grad=model != "pinhole")
+    assert torch.autograd.gradcheck(lambda d, k: project_plane(d, k, model), (directions, lens))
+    plane = (0.5 * places(6)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p, k: unproject(p, k, model), (plane, lens))
+
+
+@pytest.mark.parametrize("model", ["radial_tangential", "fisheye"])
+def test_on_the_axis_values_and_gradients_are_finite(model):
+    lens = torch.tensor([*FOX[:4], 0.0, 0.0], requires_grad=True)
+    for fn, at in ((project_plane, [0.0, 0.0, 2.0]), (unproject, [0.0, 0.0])):
+        at = torch.tensor(at, requires_grad=True)
+        out = fn(at, lens, model)
+        assert torch.equal(out, torch.tensor([0.0, 0.0, 1.0][: len(out)]))
+        gradients = torch.autograd.grad(out.sum(), [at, lens])
+        assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+        assert float(gradients[0][0]) == (0.5 if fn is project_plane else 1.0)
+
+
+@pytest.mark.parametrize("model", ["radial_tangential", "fisheye"])
+def test_stretches_are_the_singular_values_of_the_projection(model):
+    lens = torch.tensor([0.1, -0.05, 0.02, -0.01, 0.01, -0.02], dtype=torch.float64)
+    lens = lens if model == "radial_tangential" else lens * torch.tensor([1, 1, 1, 1, 0, 0])
+    directions = unproject(places(20), lens, model)
+    for direction, found in zip(directions, stretches(directions, lens, model), strict=True):
+        if model == "fisheye":  # against an angle: steps of unit length across the direction
+            unit = direction / direction.norm()
+            across = torch.linalg.svd(unit[None]).Vh[1:].T
+        else:  # against the pinhole's plane
+            unit, across = direction, torch.eye(3, 2, dtype=torch.float64)
+        jacobian = torch.autograd.functional.jacobian(lambda d: project_plane(d, lens, model), unit) @ across
+        torch.testing.assert_close(torch.linalg.svdvals(jacobian).flip(0), found)
+
+
+@pytest.mark.parametrize("model", ["radial_tangential", "fisheye"])
+def test_nothing_depends_on_values(model):
+    """On the meta device there are none: a branch or a size that asks for one fails, as it would wait on a GPU."""
+    plane, lens = torch.empty(5, 2, device="meta"), torch.empty(5, 6, device="meta")
+    assert project_plane(unproject(plane, lens, model), lens, model).shape == (5, 2)
+
+
+def test_angles_and_headings_are_inverted():
+    directions = torch.nn.functional.normalize(torch.randn(100, 3, dtype=torch.float64), dim=-1)
+    torch.testing.assert_close(at_angle(*off_axis(directions)), directions)
+
+
+mild = st.floats(-0.08, 0.08)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.tuples(mild, mild, mild, mild), st.tuples(*[st.floats(-0.005, 0.005)] * 2), st.booleans())
+def test_mild_lenses_are_inverted(k, p, fisheye):
+    model = "fisheye" if fisheye else "radial_tangential"
+    lens = torch.tensor([*k, *((0.0, 0.0) if fisheye else p)], dtype=torch.float64)
+    plane = places(50, most=0.5)
+    directions = unproject(plane, lens, model)
+    torch.testing.assert_close(project_plane(directions, lens, model), plane, rtol=0, atol=1e-9)
+    assert bool((stretches(directions, lens, model)[..., 0] > 0.5).all())

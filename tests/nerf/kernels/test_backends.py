@@ -1,0 +1,92 @@
+"""What becomes of a kernel that cannot be compiled, or not be kept."""
+
+import logging
+import os
+import subprocess
+import sys
+from types import ModuleType
+
+import numba
+import pytest
+import torch
+
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.adam.step import adam_step
+
+
+@pytest.fixture
+def anew(monkeypatch):
+    """Let every kernel be looked for again, and forget what was found."""
+    former = numba.config.CACHE_DIR
+
+    def forget():
+        for cached in (backends.twin, backends._warn_once, backends._cache_elsewhere):
+            cached.cache_clear()
+        backends._reasons.clear()
+
+    forget()
+    yield
+    monkeypatch.undo()
+    forget()
+    numba.config.CACHE_DIR = former
+
+
+def module_whose_trial(words=None):
+    def trial():
+        if words:
+            raise RuntimeError(words)
+
+    module = ModuleType("a_twin")
+    module.trial = trial
+    return module
+
+
+def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, monkeypatch, caplog):
+    monkeypatch.setattr(
+        backends.importlib, "import_module", lambda name: module_whose_trial("LLVM cannot select\n this")
+    )
+    parameter, grad = torch.ones(3), torch.tensor([1.0, 0.0, -1.0])
+    for _ in range(2):
+        adam_step(parameter, grad.clone(), torch.zeros(3), torch.zeros(3), 0.5, 1.0, (0.0, 0.0), 1e-15)
+    torch.testing.assert_close(parameter, torch.tensor([0.0, 1.0, 2.0]))
+    assert backends.why_not("adam.cpu") == "RuntimeError: LLVM cannot select this"
+    assert len(caplog.records) == 1
+    assert "the torch twins of its kernels run instead" in caplog.text
+
+
+def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, caplog):
+    monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial("PTX assembly failed"))
+    assert backends.cuda_twin("hash_grid.cuda", torch.device("cuda")) is None
+    assert "triton cannot be used here (RuntimeError: PTX assembly failed)" in caplog.text
+    assert backends.cuda_twin("hash_grid.cuda", torch.device("cpu")) is None
+
+
+def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(anew, monkeypatch, caplog):
+    found, asked = module_whose_trial(), []
+
+    def without_cache(name):
+        asked.append(name)
+        if not numba.config.CACHE_DIR:
+            raise RuntimeError("cannot cache function '_forward': no locator available for file 'x.py'")
+        return found
+
+    numba.config.CACHE_DIR = ""
+    monkeypatch.setattr(backends.importlib, "import_module", without_cache)
+    with caplog.at_level(logging.WARNING):
+        assert backends.twin("march.cpu") is found
+        assert backends.twin("adam.cpu") is found
+    assert len(asked) == 3
+    assert os.access(numba.config.CACHE_DIR, os.W_OK)
+    assert [record.getMessage().partition(" (")[0] for record in caplog.records] == [
+        "Until then every start compiles the kernels anew, which takes about a minute: numba cannot write its cache"
+    ]
+
+
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
+    (tmp_path / "file").touch()
+    places = {"NUMBA_CACHE_DIR": f"{tmp_path}/file/below", "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+    program = "from nerf_lightning.nerf.kernels.backends import twin; print(twin('adam.cpu'))"
+    result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
+    assert "adam/cpu.py" in result.stdout, result.stderr
+    assert "Set NUMBA_CACHE_DIR" in result.stderr

@@ -1,0 +1,123 @@
+"""Carving: what it keeps, and the compiled twin against its reference."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import BALL_RADIUS, LENSES, ball_scene
+
+from nerf_lightning.nerf.geometry.footprints import footprint
+from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.carving import cpu as carving_cpu
+from nerf_lightning.nerf.kernels.carving import reference as carving_reference
+from nerf_lightning.nerf.kernels.carving.carve import possible_cells
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+
+
+def cells(scene, resolution=24):
+    sampler = OccupancySampler(resolution=resolution)
+    sampler.aabb.copy_(scene.aabb)
+    return sampler.cell_centers(0)
+
+
+def test_what_the_alpha_shows_empty_is_carved_and_what_is_there_is_kept():
+    scene = ball_scene(num_views=24, size=40)
+    centers, half_diagonal = cells(scene)
+    possible = possible_cells(scene, centers, half_diagonal)
+    distance = centers.norm(dim=-1)
+    assert bool(possible[distance < BALL_RADIUS].all())
+    assert float(possible[distance > 1.6 * BALL_RADIUS].float().mean()) < 0.35
+    assert 0.2 < float(possible.float().mean()) < 0.8
+
+
+def test_without_alpha_nothing_is_carved():
+    scene = ball_scene(num_views=8, size=24)
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    opaque = replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
+    assert bool(possible_cells(opaque, *cells(opaque)).all())
+
+
+def test_cells_that_no_training_view_sees_are_left_out():
+    scene = ball_scene(num_views=2, size=24)
+    centers, half_diagonal = cells(scene)
+    behind = centers + 2.5 * scene.cameras.c2w[0, :, 3]
+    assert not bool(possible_cells(scene, behind, half_diagonal).any())
+
+
+@pytest.mark.parametrize(("model", "lens"), LENSES)
+def test_carving_looks_through_the_lens(model, lens):
+    """The fault: a pinhole's places in a photograph that a lens has bent."""
+    scene = ball_scene(num_views=24, size=40, lens=lens, lens_model=model)
+    centers, half_diagonal = cells(scene)
+    possible = possible_cells(scene, centers, half_diagonal)
+    distance = centers.norm(dim=-1)
+    assert bool(possible[distance < BALL_RADIUS].all())
+    assert float(possible[distance > 1.6 * BALL_RADIUS].float().mean()) < 0.35
+
+
+@pytest.fixture
+def a_view():
+    """A view whose pose, focal lengths and principal point are numbers without any pattern, and cells all around it."""
+    scene = ball_scene(num_views=3, size=40)
+    cameras = replace(
+        scene.cameras,
+        focal=scene.cameras.focal * torch.tensor([1.0, 1.13]),
+        center=scene.cameras.center + torch.tensor([1.7, -2.3]),
+    )
+    generator = torch.Generator().manual_seed(0)
+    return cameras, 1, 2.0 * torch.randn(60_000, 3, generator=generator), generator
+
+
+def test_the_compiled_footprints_have_the_references_bits(a_view):
+    cameras, view, centers, _ = a_view
+    camera, _, _ = carving_cpu._camera(cameras, view)
+    found = [carving_cpu._footprint(*center, camera, *carving_cpu._halves(0.07)) for center in centers[:500].numpy()]
+    assert torch.equal(torch.tensor(found), torch.stack(footprint(cameras, view, centers[:500], 0.07), dim=-1))
+
+
+@pytest.mark.parametrize("half_diagonal", [0.01, 0.07, 0.5])
+def test_the_compiled_twin_sees_what_the_reference_sees(a_view, half_diagonal):
+    cameras, view, centers, generator = a_view
+    fast = torch.rand(centers.shape[0], generator=generator) < 0.1
+    slow = fast.clone()
+    carving_cpu.add_seen(fast, cameras, view, centers, half_diagonal)
+    carving_reference.add_seen(slow, cameras, view, centers, half_diagonal)
+    assert 0.2 < float(slow.float().mean()) < 0.9
+    assert torch.equal(fast, slow)
+
+
+@pytest.mark.parametrize("half_diagonal", [0.01, 0.07, 0.5])
+def test_the_compiled_twin_carves_what_the_reference_carves(a_view, half_diagonal):
+    cameras, view, centers, generator = a_view
+    matter = torch.zeros(40, 40, dtype=torch.bool)
+    matter[8:19, 20:33] = True
+    fast = torch.rand(centers.shape[0], generator=generator) < 0.9
+    given, slow = fast.clone(), fast.clone()
+    carving_cpu.carve(fast, cameras, view, centers, half_diagonal, matter)
+    carving_reference.carve(slow, cameras, view, centers, half_diagonal, matter)
+    # The widest discs leave no pixel of these free of matter that is sure to be it.
+    assert torch.equal(slow, given) == (half_diagonal == 0.5)
+    assert torch.equal(fast, slow)
+
+
+def test_matter_is_widened_to_squares_that_hold_the_largest_disc():
+    matter = torch.zeros(20, 30, dtype=torch.bool)
+    matter[3, 12] = matter[19, 0] = True
+    found = carving_reference.widened(matter, torch.tensor([0.0, 0.4, 2.3]))  # 2.3 and half a pixel: 3
+    expected = torch.zeros_like(matter)
+    expected[0:7, 9:16] = expected[16:20, 0:4] = True
+    assert found is not None
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("radius", [[], [0.0], [9.8]])
+def test_without_a_disc_that_fits_nothing_is_widened(radius):
+    assert carving_reference.widened(torch.ones(20, 30, dtype=torch.bool), torch.tensor(radius)) is None
+
+
+def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
+    scene = ball_scene(num_views=24, size=40)
+    fast = possible_cells(scene, *cells(scene))
+    with without("carving.cpu"):
+        assert torch.equal(possible_cells(scene, *cells(scene)), fast)

@@ -1,0 +1,111 @@
+"""The march: what it keeps, against looking every interval up."""
+
+import pytest
+import torch
+from support.scenes import some_rays
+
+from nerf_lightning.nerf.geometry.boxes import distances_in_box
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.march import march
+from nerf_lightning.nerf.kernels.march.reference import march_torch
+
+AABB = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
+
+
+def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0, density=0.0):
+    rays = some_rays(count)
+    cells = (torch.rand(cascades, resolution, resolution, resolution) < share).to(torch.uint8)
+    enter, leave = distances_in_box(rays, AABB * 2.0 ** (cascades - 1))
+    state = March(enter, leave, torch.rand(count), torch.zeros(count, dtype=torch.long))
+    edges = [1.9]
+    while edges[-1] < 6.1:
+        edges.append(edges[-1] + max(0.02, growth * edges[-1]))
+    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), grid_of(cells, density)
+
+
+def grid_of(cells, density):
+    return OccupancyCells(AABB, cells, blocks_of(cells), density * torch.rand(cells.shape))
+
+
+@pytest.mark.parametrize("limit", [None, 1, 5])
+@pytest.mark.parametrize(("cascades", "growth"), [(1, 0.0), (3, 0.0), (2, 0.01)])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
+def test_skipping_keeps_what_looking_everywhere_keeps(cascades, growth, share, limit):
+    given = a_march(cascades=cascades, growth=growth, share=share)
+    fast, fast_next = march(*given, limit)
+    slow, slow_next = march_torch(*given, limit, None)
+    counts = [found.bounds.diff() for found in (fast, slow)]
+    same = (counts[0] == counts[1]) & (fast_next == slow_next)
+    # A midpoint on a cell's face, to the last bit, may fall to either side.
+    assert int((~same).sum()) <= 1
+    a, b = (found.at(*_of_rays(found, same)) for found in (fast, slow))
+    assert torch.equal(a.ray_index, b.ray_index)
+    torch.testing.assert_close(a.starts, b.starts)
+    torch.testing.assert_close(a.ends, b.ends)
+
+
+def _of_rays(samples, chosen):
+    counts = samples.bounds.diff() * chosen
+    return chosen[samples.ray_index].nonzero()[:, 0], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def test_marching_in_rounds_finds_what_one_march_finds():
+    rays, state, lattice, grid = a_march(share=0.3)
+    whole, _ = march(rays, state, lattice, grid)
+    found = []
+    while bool((state.next < lattice.numel() - 2).any()):
+        part, following = march(rays, state, lattice, grid, limit=3)
+        state.next.copy_(following)
+        found.append(torch.stack([part.ray_index.double(), part.starts.double()], dim=-1))
+    everything = torch.cat(found)
+    order = (everything[:, 0] * 1e3 + everything[:, 1]).argsort()
+    torch.testing.assert_close(everything[order, 1].float(), whole.starts)
+
+
+def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
+    rays, state, lattice, grid = a_march(count=50, share=2.0)
+    samples, _ = march(rays, state, lattice, grid)
+    lengths = torch.zeros(50).index_add(0, samples.ray_index, samples.deltas)
+    chord = (state.leave - state.enter).clamp(min=0)
+    assert float((lengths - chord).abs().max()) <= 0.021  # an interval at either end, half of it each
+    assert bool((samples.deltas > 0).all())
+
+
+def test_a_march_ends_behind_what_is_opaque_by_a_wide_margin():
+    rays, state, lattice, grid = a_march(count=200, share=1.0, density=500.0)
+    fast, _ = march(rays, state, lattice, grid)
+    slow, _ = march_torch(rays, state, lattice, grid, None, None)
+    assert torch.equal(fast.bounds, slow.bounds)
+    everything, _ = march(rays, state, lattice, OccupancyCells(AABB, grid.cells, grid.blocks, 0 * grid.floor))
+    assert fast.starts.numel() < 0.5 * everything.starts.numel()
+    optical = torch.zeros(200).index_add(0, fast.ray_index, density_at(rays, fast, grid) * fast.deltas)
+    cut = fast.bounds.diff() < everything.bounds.diff()
+    assert bool((optical[cut] > 12).all())
+
+
+def density_at(rays, samples, grid):
+    from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
+
+    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
+    return floor_of_cells(rays.origins[samples.ray_index] + along, grid)
+
+
+def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():
+    rays, state, lattice, grid = a_march(count=40, share=0.5)
+    whole, _ = march(rays, state, lattice, grid)
+    total = int(whole.bounds[-1])
+    for capacity in (total + 100, total // 2):
+        samples, _ = march(rays, state, lattice, grid, capacity=capacity)
+        kept = min(capacity, total)
+        assert samples.starts.shape == (capacity,)
+        assert int(samples.bounds[-1]) == kept
+        torch.testing.assert_close(samples.starts[:kept], whole.starts[:kept])
+        assert bool((samples.deltas[kept:] == 0).all())
+
+
+def test_rays_that_miss_the_box_have_no_samples():
+    rays, state, lattice, grid = a_march(count=20, share=1.0)
+    rays.directions.mul_(-1.0)
+    enter, leave = distances_in_box(rays, AABB)
+    samples, _ = march(rays, March(enter, leave, state.jitter, state.next), lattice, grid)
+    assert samples.starts.numel() == 0

@@ -1,0 +1,128 @@
+"""What GPUs do with packed samples, without one: a fixed capacity, no number read, nothing sent there within a step.
+
+On the meta device nothing has a value, so whatever reads one is refused; and what goes from the host to it is seen.
+"""
+
+import pytest
+import torch
+from support.scenes import ball_scene
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.selftest.models import METHODS
+from nerf_lightning.training.system import RadianceFieldSystem
+
+# The one that asks how much it found, as the CPU does, is not for this.
+ON_DEVICES = [name for name in METHODS if name != "packed hash grid"]
+STEP = 3
+
+
+class FromTheHost(TorchDispatchMode):
+    """Write down what goes from the host to the device."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        out = operation(*args, **(kwargs or {}))
+        given = {x.device.type for x in args if isinstance(x, torch.Tensor) and x.dim()}
+        if isinstance(out, torch.Tensor) and out.device.type == "meta" and "cpu" in given:
+            self.seen.append(str(operation))
+        return out
+
+
+def a_system(name: str, scene, progress: Progress, loss=None) -> RadianceFieldSystem:
+    method = METHODS[name]
+    model = method.model()
+    model.fit_to(scene)
+    # torch's fused Adam does not know the device.
+    plain = method.optimizer if "hash" in name else lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    system = RadianceFieldSystem(
+        model, loss or method.loss(), plain, ExponentialDecay(), progress, 100, 0, "random", None, 1.0, None, {}
+    )
+    system.initialize()
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    return system
+
+
+def sent_within_a_step(name, monkeypatch, loss=None):
+    scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+    loader, system = RayBatches(scene, progress, 0, 64, 100), a_system(name, scene, progress, loss)
+    # What is read once in a run (switches, lattices) or at each update of the grid is read on the host.
+    system.training_step(loader.at(0, 0), 0)
+    system.to("meta")
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.guard.counts, system.guard.place = lambda: optimizer, None, None
+    batch, make, made = loader.at(0, 0).to("meta"), torch.tensor, []
+
+    def tensor(*given, **options):
+        made.append(str(options.get("device", "cpu")))
+        return make(*given, **options)
+
+    for progress.step in (STEP, STEP + 1):  # kept numbers are sent in the first
+        made.clear()
+        with FromTheHost() as watch, monkeypatch.context() as patch:
+            patch.setattr(torch, "tensor", tensor)
+            system.training_step(batch, 0)
+    return watch.seen + [device for device in made if "meta" in device]
+
+
+@pytest.mark.parametrize("name", ON_DEVICES)
+def test_a_step_reads_no_number_and_sends_nothing_to_the_device(name, monkeypatch):
+    assert sent_within_a_step(name, monkeypatch) == []
+
+
+class Planted(MeanSquaredError):
+    def __init__(self, fault):
+        super().__init__()
+        self.fault = fault
+
+    def forward(self, renderings, target, weight):
+        self.fault(renderings[-1].opacity)
+        return super().forward(renderings, target, weight)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda opacity: torch.arange(3.0).to(opacity.device),
+        lambda opacity: torch.tensor([1.0, 2.0], device=opacity.device),
+    ],
+)
+def test_what_is_sent_there_is_noticed(fault, monkeypatch):
+    assert sent_within_a_step("packed hash grid, fixed capacity", monkeypatch, Planted(fault)) != []
+
+
+@pytest.mark.parametrize("fault", [lambda opacity: opacity.mean().item(), lambda opacity: opacity.nonzero()])
+def test_what_is_read_there_is_refused(fault, monkeypatch):
+    with pytest.raises((RuntimeError, NotImplementedError), match=r"[Mm]eta"):
+        sent_within_a_step("packed hash grid, fixed capacity", monkeypatch, Planted(fault))
+
+
+def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():
+    losses, dropped = [], []
+    for name in ("packed hash grid", "packed hash grid, fixed capacity"):
+        scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+        system, loader = a_system(name, scene, progress), RayBatches(scene, progress, 0, 64, 100)
+        for _ in range(20):
+            system.training_step(loader.at(0, progress.rays_seen), 0)
+        losses.append(system.last_step["losses"])
+        dropped.append(system.model.statistics()["train/dropped_samples"])
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-4, atol=0)
+    assert dropped == [0, 0]
+
+
+def test_without_room_samples_are_dropped_and_counted():
+    scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+    system = a_system("packed hash grid, fixed capacity", scene, progress)
+    system.model.last.sampler.capacity = 500
+    loader = RayBatches(scene, progress, 0, 64, 100)
+    for _ in range(3):
+        system.training_step(loader.at(0, progress.rays_seen), 0)
+    assert system.model.statistics()["train/dropped_samples"] > 500
+    assert system.guard.skipped == 0

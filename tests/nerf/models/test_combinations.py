@@ -1,0 +1,120 @@
+"""Every sampler, field and encoder that make sense together learn a ball together."""
+
+import pytest
+import torch
+from support.scenes import ball_scene
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
+from nerf_lightning.nerf.encoders.gaussian_fourier import GaussianFourierEncoder
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.proposal import ProposalLoss
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.proposal_level import ProposalLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.optimizers.table_adam import TableAdam
+from nerf_lightning.nerf.samplers.importance import ImportanceSampler
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.proposal import ProposalSampler
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.system import RadianceFieldSystem
+
+POSITIONS = {
+    "frequency": lambda: FrequencyEncoder(4),
+    "gaussian_fourier": lambda: GaussianFourierEncoder(16, scale=0.5),
+    "hash_grid": lambda: HashGridEncoder(num_levels=3, log2_table_size=10, min_resolution=4, max_resolution=24),
+}
+DIRECTIONS = {"frequency": lambda: FrequencyEncoder(2), "spherical_harmonics": lambda: SphericalHarmonicsEncoder(3)}
+FIELDS = {
+    "nerf_mlp": lambda p, d: NerfMLP(p, d, depth=2, width=32, skip=None, density_activation="softplus"),
+    "hash": lambda p, d: HashField(p, d, width=32, density_bias=0.0),
+}
+MODELS = {
+    "coarse and fine": lambda field: {
+        "coarse": DenseLevel(StratifiedSampler(12), field()),
+        "fine": DenseLevel(ImportanceSampler(12), field()),
+    },
+    "occupancy": lambda field: {"fine": PackedLevel(OccupancySampler(resolution=16, num_steps=48), field())},
+    "cascades": lambda field: {
+        "fine": PackedLevel(OccupancySampler(resolution=8, num_cascades=3, num_steps=32, cone_angle=0.01), field())
+    },
+    "proposal": lambda field: {
+        "proposal": ProposalLevel(StratifiedSampler(24), field()),
+        "fine": DenseLevel(ProposalSampler(16), field()),
+    },
+}
+PAIRS = [("frequency", "frequency"), ("gaussian_fourier", "spherical_harmonics"), ("hash_grid", "spherical_harmonics")]
+CASES = [
+    (model, field, *pair)
+    for model in MODELS
+    for field in FIELDS
+    for pair in PAIRS
+    if not (field == "nerf_mlp" and pair[0] == "hash_grid")
+]
+
+
+@pytest.mark.parametrize(("model", "field", "position", "direction"), CASES)
+def test_it_learns(model, field, position, direction):
+    torch.manual_seed(4)
+    scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+    levels = RadianceModel(MODELS[model](lambda: FIELDS[field](POSITIONS[position](), DIRECTIONS[direction]())))
+    levels.fit_to(scene)
+    system = RadianceFieldSystem(
+        model=levels,
+        loss=ProposalLoss() if model == "proposal" else MeanSquaredError(),
+        optimizer=lambda groups: TableAdam(groups, lr=0.02),
+        schedule=ExponentialDecay(decay_rate=1.0),
+        progress=progress,
+        num_steps=60,
+        seed=0,
+        background="random",
+        tile_points=4096,
+        clip_norm=None,
+        sample_budget=None,
+        record={},
+    )
+    optimizer = system.configure_optimizers()
+    system.optimizers = lambda: optimizer
+    system.manual_backward = lambda loss: loss.backward()
+    loader = RayBatches(scene, progress, 0, 64, 60)
+    losses = []
+    for _ in range(30):
+        system.training_step(loader.at(0, progress.rays_seen), 0)
+        losses.append(float(system.last_step["losses"][-1]))
+    assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
+    assert system.guard.skipped == 0
+
+
+def test_rays_per_step_follow_the_budget_in_fixed_sizes():
+    scene, progress = ball_scene(num_views=8, size=16), Progress()
+    level = PackedLevel(
+        OccupancySampler(resolution=16, num_steps=48),
+        FIELDS["hash"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
+    )
+    model = RadianceModel({"fine": level})
+    model.fit_to(scene)
+    system = RadianceFieldSystem(
+        model=model, loss=MeanSquaredError(), optimizer=lambda groups: TableAdam(groups),
+        schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, background="white",
+        tile_points=None, clip_norm=None, sample_budget=1000, record={},
+    )  # fmt: skip
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    loader = RayBatches(scene, progress, 0, 512, 60)
+    sizes = []
+    for _ in range(40):
+        sizes.append(progress.batch_rays)
+        system.training_step(loader.at(0, progress.rays_seen), 0)
+    assert set(sizes) <= {512 >> number for number in range(8)}
+    changes = [step for step in range(1, 40) if sizes[step] != sizes[step - 1]]
+    assert changes
+    assert set(changes) <= {1, 16, 32}
+    wanted = 1000 / model.points_per_ray(training=True)
+    assert sizes[-1] <= wanted < 2 * sizes[-1]

@@ -1,0 +1,44 @@
+import torch
+from support.scenes import ball_scene, some_rays, tiny_model
+
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.randomness import batch_random
+
+
+def test_levels_run_in_order_and_the_fine_one_sees_the_union():
+    model = tiny_model()
+    renderings = model(some_rays(5), torch.ones(5, 3), batch_random(0, 5))
+    assert model.level_names == ("coarse", "fine")
+    assert [r.weights.shape[-1] for r in renderings] == [8, 16]
+    assert model.points_per_ray(training=True) == 16
+    assert isinstance(model, RadianceModel)
+
+
+def test_rays_are_rendered_one_by_one():
+    model, rays, background = tiny_model(), some_rays(7), torch.rand(7, 3)
+    whole = model(rays, background, batch_random(4, 7))[-1]
+    one = model(rays[3:4], background[3:4], batch_random(4, 7)[3:4])[-1]
+    torch.testing.assert_close(whole.rgb[3:4], one.rgb)
+
+
+def test_tiles_cover_the_batch_evenly():
+    for count, size in [(10, 4), (1024, 85), (5, 9), (7, 7)]:
+        parts = list(tiles(count, size))
+        assert [i for part in parts for i in range(part.start, part.stop)] == list(range(count))
+        sizes = [part.stop - part.start for part in parts]
+        assert max(sizes) <= size
+        assert max(sizes) - min(sizes) <= 1
+    assert tile_rays_for(tiny_model(), 8192) == 512
+    assert tile_rays_for(tiny_model(), 1) == 1
+
+
+def test_a_picture_is_the_same_whatever_its_tiles():
+    model, scene = tiny_model(density_bias=1.0), ball_scene()
+    pictures = [
+        render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", points) for points in (64, 10**6)
+    ]
+    assert pictures[0].rgb.shape == (12, 12, 3)
+    torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
+    torch.testing.assert_close(pictures[0].depth, pictures[1].depth)

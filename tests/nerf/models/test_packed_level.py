@@ -1,0 +1,126 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import ball_scene, some_rays, tiny_field
+
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+
+
+def a_level(**settings):
+    torch.manual_seed(1)
+    field = tiny_field(density_activation="softplus", density_bias=1.0)
+    sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
+    level = PackedLevel(sampler, field)
+    level.fit_to(ball_scene(num_views=12))
+    level.sampler.occupy(torch.ones_like(level.sampler.possible))
+    return level
+
+
+def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
+    level, rays, background = a_level(), some_rays(60), torch.rand(60, 3)
+    inside = level.sampler.start(rays, None)
+    hit = inside.enter < inside.leave
+    near, far = inside.enter, torch.maximum(inside.leave, inside.enter + 1e-3)
+    dense = DenseLevel(StratifiedSampler(400), level.field)
+    boxed = replace(rays, near=near, far=far)
+    expected = dense(boxed, background, [], None)
+    with torch.no_grad():
+        found = level(rays, background, [], None)
+    torch.testing.assert_close(found.rgb[hit], expected.rgb[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.opacity[hit], expected.opacity[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.rgb[~hit], background[~hit])
+
+
+def test_rendering_in_rounds_equals_rendering_at_once():
+    """The same lattice, once with gradients (all samples of a ray in one go), once round by round."""
+    level, rays, background = a_level(), some_rays(80), torch.rand(80, 3)
+    whole = level(rays, background, [], None)
+    with torch.no_grad():
+        rounds = level(rays, background, [], None)
+    for name in ("rgb", "foreground", "opacity", "depth"):
+        torch.testing.assert_close(getattr(rounds, name), getattr(whole, name).detach(), atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("level", [PackedLevel, MaskedLevel])
+@pytest.mark.parametrize("distance", [2.5, 3.0, 8.0, 800.0])
+def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
+    """Rays that lie on the same lines, of photographs 4 units away and of a camera elsewhere, see the same."""
+    packed = a_level(resolution=8, num_steps=200, opaque_below=0.0)
+    level = packed if level is PackedLevel else MaskedLevel(packed.sampler, packed.field)
+    rays = some_rays(60)
+    moved = distance - 4.0
+    elsewhere = replace(
+        rays, origins=rays.origins - moved * rays.directions,
+        near=(rays.near + moved).clamp(min=0.01), far=rays.far + moved,
+    )  # fmt: skip
+    background = torch.zeros(60, 3)
+    with torch.no_grad():
+        here, there = level(rays, background, [], None), level(elsewhere, background, [], None)
+    assert float(here.opacity.max()) > 0.5
+    torch.testing.assert_close(there.opacity, here.opacity, atol=0.03, rtol=0)
+    torch.testing.assert_close(there.depth - moved, here.depth, atol=0.05, rtol=0)
+
+
+def test_tiles_change_nothing_but_rounding():
+    level, rays, random = a_level(), some_rays(50), batch_random(3, 50)
+    background = torch.rand(50, 3)
+    whole = level(rays, background, [], random).rgb
+    parts = [level(rays[part], background[part], [], random[part]).rgb for part in (slice(0, 20), slice(20, 50))]
+    torch.testing.assert_close(torch.cat(parts), whole)
+
+
+def test_samples_per_ray_are_measured_kept_and_loaded():
+    level = a_level()
+    model = RadianceModel({"fine": level})
+    assert model.points_per_ray(training=True) == 200  # nothing known yet: the most there can be
+    model(some_rays(50), torch.ones(50, 3), batch_random(0, 50))
+    model.update(16, 0)
+    counted = model.points_per_ray(training=True)
+    assert 5 < counted < 150
+    other = RadianceModel({"fine": a_level()})
+    other.load_state_dict(model.state_dict())
+    assert other.points_per_ray(training=True) == counted
+    assert model.statistics()["speed/samples_per_ray"] == pytest.approx(counted)
+    model.forget_measurements()
+    assert model.points_per_ray(training=True) == 200
+
+
+def test_a_picture_is_the_same_whatever_its_tiles():
+    model, scene = RadianceModel({"fine": a_level()}), ball_scene()
+    pictures = [render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", n) for n in (64, 10**6)]
+    torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
+
+
+def test_normal_noise_differs_from_sample_to_sample():
+    level = a_level()
+    level.field.density_noise = 1.0
+    rays = some_rays(1)[torch.zeros(2, dtype=torch.long)]
+    renders = level(rays, torch.ones(2, 3), [], batch_random(0, 2)).rgb
+    assert not torch.equal(renders[0], renders[1])
+
+
+def test_leaving_out_the_colour_of_what_is_transparent_changes_no_picture():
+    """Within 0.05 dB at any PSNR that matters: the largest difference is far below one of 255 steps."""
+    from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+    from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+    from nerf_lightning.nerf.fields.hash_field import HashField
+
+    level = a_level(opaque_below=1e-3)
+    encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=16)
+    torch.nn.init.normal_(encoder.table, std=2.0)
+    level.field = HashField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=-1.0)
+    rays, background = some_rays(200), torch.rand(200, 3)
+    whole = level(rays, background, [], None)
+    with torch.no_grad():
+        quick = level(rays, background, [], None)
+    assert float(whole.opacity.detach().std()) > 0.05
+    assert float((quick.rgb - whole.rgb.detach()).abs().max()) < 4e-3
+    assert float((quick.rgb - whole.rgb.detach()).abs().mean()) < 1e-3

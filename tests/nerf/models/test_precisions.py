@@ -1,0 +1,67 @@
+"""The same weights see the same in float32 and in bfloat16, in every model of conf/model."""
+
+import pytest
+import torch
+from support.configs import composed, options
+from support.scenes import ball_scene
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.tiles import tile_rays_for
+from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.step import Share, add_gradients
+
+# Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
+STEPS, SIDE, TILE_POINTS = 40, 16, 8192
+RAYS = {"nerf": 10, "nerf_occupancy": 16}
+MOST_RAYS = 64
+# Two of four: from both sides.
+SEEN_FROM = (0, 2)
+
+
+def trained(name, scene):
+    # Few frequencies: a field that is half trained at many is noise, of which any change makes other noise.
+    config = composed("train", f"model={name}", *["encoder.num_frequencies=4"] * name.startswith("nerf"))
+    if "resolution" in config.model.levels.fine.sampler:
+        config.model.levels.fine.sampler.update(resolution=32, num_steps=128)  # carved in a moment
+    model, loss = build(config.model), build(config.loss)
+    assert isinstance(loss, Loss)
+    model.fit_to(scene)
+    torch.manual_seed(2)
+    model.reset_parameters()
+    model.multiply_in("bfloat16")
+    optimizer = build(config.optimizer)([{"params": list(model.parameters())}])
+    rays = RAYS.get(name, MOST_RAYS)
+    batches = RayBatches(scene, Progress(), seed=0, batch_rays=rays, num_steps=STEPS)
+    for step in range(STEPS):
+        optimizer.zero_grad()
+        model.update(step, step)
+        batch = batches.at(0, step * rays)
+        share = Share(0, rays, batch.weight.sum())
+        tile = tile_rays_for(model, TILE_POINTS, training=True)
+        add_gradients(model, loss, lambda x: x.backward(), batch, share, batch_random(step, rays), "random", tile)
+        optimizer.step()
+    return model.eval()
+
+
+@pytest.mark.parametrize("name", options("model"))
+def test_weights_see_the_same_in_both_precisions(name):
+    scene = ball_scene(num_views=4, size=SIDE)
+    model, found = trained(name, scene), {}
+    for products in ("float32", "bfloat16"):
+        model.multiply_in(products)
+        measured = []
+        for view in SEEN_FROM:
+            picture = render_picture(model, scene.cameras, view, scene.near, scene.far, "white", TILE_POINTS)
+            measured.append(image_metrics(picture.rgb, photograph(scene, view, "white")))
+        # Of several views, as evaluations are: the coarse level moves the fine one's samples a little, and a field
+        # that is half trained shows each move.
+        found[products] = mean_over_images(measured)
+    assert abs(found["float32"]["psnr"] - found["bfloat16"]["psnr"]) < 0.05
+    assert abs(found["float32"]["ssim"] - found["bfloat16"]["ssim"]) < 0.001
+    assert found["float32"] != found["bfloat16"]  # they were computed differently

@@ -1,0 +1,93 @@
+"""A step for compilers like XLA's, tried without one: on the meta device, where nothing has a value, only a shape.
+
+There whatever reads a number or makes a shape of one is refused, and the operations of a step can be written down.
+"""
+
+import pytest
+import torch
+from support.scenes import ball_scene
+from support.static_models import MODELS, fast_model, static_system
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.types.progress import Progress
+
+
+class Operations(TorchDispatchMode):
+    """Write down each operation that makes or changes a tensor of the device, with its shapes."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen: list[tuple] = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        out = operation(*args, **(kwargs or {}))
+        if isinstance(out, torch.Tensor) and out.device.type == "meta":
+            shapes = tuple(tuple(x.shape) for x in args if isinstance(x, torch.Tensor))
+            self.seen.append((str(operation), shapes, tuple(out.shape)))
+        return out
+
+
+def operations_of_steps(name, steps, model=None, loss=None):
+    scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+    system = static_system(name, scene, progress, 100, model, loss)
+    loader = RayBatches(scene, progress, 0, 64, 100)
+    # What is read once in a run (switches, the grid's content) is read on the host.
+    system.model.update(4, 0)
+    system.model(loader.at(0, 0).rays, torch.zeros(64, 3), None)
+    system.to("meta")
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    lists = []
+    for step in steps:
+        progress.step = step
+        with Operations() as operations:
+            system.training_step(loader.at(0, progress.rays_seen).to("meta"), 0)
+        lists.append(operations.seen)
+    return lists
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_step_reads_no_number_and_is_the_same_program_each_time(name):
+    _, second, third, fourth = operations_of_steps(name, [1, 2, 3, 5])  # the optimizer's state is made in the first
+    assert len(second) > 100
+    assert second == third == fourth
+    assert not [seen for seen in second if "searchsorted" in seen[0]]
+
+
+def test_the_grid_is_updated_without_reading_a_number():
+    plain, _, update, same_cells = operations_of_steps("fast_dense", [5, 8, 16, 24])
+    assert len(update) > len(plain)
+    assert update == same_cells
+
+
+class Planted(MeanSquaredError):
+    def __init__(self, fault):
+        super().__init__()
+        self.fault = fault
+
+    def forward(self, renderings, target, weight):
+        self.fault(renderings[-1].opacity)
+        return super().forward(renderings, target, weight)
+
+
+FAULTS = {
+    "a number that is read": lambda opacity: opacity.mean().item(),
+    "a branch that depends on data": lambda opacity: bool(opacity.mean() > 0.5),
+    "a boolean mask": lambda opacity: opacity[opacity > 0.5].sum(),
+    "nonzero": lambda opacity: opacity.nonzero(),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_xla_could_not_compile_is_refused(name, fault):
+    with pytest.raises((RuntimeError, NotImplementedError), match=r"[Mm]eta"):
+        operations_of_steps(name, [1], loss=Planted(FAULTS[fault]))
+
+
+def test_the_packed_form_is_refused():
+    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
+        operations_of_steps("fast_dense", [2], model=fast_model(PackedLevel))

@@ -1,0 +1,87 @@
+import pytest
+import torch
+from support.scenes import some_rays
+
+from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, median_distances, weight_along
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+
+
+def straight_rays(count, near=0.0, far=1.0):
+    rays = some_rays(count)
+    return RayBundle(
+        rays.origins, rays.directions, torch.full((count,), near), torch.full((count,), far), rays.camera_index,
+        rays.view_directions,
+    )  # fmt: skip
+
+
+def seen(weights, samples, rays, kind=DenseRendering):
+    nothing = torch.zeros(rays.near.numel())
+    color = torch.zeros(rays.near.numel(), 3)
+    return kind(rgb=color, foreground=color, opacity=nothing, depth=nothing, weights=weights, samples=samples)
+
+
+def dense(weights, near=0.0, far=1.0):
+    rays = straight_rays(len(weights), near, far)
+    edges = torch.linspace(near, far, weights.shape[1] + 1).expand(len(weights), -1)
+    return seen(weights, RaySamples(edges), rays), rays
+
+
+def packed(weights, near=0.0, far=1.0):
+    """The same samples, ray after ray, those without weight left out, and two of padding behind them."""
+    rays = straight_rays(len(weights), near, far)
+    edges = torch.linspace(near, far, weights.shape[1] + 1)
+    ray, place = weights.nonzero(as_tuple=True)
+    bounds = torch.cat([torch.zeros(1, dtype=torch.long), (weights > 0).sum(1).cumsum(0)])
+    padding = torch.zeros(2)
+    samples = PackedSamples(
+        torch.cat([ray, torch.zeros(2, dtype=torch.long)]), torch.cat([edges[:-1][place], padding]),
+        torch.cat([edges[1:][place], padding]), bounds, bounds[-1],
+    )  # fmt: skip
+    return seen(torch.cat([weights[ray, place], padding]), samples, rays, PackedRendering), rays
+
+
+@pytest.mark.parametrize("kind", [dense, packed])
+def test_effective_samples_are_as_many_as_share_the_light(kind):
+    weights = torch.zeros(4, 10)
+    weights[0, 3] = 0.7
+    weights[1, :5] = 0.1
+    weights[2] = 0.05
+    assert effective_samples(*kind(weights)).tolist() == pytest.approx([1.0, 5.0, 10.0, 0.0])
+
+
+@pytest.mark.parametrize("kind", [dense, packed])
+def test_weight_lies_where_the_samples_are(kind):
+    weights = torch.zeros(2, 8)
+    weights[0, 1], weights[1, 6], weights[1, 7] = 1.0, 0.5, 0.25
+    assert weight_along(*kind(weights, near=2.0, far=6.0), bins=4).tolist() == [0.5, 0.0, 0.0, 0.375]
+
+
+@pytest.mark.parametrize("kind", [dense, packed])
+def test_the_median_lies_in_what_is_seen_and_not_between(kind):
+    weights = torch.zeros(4, 10)
+    weights[0, 1], weights[0, 8] = 0.3, 0.6
+    weights[1, 1], weights[1, 8] = 0.6, 0.3
+    weights[3] = 0.1
+    assert median_distances(*kind(weights)).tolist() == pytest.approx([0.85, 0.15, 1.0, 0.45])
+
+
+def test_many_rays_do_not_blur_the_median():
+    weights = torch.full((20_000, 5), 1e-4)
+    weights[:, 3] = 0.9
+    assert bool((median_distances(*dense(weights)) - 0.7).abs().max() < 1e-6)
+
+
+def test_all_parts_together_are_the_mean_opacity():
+    weights = torch.rand(7, 33) / 33
+    rendering, rays = dense(weights, near=0.5, far=3.0)
+    assert float(weight_along(rendering, rays, bins=50).sum()) == pytest.approx(float(weights.sum(1).mean()))
+
+
+def test_without_bounds_the_parts_are_those_of_the_spacing():
+    """Far is at 1 - 1 / 2000 of the spacing: 500 lies at 0.9995 of the way, though at half of the distance."""
+    weights = torch.zeros(1, 2)
+    weights[0, 0] = 1.0
+    rendering, rays = dense(weights, near=0.0, far=1000.0)
+    assert weight_along(rendering, rays, bins=4).tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert weight_along(rendering, rays, bins=4, endless=True).tolist() == [0.0, 0.0, 0.0, 1.0]

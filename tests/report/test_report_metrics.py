@@ -1,0 +1,13 @@
+"""What a page shows of metrics.json, which may be anybody's: what does not fit is left out."""
+
+import pytest
+
+from nerf_lightning.report.metrics import views_on_page
+
+
+@pytest.mark.parametrize("name", [[], {}, "x" * 5000, "a\x00", 10**400], ids=lambda name: str(name)[:9])
+def test_views_of_no_name_are_missing(tmp_path, name):
+    metrics = {"per_image": [{"name": name}], "worst_views": [name], "pictures": [name]}
+    worst, spread, missing = views_on_page(metrics, tmp_path)
+    assert (worst, spread) == ([], [])
+    assert len(missing) == 2

@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from support.corner import noise
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.sfm.video_frames import count_frames, frame_stride, sharpness, write_sharp_frames
+
+# imageio's reader of videos forgets its pipes.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+SIDE = 160
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """A camera that slides over a picture, with two frames of six still and the others shaken."""
+    imageio = pytest.importorskip("imageio.v3")
+    ground = Image.fromarray(noise(320, 0)).convert("RGB")
+    path = tmp_path_factory.mktemp("film") / "slide.mp4"
+    frames = []
+    for number in range(20):
+        frame = ground.crop((number * 4, number * 2, number * 4 + SIDE, number * 2 + SIDE))
+        shaken = ImageFilter.GaussianBlur({0: 3, 1: 2, 2: 2, 3: 0, 4: 2, 5: 3}[number % 6])
+        frames.append(np.asarray(frame.filter(shaken)))
+    imageio.imwrite(path, np.stack(frames), plugin="FFMPEG", fps=10, quality=9, macro_block_size=16)
+    return path, frames
+
+
+def test_blurred_frames_are_avoided(film, tmp_path):
+    path, frames = film
+    seen = []
+    assert write_sharp_frames(path, tmp_path, every=6, seen=seen.append) == 4
+    # The last group has frames 18 and 19 alone; 19 is blurred less.
+    assert sorted(file.name for file in tmp_path.iterdir()) == [f"frame_{n:06d}.jpg" for n in (3, 9, 15, 19)]
+    assert seen == list(range(1, 21))
+    written = np.asarray(Image.open(tmp_path / "frame_000009.jpg"), dtype=float)
+    assert np.abs(written - frames[9]).mean() < 6
+
+
+def test_every_frame_can_be_taken(film, tmp_path):
+    assert write_sharp_frames(film[0], tmp_path, every=1) == count_frames(film[0]) == 20
+
+
+@pytest.mark.parametrize("size", [(40, 60), (1200, 500)])
+def test_sharpness_falls_with_blur_and_scales_with_contrast_squared(size):
+    picture = Image.fromarray(noise(1280, 1)).crop((0, 0, *size)).convert("RGB")
+    blurred = [np.asarray(picture.filter(ImageFilter.GaussianBlur(radius))) for radius in (0, 1, 3, 9)]
+    values = [sharpness(frame) for frame in blurred]
+    assert values == sorted(values, reverse=True)
+    assert sharpness(blurred[0] // 2 * 2) == pytest.approx(4 * sharpness(blurred[0] // 2), rel=0.05)
+
+
+def test_an_even_slope_has_contrast_but_is_not_sharp():
+    slope = np.repeat(np.arange(0, 250, 5, dtype=np.uint8)[None, :, None], 20, axis=0).repeat(3, axis=2)
+    assert sharpness(slope) == 0.0
+
+
+def test_about_a_hundred_frames_are_left():
+    for count in (1, 50, 100, 199, 1000, 12345):
+        left = -(-count // frame_stride(count, None))
+        assert left == count or 100 <= left < 200
+
+
+def test_what_is_not_a_video_is_named(tmp_path):
+    path = tmp_path / "notes.mp4"
+    path.write_text("no film\n" * 100)
+    with pytest.raises(InputError, match=r"notes\.mp4 is not a video that is read here: mp4.*Convert it"):
+        count_frames(path)
+    with pytest.raises(InputError, match="is not a video that ffmpeg can read"):
+        write_sharp_frames(path, tmp_path, every=2)
+    with pytest.raises(InputError, match=r"none\.mp4: there is no such file"):
+        count_frames(tmp_path / "none.mp4")

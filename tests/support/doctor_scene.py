@@ -1,0 +1,82 @@
+"""A sound capture of the noisy corner as a scene, and what its checks say."""
+
+from dataclasses import replace
+from functools import cache
+
+import torch
+from support.corner import FOCAL, HEIGHT, WIDTH, corner_poses, photograph
+
+from nerf_lightning.data.pixels.store import layout
+from nerf_lightning.doctor import poses
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.examine import CHECKS, gather_evidence
+from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
+
+VIEWS = 12
+
+
+@cache
+def corner_scene() -> Scene:
+    """Twelve photographs on an arc, all of them good; every fourth is held out."""
+    c2w = corner_poses(VIEWS)
+    grey = torch.stack([torch.from_numpy(photograph(pose)) for pose in c2w])
+    rgba = grey[..., None].repeat(1, 1, 1, 4)
+    rgba[..., 3] = 255
+    # In the middle between the extremes, so that brightness can go either way.
+    rgba[..., :3] = 40 + (rgba[..., :3].float() * 0.6).to(torch.uint8)
+    held = tuple(range(0, VIEWS, 4))
+    return Scene(
+        name="corner",
+        cameras=pinhole_cameras(torch.from_numpy(c2w).float(), FOCAL, WIDTH, HEIGHT),
+        pixels=PixelStore(rgba.reshape(-1, 4), *layout([(WIDTH, HEIGHT)] * VIEWS), has_transparency=False),
+        near=torch.full((VIEWS,), 0.5),
+        far=torch.full((VIEWS,), 12.0),
+        aabb=torch.tensor([[-0.5] * 3, [0.5] * 3]),
+        splits={"train": tuple(v for v in range(VIEWS) if v not in held), "val": held, "test": held},
+        view_names=tuple(f"view {number}.png" for number in range(VIEWS)),
+        background="black",
+        to_user=torch.eye(4),
+        protocol={},
+        truth=None,
+        space="contracted",
+    )
+
+
+@cache
+def corner_evidence() -> Evidence:
+    """What the checks see of the sound capture."""
+    return gather_evidence(corner_scene())
+
+
+def with_poses(c2w: torch.Tensor) -> Evidence:
+    """The same photographs, so the same matches, with other poses."""
+    sound = corner_evidence()
+    cameras = replace(sound.scene.cameras, c2w=c2w)
+    return replace(sound, scene=replace(sound.scene, cameras=cameras), agrees=agreeing(sound.matches, c2w))
+
+
+def with_scene(**changes) -> Evidence:
+    """The same photographs and cameras, with other fields of the scene."""
+    sound = corner_evidence()
+    return replace(sound, scene=replace(sound.scene, **changes))
+
+
+def with_pictures(change) -> Evidence:
+    """Photographs after `change` (views, height, width, 4) -> the same."""
+    scene = corner_scene()
+    rgba = change(scene.pixels.rgba.view(VIEWS, HEIGHT, WIDTH, 4).clone())
+    transparent = bool((rgba[..., 3] < 255).any())
+    pixels = replace(scene.pixels, rgba=rgba.reshape(-1, 4), has_transparency=transparent)
+    return gather_evidence(replace(scene, pixels=pixels))
+
+
+def outcome(evidence: Evidence, checks=CHECKS) -> dict[str, Check]:
+    """Every check by its name."""
+    return {check.name: check for check in (fn(evidence) for fn in checks)}
+
+
+def but_poses(evidence: Evidence) -> dict[str, Check]:
+    """All but those that try many readings of the poses, which take longer."""
+    return outcome(evidence, [fn for fn in CHECKS if fn not in poses.CHECKS])

@@ -1,0 +1,63 @@
+"""Training any model yaml step by step on any device, with a handful of rays."""
+
+from dataclasses import dataclass, field
+
+import torch
+from support.configs import composed
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.data.pixels.placement import on_device
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.models.occupancy_level import GridLevel
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.selftest.scene import ball_scene
+from nerf_lightning.training.build import build_system
+from nerf_lightning.training.launch.trainer import PRODUCTS, TrainerSettings
+from nerf_lightning.training.system import RadianceFieldSystem
+
+RAYS = 48
+# Opaque matter is cut off where nothing can be seen of it any more: GPUs do not cut, and the losses are compared.
+CUT = 1e-6
+
+
+@dataclass
+class StepByStep:
+    """A run without Lightning: the system with stand-ins for what its trainer provides."""
+
+    system: RadianceFieldSystem
+    loader: RayBatches
+    losses: list[torch.Tensor] = field(default_factory=list)
+
+    def step(self) -> None:
+        """Make a batch and take a step."""
+        system, progress = self.system, self.system.progress
+        batch = self.loader.at(progress.attempt, progress.rays_seen)
+        system.training_step(batch.to(system.device), progress.step)
+        self.losses.append(system.last_step["losses"].sum())
+
+    def all_losses(self) -> torch.Tensor:
+        """Return the losses so far, on the host."""
+        return torch.stack(self.losses).cpu().double()
+
+
+def step_by_step(model: str, device: torch.device, precision: str = "32-true", tile_points: int | None = None):
+    """Prepare a model of conf/model on a device, its pixels there too."""
+    config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
+    settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
+    scene, progress = ball_scene(), Progress()
+    system = build_system(config, settings, scene, progress, 1000, {})
+    for level in system.model.modules():
+        if isinstance(level, GridLevel):
+            level.sampler.opaque_below = CUT
+    system.initialize()
+    system.model.multiply_in(PRODUCTS[precision])
+    system.to(device)
+    here = scene if device.type == "cpu" else on_device(scene, device)
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    return StepByStep(system, RayBatches(here, progress, 0, RAYS, 1000))
+
+
+def default_callbacks(*changes: str):
+    """Return the callbacks that `nerf train` has."""
+    return list(build(composed("train", *changes).callbacks).values())

@@ -1,0 +1,52 @@
+"""Models whose surface is known: solids of constant density, given by their signed distance."""
+
+from collections.abc import Callable
+
+import torch
+
+from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.types.renderings import FieldOutput
+
+INSIDE = 400.0
+"""Density well inside."""
+SOFT = 0.01
+"""Width of the surface, scene units."""
+
+Distance = Callable[[torch.Tensor], torch.Tensor]
+
+
+def red_and_green(positions: torch.Tensor) -> torch.Tensor:
+    """Red where x > 0, else green."""
+    red = (positions[..., :1] > 0).float()
+    return torch.cat([red, 1 - red, torch.zeros_like(red)], dim=-1)
+
+
+class SolidField(Field):
+    """Dense where a signed distance is negative; the same colour from all sides."""
+
+    def __init__(self, distance: Distance, color: Callable = red_and_green, inside: float = INSIDE):
+        super().__init__()
+        self.distance, self.color, self.inside = distance, color, inside
+        self.place_of_the_model = torch.nn.Parameter(torch.zeros(1))
+
+    def density(self, positions):
+        return self.inside * torch.sigmoid(-self.distance(positions) / SOFT)
+
+    def forward(self, positions, directions, random):
+        return FieldOutput(self.density(positions), self.color(positions))
+
+    def reset_parameters(self):
+        pass
+
+
+def solid(distance: Distance, samples: int = 192, **settings) -> RadianceModel:
+    """A model of one level."""
+    return RadianceModel({"fine": DenseLevel(StratifiedSampler(samples), SolidField(distance, **settings))}).eval()
+
+
+def ball(radius: float = 0.8, center=(0.0, 0.0, 0.0)) -> Distance:
+    """The signed distance of a ball."""
+    return lambda positions: (positions - torch.tensor(center)).norm(dim=-1) - radius

@@ -1,0 +1,87 @@
+"""Ways to break a good capture, each with what must be said of it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.posed_captures import Known, read, write_colmap, write_llff, write_transforms
+
+from nerf_lightning.errors import InputError
+
+MODEL = Path("sparse/0")
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "llff": lambda root: write_llff(root, Known()),
+    "colmap": lambda root: write_colmap(root, Known()),
+    "text": lambda root: write_colmap(root, Known(), ".txt"),
+    "transforms": lambda root: write_transforms(root, Known()),
+}
+
+
+class Cases:
+    """The malformed captures of one test file."""
+
+    def __init__(self) -> None:
+        self.params: list[Any] = []
+
+    def __call__(self, kind: str, message: str, **settings: object) -> Callable:
+        """Register a way to break a good capture of some kind, and the key words of its message."""
+
+        def register(damage: Callable[[Path], None]) -> Callable[[Path], None]:
+            self.params.append(pytest.param(kind, damage, message, settings, id=f"{kind}-{damage.__name__}"))
+            return damage
+
+        return register
+
+
+def refused(kind: str, root: Path, message: str, **settings: object) -> None:
+    """Read, and expect one paragraph and no other exception."""
+    with pytest.raises(InputError, match=message) as caught:
+        read("colmap" if kind == "text" else kind, root, **settings)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.endswith((".", ")")), text
+
+
+def refused_when_damaged(
+    tmp_path: Path, kind: str, damage: Callable[[Path], None], message: str, settings: dict
+) -> None:
+    """Write a good capture, break it, and expect the message."""
+    root = WRITERS[kind](tmp_path / "capture")
+    damage(root)
+    refused(kind, root, message, **settings)
+
+
+def edit_rows(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    rows = np.load(root / "poses_bounds.npy")
+    np.save(root / "poses_bounds.npy", change(rows))
+
+
+def edit_bytes(root: Path, name: str, old: bytes, new: bytes) -> None:
+    path = root / MODEL / name
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+
+
+def edit_text(root: Path, name: str, change: Callable[[str], str]) -> None:
+    path = root / MODEL / name
+    path.write_text(change(path.read_text()))
+
+
+def edit_json(root: Path, change: Callable[[Any], Any]) -> None:
+    path = root / "transforms.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+def edit_frame(root: Path, view: int, **changed: object) -> None:
+    def change(content: dict) -> dict:
+        content["frames"][view] |= changed
+        return content
+
+    edit_json(root, change)
+
+
+def one_picture(root: Path) -> Path:
+    return root / "images" / "p_3.png"

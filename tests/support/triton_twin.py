@@ -1,0 +1,27 @@
+"""The CUDA twin of the hash grid against its reference: on a GPU, or through triton's interpreter."""
+
+import torch
+
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
+
+
+def check_against_the_reference(device: str, count: int) -> None:
+    """Compare values and gradients, of tables in float32 and in half precision."""
+    from nerf_lightning.nerf.kernels.hash_grid import cuda as twin
+
+    twin.trial(device)
+    for features, levels, size in ((2, 3, 10), (4, 5, 12)):
+        layout = hash_grid_layout(levels, size, 4, 64)
+        table = torch.randn(layout.offsets[-1], features, device=device)
+        points = 1.2 * torch.rand(count, 3, device=device) - 0.1
+        grad = torch.randn(count, levels * features, device=device)
+        leaf = table.clone().requires_grad_()
+        expected = interpolate_torch(leaf, points, layout)
+        expected.backward(grad)
+        found, gradient = twin.forward(table, points, layout), torch.zeros_like(table)
+        twin.add_table_gradient(gradient, points, grad, layout)
+        assert float((found - expected.detach()).norm() / expected.detach().norm()) < 1e-5
+        assert float((gradient - leaf.grad).norm() / leaf.grad.norm()) < 1e-5
+        half = twin.forward(table.half(), points, layout)
+        assert 1e-6 < float((half - expected.detach()).norm() / expected.detach().norm()) < 2e-3

@@ -1,0 +1,184 @@
+"""The page while training: it shows what is learnt, changes nothing of it, and closes with the run."""
+
+import math
+import re
+import socket
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+from urllib.parse import urlsplit
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from support.ports import unused_port
+from support.running import FAST, start
+from support.viser_client import ViserClient
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.training.callbacks.live_view import LiveView
+from nerf_lightning.viewer.camera_state import CameraState
+from nerf_lightning.viewer.progressive import ProgressiveRendering
+from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.renderer import SlicedRenderer
+
+
+@pytest.fixture
+def capture(tmp_path):
+    import numpy as np
+    from support.scenes import ball_scene
+
+    scene = ball_scene(num_views=6, size=16, background="black")
+    poses = torch.eye(4).repeat(6, 1, 1)
+    poses[:, :3] = scene.cameras.c2w
+    pictures = torch.stack([scene.pixels.view(view) for view in range(6)]).float() / 255
+    np.savez(tmp_path / "ball.npz", images=pictures[..., :3].numpy(), poses=poses.numpy(), focal=1.6 * 16)
+    return tmp_path / "ball.npz"
+
+
+def run(capture, folder, *arguments):
+    return start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "final.video=false", "final.evaluate=false",
+        "logger=none", "trainer.num_threads=1", f"paths.output_dir={folder}", *arguments,
+    )  # fmt: skip
+
+
+def address_in(process):
+    for line in process.stdout:
+        found = re.search(r"Watch the training at (http://\S+)", line)
+        if found:
+            return found[1]
+    raise AssertionError("it never said where the page is")
+
+
+@pytest.mark.slow
+def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
+    steps = "trainer.max_steps=200"
+    alone = run(capture, tmp_path / "alone", steps)
+    watched = run(
+        capture,
+        tmp_path / "watched",
+        steps,
+        "viewer=on",
+        f"viewer.live_view.port={unused_port()}",
+        "viewer.live_view.max_height=48",
+    )
+    address = address_in(watched)
+    client, lazy = ViserClient(address, 64, 48), ViserClient(address, 64, 48, reads=False)
+    client.look_from(0)
+    lazy.look_from(0)
+    client.wait_for(len)
+    client.close()
+    again = ViserClient(address, 64, 48)
+    again.look_from(90)
+    again.wait_for(len)
+    hostile = ViserClient(address, 64, 48)
+    for changed in ({"fov": 0.0}, {"fov": math.inf}, {"image_width": 4e8}, {"image_width": 10**9, "image_height": 10}):
+        hostile.look_from(0, **changed)
+    for process in (alone, watched):
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 0, output
+        assert "Traceback" not in output
+    weights = [
+        torch.load(tmp_path / name / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+        for name in ("alone", "watched")
+    ]
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    with socket.socket() as freed:
+        freed.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        freed.bind(("127.0.0.1", urlsplit(address).port))
+    assert "token" not in (tmp_path / "watched" / "train.log").read_text()
+
+
+@pytest.fixture
+def trainer():
+    return Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+
+
+class ClockedQueue(RenderQueue):
+    """A clock in place of pictures: each slice takes a given time."""
+
+    def __init__(self, clock, seconds):
+        self.clock, self.seconds, self.slices = clock, seconds, 0
+        self._refinements = {0: ProgressiveRendering(lambda *_: None)}
+
+    def work(self):
+        self.clock.now += self.seconds
+        self.slices += 1
+        return True
+
+    def refresh(self):
+        pass
+
+
+class Clock:
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+class FakeSystem:
+    def eval(self):
+        pass
+
+    def train(self):
+        pass
+
+
+@pytest.mark.parametrize("slice_seconds", [0.01, 0.2, 2.0])
+def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, trainer, slice_seconds):
+    from nerf_lightning.training.callbacks import live_view
+
+    clock = Clock()
+    monkeypatch.setattr(live_view, "time", clock)
+    callback = LiveView(share=0.2)
+    queue = ClockedQueue(clock, slice_seconds)
+    monkeypatch.setattr(callback, "page", SimpleNamespace(queue=queue))
+    spent = 0.0
+    for _ in range(2000):
+        clock.now += 0.05  # a step
+        before = clock.now
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+        spent += clock.now - before
+    assert spent / clock.now < 0.2 + 2 * slice_seconds / clock.now
+    assert spent / clock.now > 0.1
+
+
+def test_nobody_looking_on_costs_nothing(trainer):
+    callback = LiveView()
+    queue = ClockedQueue(Clock(), 1.0)
+    queue._refinements.clear()
+    callback.page = SimpleNamespace(queue=queue)
+    for _ in range(10):
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+    assert queue.slices == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -1.0])
+def test_a_share_that_leaves_nothing_is_refused(share):
+    with pytest.raises(InputError, match="give a part of the time between 0 and 1"):
+        LiveView(share=share)
+
+
+def test_a_place_where_nobody_can_listen_is_refused_at_once():
+    with pytest.raises(InputError, match="cannot listen there"):
+        LiveView(host="192.0.2.1")
+    with pytest.raises(InputError, match="port=0"):
+        LiveView(port=0)
+    with pytest.raises(InputError, match="no name of a machine"):
+        LiveView(hosts=["a b"])
+
+
+def test_what_cannot_be_drawn_ends_no_training(trainer, caplog):
+    renderer = MagicMock(spec=SlicedRenderer)
+    renderer.slices.side_effect = ZeroDivisionError("float division by zero")
+    renderer.height_while_moving.return_value = 16
+    queue, refinement = RenderQueue(renderer), ProgressiveRendering(lambda *_: None)
+    queue.add(1, refinement)
+    callback = LiveView(share=0.9)
+    callback.page = SimpleNamespace(queue=queue)
+    for _ in range(5):
+        refinement.ask(CameraState(torch.eye(4)[:3], 0.0, 16, 16))
+        callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
+    assert renderer.slices.call_count > 1
+    assert caplog.text.count("could not be drawn: ZeroDivisionError") == 1

@@ -1,0 +1,183 @@
+"""The memory plan against the memory that a run really takes, measured in a process of its own."""
+
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.training import memory_plan
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.memory_plan import MemoryPlan, Row
+from nerf_lightning.training.memory_trial import peak_bytes
+from nerf_lightning.training.system import RadianceFieldSystem
+
+CPU = torch.device("cpu")
+
+MEASURE = """
+import ctypes, json, sys
+
+sys.path.insert(0, sys.argv[1])
+import torch
+from support.configs import composed
+from support.scenes import ball_scene
+
+from nerf_lightning.config.instantiate import build; from nerf_lightning.training.build import build_system
+from nerf_lightning.training.memory_plan import memory_plan
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.nerf.models.render_image import render_picture
+
+TILE = int(sys.argv[3])
+
+
+def status(name):
+    with open("/proc/self/status") as file:
+        return 1024 * int(next(line for line in file if line.startswith(name)).split()[1])
+
+
+def most(work):
+    "Bytes that the work adds to what is there."
+    ctypes.CDLL("libc.so.6").malloc_trim(0)  # what was freed before would be taken again
+    with open("/proc/self/clear_refs", "w") as file:
+        file.write("5")  # the peak is what there is now
+    before = status("VmRSS")
+    work()
+    return status("VmHWM") - before
+
+
+def built():
+    progress = Progress()
+    system = build_system(config, settings, scene, progress, 10, {})
+    settings.prepare(system.model)
+    system.initialize()
+    system.tile_points = TILE
+    optimizer = system.configure_optimizers()
+    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    return system, build(config.data)(scene=scene, progress=progress, seed=0, num_steps=10)
+
+
+def warm(system, batches):
+    "Load libraries and kernels, which are in no plan."
+    few = batches.at(0, 0)[:8]
+    system.accumulate_gradients(few, lambda loss: loss.backward())
+    with torch.no_grad():
+        system.model(few.rays, None, None)
+        image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
+    system.forget_measurements()
+    system.learn_points_per_ray()
+
+
+def train():
+    for _ in range(2):
+        batches.progress.batch_rays = batches.progress.largest_batch
+        system.training_step(batches.at(0, batches.progress.rays_seen), 0)
+
+
+def evaluate():
+    system.eval()
+    with torch.no_grad():
+        picture = render_picture(system.model, scene.cameras, 0, scene.near, scene.far, "white", TILE)
+        image_metrics(picture.rgb, picture.rgb)
+
+
+config = composed("train", f"model={sys.argv[2]}", "trainer.accelerator=cpu", "trainer.num_threads=1", *sys.argv[4:])
+settings = build(config.trainer)
+settings.prepare_machine()
+scene = ball_scene(num_views=6, size=320, background="random")
+settings.tile_points = TILE
+system, data = built()
+batches = data.batches
+warm(system, batches)
+measured = most(lambda: (train(), evaluate()))
+plan = memory_plan(settings, *built())
+print(plan)
+print(json.dumps([measured, plan.total]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of the resident memory is read from /proc")
+@pytest.mark.parametrize(
+    ("model", "precision", "tile", "overrides"),
+    [
+        ("nerf_tiny", "bf16-mixed", 131_072, ["data.batch_rays=4096"]),
+        ("fast_proposal", "bf16-mixed", 131_072, []),
+        pytest.param("nerf_tiny", "32-true", 131_072, ["data.batch_rays=4096"], marks=pytest.mark.exhaustive),
+        pytest.param("fast_small", "32-true", 131_072, [], marks=pytest.mark.exhaustive),
+        pytest.param("fast_small", "bf16-mixed", 131_072, [], marks=pytest.mark.exhaustive),
+        pytest.param("fast_proposal", "32-true", 131_072, [], marks=pytest.mark.exhaustive),
+    ],
+)
+def test_the_plan_is_right_to_a_fifth(model, precision, tile, overrides):
+    tests = str(Path(__file__).parents[1])
+    settings = [f"trainer.precision={precision}", *overrides]
+    command = [sys.executable, "-c", MEASURE, tests, model, str(tile), *settings]
+    seen = []
+    for _ in range(5):  # the gaps in the heap make one run take a fifth more than another of the same program
+        run = subprocess.run(command, check=True, capture_output=True, text=True)
+        print(run.stdout)
+        measured, planned = json.loads(run.stdout.splitlines()[-1])
+        if 0.8 * measured < planned < 1.2 * measured:
+            return
+        seen.append(measured)
+    pytest.fail(f"planned {planned}, measured {seen}")
+
+
+def test_what_a_chain_of_layers_holds_is_counted_to_the_byte():
+    weight, points = torch.randn(8, 8, requires_grad=True), torch.randn(1000, 8)
+
+    def forward():
+        hidden = points
+        for _ in range(3):
+            hidden = torch.nn.functional.linear(hidden, weight)
+        return hidden
+
+    layer = 1000 * 8 * 4
+    with torch.no_grad():
+        assert peak_bytes(forward, CPU) == 2 * layer  # one goes in, one comes out
+    assert peak_bytes(forward, CPU) == 3 * layer  # the way back needs what lies between
+    assert peak_bytes(forward, torch.device("meta")) == 0
+
+
+def test_views_and_what_was_there_before_take_nothing():
+    before = torch.zeros(1000)
+    assert peak_bytes(lambda: before.view(10, 100).t().add_(1.0), CPU) == 0
+    assert peak_bytes(lambda: before + 1.0, CPU) == 4000
+
+
+def plan(step, free, counts=True):
+    rows = [
+        Row("pixels", 3 * 10**9, "mapped file", counts),
+        Row("optimizer's state", 10**9, "memory", cure="shrink it"),
+    ]
+    steps = [Row("a step", step, "memory", cure="lower trainer.tile_points"), Row("or a picture", 10**9, "memory")]
+    return MemoryPlan(rows, steps, free)
+
+
+def test_the_total_counts_what_is_there_at_a_time_and_no_mapped_file():
+    assert plan(2 * 10**9, 10**10).total == 6 * 10**9
+    assert plan(10**8, 10**10).total == 5 * 10**9
+    assert plan(2 * 10**9, 10**10, counts=False).total == 3 * 10**9
+    assert "at most" in str(plan(2 * 10**9, 10**10)).splitlines()[-1]
+
+
+def test_a_shortage_is_said_with_its_cure():
+    assert plan(2 * 10**9, 7 * 10**9).warning is None
+    assert "lower trainer.tile_points" in str(plan(4 * 10**9, 7 * 10**9).warning)
+    assert "7.0 GB are free" in str(plan(4 * 10**9, 7 * 10**9).warning)
+
+
+def test_a_plan_is_logged_row_by_row(monkeypatch, caplog):
+    """What is logged is escaped, ends of lines too."""
+    plan = MemoryPlan([Row("pixels", 10, "memory")], [Row("a step", 20, "memory")], free=1000)
+    monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
+    parts = (kind.__new__(kind) for kind in (TrainerSettings, RadianceFieldSystem, RayDataModule))
+    with caplog.at_level(logging.INFO):
+        memory_plan.announce_memory(*parts)
+    assert caplog.messages == str(plan).splitlines()
+    assert len(caplog.messages) == 4

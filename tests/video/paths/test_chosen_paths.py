@@ -1,0 +1,220 @@
+"""Paths that a person lays: ellipses, drives, pans, photographs and keyframes, in the capture's own frame."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import project
+from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, similarity
+from nerf_lightning.nerf.geometry.poses import is_rigid, look_at, rotation_from_quaternion
+from nerf_lightning.video.paths.base import PathFrame
+from nerf_lightning.video.paths.ellipse import Ellipse
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
+from nerf_lightning.video.paths.look_at import LookAt
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.pan import Pan
+from nerf_lightning.video.paths.photographs import Photographs
+from nerf_lightning.video.paths.spiral import Spiral
+
+MIDDLE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def frame(count=8, long=4.0, short=2.0, height=1.0) -> PathFrame:
+    """Cameras on an ellipse around (1, 2, 3), whose long axis is 30 degrees from x; they look at that point."""
+    angle = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    flat = torch.stack([long * angle.cos(), short * angle.sin(), torch.full_like(angle, height)], dim=-1)
+    c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    eyes = MIDDLE + flat @ turn.mT
+    return PathFrame(
+        center=MIDDLE,
+        up=UP,
+        radius=4.0,
+        focal=140.0,
+        width=100,
+        height=80,
+        poses=look_at(eyes, MIDDLE.expand_as(eyes), UP),
+        view_names=tuple(f"IMG_{number:02d}.jpg" for number in range(count)),
+    )
+
+
+def keyframe_file(tmp_path, *keyframes):
+    write_keyframes(tmp_path / "keys.yaml", keyframes)
+    return str(tmp_path / "keys.yaml")
+
+
+def keys(tmp_path):
+    return keyframe_file(
+        tmp_path,
+        Keyframe((5.0, 2.0, 4.0), look_at=(1.0, 2.0, 3.0)),
+        Keyframe((1.0, 7.0, 5.0), direction=(0.0, -3.0, -1.0), fov=60.0),
+        Keyframe((-4.0, 2.0, 3.0), look_at=(1.0, 2.0, 3.0), up=(0.1, 0.0, 1.0)),
+    )
+
+
+def every_path(tmp_path):
+    return [
+        Orbit(5, radius=3.0, center=[0.0, 1.0, 2.0]),
+        Spiral(5, target=[0.0, 1.0, 2.0]),
+        LookAt(5, start=[6.0, 1.0, 2.0], end=[7.0, 8.0, 9.0]),
+        Pan(5, position=[6.0, 1.0, 2.0]),
+        Pan(5, view="IMG_03*"),
+        Photographs(5, views=[0, "IMG_05.jpg", 3]),
+        Photographs(5, views=[0, 2, 3], closed=True),
+        KeyframePath(keys(tmp_path), 5),
+    ]
+
+
+def in_another_frame(user: PathFrame, quaternion: list[float]) -> PathFrame:
+    """The same capture, brought elsewhere, turned and 2.5 times smaller."""
+    rotation = rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64))
+    to_user = similarity(rotation, torch.tensor([10.0, -3.0, 4.0], dtype=torch.float64), 2.5)
+    return replace(
+        user,
+        center=points_from_user(user.center[None], to_user)[0],
+        up=rotation.mT @ user.up,
+        radius=user.radius / 2.5,
+        poses=poses_from_user(user.poses, to_user),
+        to_user=to_user,
+    )
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_a_path_does_not_depend_on_the_working_frame(tmp_path, number):
+    """What the user gave in the user's frame is there, however the capture was moved, turned and scaled."""
+    path, user = every_path(tmp_path)[number], frame()
+    if isinstance(path, Spiral):  # it wants cameras that look the same way
+        user = replace(user, poses=user.poses[:3])
+    working = in_another_frame(user, [0.9, 0.1, -0.3, 0.2])
+    to_user = working.to_user
+    wanted, found = path.cameras(user), path.cameras(working)
+    assert is_rigid(found.c2w, tolerance=1e-9).all()
+    if isinstance(path, Orbit):  # its azimuth 0 is the working frame's
+        distance = (found.c2w[:, :, 3] - points_from_user(torch.tensor([[0.0, 1, 2]]).double(), to_user)).norm(dim=-1)
+        torch.testing.assert_close(distance, torch.full_like(distance, 3.0 / 2.5))
+    else:
+        torch.testing.assert_close(found.c2w, poses_from_user(wanted.c2w, to_user))
+        torch.testing.assert_close(found.focal, wanted.focal)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "end"), [([0.9, 0.1, -0.3, 0.2], 0), ([0.2, 0.1, -0.1, 0.9], 1)], ids=["one end", "other end"]
+)
+@pytest.mark.parametrize("target", [None, [0.0, 1.0, 2.0]])
+def test_an_ellipse_does_not_depend_on_the_working_frame(quaternion, end, target):
+    """But for the end of the long axis at which it begins, where the working frame's own x axis points."""
+    user = replace(frame(), poses=torch.cat([frame(height=0.0).poses, frame(height=2.0).poses]))
+    working = in_another_frame(user, quaternion)
+    found = Ellipse(8, target=target, rise=0.5).cameras(working)
+    assert is_rigid(found.c2w, tolerance=1e-9).all()
+    # Begun at the other end, the first half of the way is the second, and what rose there sinks.
+    wanted = Ellipse(8, target=target, start=180.0 * end, rise=0.5 * (1 - 2 * end)).cameras(user)
+    torch.testing.assert_close(found.c2w, poses_from_user(wanted.c2w, working.to_user))
+    torch.testing.assert_close(found.focal, wanted.focal)
+    aim = MIDDLE if target is None else torch.tensor(target, dtype=torch.float64)
+    for view in range(8):
+        torch.testing.assert_close(project(wanted, view, aim), wanted.center[view], atol=1e-3, rtol=0)
+
+
+def test_an_ellipse_goes_through_the_cameras_at_one_speed():
+    cameras = Ellipse(400).cameras(frame(360))
+    eyes = cameras.c2w[:, :, 3] - MIDDLE
+    c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
+    x, y = c * eyes[:, 0] + s * eyes[:, 1], c * eyes[:, 1] - s * eyes[:, 0]
+    torch.testing.assert_close(eyes[:, 2], torch.ones(400, dtype=torch.float64))
+    torch.testing.assert_close((x / 4) ** 2 + (y / 2) ** 2, torch.ones(400, dtype=torch.float64), rtol=0.05, atol=0)
+    assert float(x[0]) == pytest.approx(4.0, rel=0.02)  # from the long axis on
+    steps = (eyes - eyes.roll(-1, dims=0)).norm(dim=-1)
+    assert float(steps.max() / steps.min()) < 1.01
+    assert float(torch.linalg.cross(eyes[0], eyes[1])[2]) > 0  # anticlockwise
+    for view in (0, 100):
+        torch.testing.assert_close(project(cameras, view, MIDDLE), cameras.center[view], atol=1e-3, rtol=0)
+
+
+def test_an_ellipse_can_be_larger_backwards_and_rise():
+    around = replace(frame(), poses=torch.cat([frame(height=0.0).poses, frame(height=2.0).poses]))
+    plain, other = Ellipse(8).cameras(around), Ellipse(8, scale=2.0, turns=-1.0, rise=1.0).cameras(around)
+    first, second = plain.c2w[:, :, 3] - MIDDLE, other.c2w[:, :, 3] - MIDDLE
+    torch.testing.assert_close(2 * first[0, :2], second[0, :2])
+    torch.testing.assert_close(2 * first[1, :2], second[7, :2])
+    assert float(second[:, 2].max()) == pytest.approx(2.0)
+    assert float(second[:, 2].min()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_drive_is_straight_and_looks_at_its_target():
+    cameras = LookAt(5, start=[5.0, 0.0, 0.0], end=[5.0, 4.0, 0.0], target=[0.0, 0.0, 0.0]).cameras(frame())
+    assert cameras.c2w[:, :, 3].tolist() == [[5, y, 0] for y in range(5)]
+    for view in range(5):
+        torch.testing.assert_close(project(cameras, view, torch.zeros(3).double()), cameras.center[view])
+
+
+def test_a_drive_without_ends_goes_from_the_first_photograph_to_the_last():
+    cameras = LookAt(2).cameras(frame())
+    torch.testing.assert_close(cameras.c2w[:, :, 3], frame().poses[[0, -1], :, 3])
+
+
+def test_a_pan_turns_and_stays():
+    cameras = Pan(4, view=2, sweep=80.0).cameras(frame())
+    torch.testing.assert_close(cameras.c2w[:, :, 3], frame().poses[2, :, 3].expand(4, 3))
+    ahead, photograph = -cameras.c2w[:, :, 2], -frame().poses[2, :, 2]
+    torch.testing.assert_close(ahead[:, 2], photograph[2].expand(4))
+    level = torch.nn.functional.normalize(ahead[:, :2], dim=-1) @ torch.nn.functional.normalize(photograph[:2], dim=0)
+    wanted = [math.cos(math.radians(angle)) for angle in (-30, -10, 10, 30)]
+    torch.testing.assert_close(level, torch.tensor(wanted, dtype=torch.float64))
+    assert float(torch.linalg.cross(ahead[0], ahead[3])[2]) < 0  # from the left to the right
+
+
+def test_a_tilted_pan_looks_higher():
+    flat, high = (Pan(1, tilt=tilt).cameras(frame()).c2w[0, :, 2] for tilt in (0.0, 10.0))
+    assert math.degrees(math.asin(-high[2]) - math.asin(-flat[2])) == pytest.approx(10.0)
+
+
+def test_a_path_passes_the_photographs_as_they_were_taken():
+    chosen = frame().poses[[0, 3, 4]]
+    cameras = Photographs(2001, views=[0, "IMG_03*", 4]).cameras(frame())
+    for pose in chosen:
+        apart = (cameras.c2w - pose).abs().amax(dim=(-2, -1))
+        assert float(apart.min()) < 5e-3
+    torch.testing.assert_close(cameras.c2w[[0, -1]], chosen[[0, -1]])
+
+
+def test_a_closed_path_is_smooth_where_it_closes():
+    eyes = Photographs(400, closed=True).cameras(frame()).c2w[:, :, 3]
+    velocity = eyes.roll(-1, dims=0) - eyes
+    change = (velocity.roll(-1, dims=0) - velocity).norm(dim=-1)
+    assert float(change[-2:].max()) <= float(change[:-2].max()) * 1.01
+    assert float(velocity.norm(dim=-1).max() / velocity.norm(dim=-1).min()) < 2.5
+
+
+def test_a_far_photograph_takes_longer_to_reach():
+    eyes = MIDDLE + torch.tensor([[0.0, 9.0, 0.0], [1.0, 9.0, 0.0], [11.0, 9.0, 0.0]], dtype=torch.float64)
+    along_x = look_at(eyes, eyes - torch.tensor([0.0, 1.0, 0.0]).double(), UP)
+    x = Photographs(111).cameras(replace(frame(), poses=along_x)).c2w[:, 0, 3]
+    torch.testing.assert_close(x.diff(), torch.full((110,), 0.1, dtype=torch.float64))
+
+
+def test_fov_is_a_setting_of_every_path():
+    cameras = Photographs(3, fov=90.0, width=60).cameras(frame())
+    assert cameras.focal[0].tolist() == pytest.approx([30.0, 30.0])
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (Photographs(views=["IMG_99.jpg", 1]), r"no photograph IMG_99.jpg. It has 8, numbered from 0, with names like"),
+        (Photographs(views=[0, 8]), "no photograph 8. It has 8"),
+        (Photographs(views=[3]), r"names 1 photograph\(s\), and a path needs two"),
+        (Pan(view="IMG_7"), "path.view: the capture has no photograph IMG_7"),
+        (LookAt(target=[1.0, 2.0]), "path.target is .1.0, 2.0., but must be three finite numbers"),
+        (LookAt(start=[1.0, 2.0, 9.0], end=[3.0, 2.0, 9.0]), "frame 0 of the path looks along its own up axis"),
+        (LookAt(start=[1.0, 2.0, 3.0]), "frame 0 of the path"),
+    ],
+)
+def test_what_cannot_be_filmed_is_named(path, words):
+    with pytest.raises(InputError, match=words):
+        path.cameras(frame())

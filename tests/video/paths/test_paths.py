@@ -1,0 +1,193 @@
+import inspect
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra.utils import get_class
+from omegaconf import OmegaConf
+from support.configs import loaded, options
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, project
+from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
+from nerf_lightning.video.paths.auto import AutoPath, widest_gap
+from nerf_lightning.video.paths.base import PathFrame, frame_of
+from nerf_lightning.video.paths.orbit import Orbit
+
+
+def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64, poses=None):
+    poses = torch.eye(4, dtype=dtype)[None, :3] if poses is None else poses
+    return PathFrame(
+        center=torch.tensor([1.0, 2.0, 3.0], dtype=dtype),
+        up=torch.tensor(up, dtype=dtype),
+        radius=4.0,
+        focal=140.0,
+        width=100,
+        height=80,
+        poses=poses,
+    )
+
+
+def test_the_first_cameras_stand_where_geometry_says():
+    cameras = Orbit(num_frames=4, elevation=30.0).cameras(frame())
+    level, up = 4 * math.cos(math.pi / 6), 2.0
+    offsets = [[level, 0, up], [0, level, up], [-level, 0, up], [0, -level, up]]
+    wanted = torch.tensor(offsets, dtype=torch.float64) + frame().center
+    torch.testing.assert_close(cameras.c2w[:, :, 3], wanted)
+
+
+def test_start_and_direction():
+    eyes = Orbit(num_frames=4, elevation=0.0, start=90.0, turns=-1.0).cameras(frame()).c2w[:, :, 3] - frame().center
+    wanted = torch.tensor([[0.0, 4, 0], [4, 0, 0], [0, -4, 0], [-4, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(eyes, wanted)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.3, 0.5, -0.4)])
+def test_every_camera_looks_at_the_center_and_keeps_up_up(up):
+    around = frame(up)
+    cameras = Orbit(num_frames=7, elevation=-20.0, turns=2.0).cameras(around)
+    assert is_rigid(cameras.c2w, tolerance=1e-9).all()
+    unit = around.up / around.up.norm()
+    offsets = cameras.c2w[:, :, 3] - around.center
+    torch.testing.assert_close(offsets.norm(dim=-1), torch.full((7,), 4.0, dtype=torch.float64))
+    height = torch.full((7,), 4 * math.sin(math.radians(-20)), dtype=torch.float64)
+    torch.testing.assert_close(offsets @ unit, height)
+    for view in range(7):
+        middle = project(cameras, view, around.center)
+        torch.testing.assert_close(middle, torch.tensor([50.0, 40.0], dtype=torch.float64))
+        assert project(cameras, view, around.center + 0.1 * unit)[1] < 40.0
+
+
+def test_frames_are_evenly_spaced_and_the_last_is_not_the_first():
+    eyes = Orbit(num_frames=12).cameras(frame()).c2w[:, :, 3]
+    gaps = (eyes - eyes.roll(-1, dims=0)).norm(dim=-1)
+    torch.testing.assert_close(gaps, gaps[:1].expand(12))
+    assert gaps[0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("asked", "size", "focal"),
+    [
+        ({}, (100, 80), 140.0),
+        ({"width": 200}, (200, 160), 280.0),
+        ({"height": 40}, (50, 40), 70.0),
+        ({"width": 400, "height": 400}, (400, 400), 560.0),
+    ],
+)
+def test_another_size_keeps_the_field_of_view(asked, size, focal):
+    cameras = Orbit(num_frames=2, **asked).cameras(frame())
+    assert (int(cameras.width[0]), int(cameras.height[0])) == size
+    assert cameras.focal.tolist() == [[focal, focal]] * 2
+    assert cameras.center[1].tolist() == [size[0] / 2, size[1] / 2]
+    assert math.isclose(float(cameras.width[0] / cameras.focal[0, 0]), 100 / 140, rel_tol=1e-6)
+
+
+def test_a_radius_of_ones_own():
+    cameras = Orbit(num_frames=3, radius=1.5).cameras(frame(dtype=torch.float32))
+    distance = (cameras.c2w[:, :, 3] - frame(dtype=torch.float32).center).norm(dim=-1)
+    torch.testing.assert_close(distance, torch.full((3,), 1.5))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"num_frames": 0}, "path.num_frames is 0, but must be at least 1"),
+        ({"elevation": 90.0}, "path.elevation is 90.0, but must be between -90 and 90"),
+        ({"elevation": math.nan}, "path.elevation is nan"),
+        ({"radius": 0.0}, "path.radius is 0.0, but must be a positive distance"),
+        ({"radius": math.inf}, "path.radius is inf"),
+        ({"turns": 0.0}, "path.turns is 0.0"),
+        ({"start": math.nan}, "path.start is nan"),
+        ({"width": 0}, "path.width is 0"),
+        ({"height": -3}, "path.height is -3"),
+        ({"fps": 0}, "path.fps is 0"),
+        ({"fov": 180.0}, "path.fov is 180.0"),
+        ({"center": [0.0, 1.0]}, "path.center is .0.0, 1.0., but must be three finite numbers"),
+    ],
+)
+def test_a_bad_number_is_named(bad, words):
+    with pytest.raises(InputError, match=words):
+        Orbit(**bad).cameras(frame())
+
+
+def test_the_frame_of_a_capture():
+    eyes = torch.tensor([[3.0, 0, 1], [0, 5, 1], [1, 0, 4]])
+    target = torch.tensor([1.0, 0, 1])
+    c2w = look_at(eyes, target.expand(3, 3), torch.tensor([0.1, 0.2, 1.0]))
+    cameras = pinhole_cameras(c2w, focal=70.0, width=64, height=48)
+    around = frame_of(cameras, torch.tensor([[0.0, -1, 0], [2, 1, 2]]))
+    assert around.center.tolist() == [1, 0, 1]
+    assert around.up.tolist() == [0, 0, 1]
+    assert math.isclose(around.radius, (2 + math.sqrt(26) + 3) / 3, rel_tol=1e-6)
+    assert (around.focal, around.width, around.height) == (70.0, 64, 48)
+    assert frame_of(cameras, torch.zeros(2, 3), up=(0.0, 1.0, 0.0)).up.tolist() == [0, 1, 0]
+
+
+def test_a_path_leaves_the_lens_behind():
+    """What is rendered anew has no reason to be bent."""
+    c2w = look_at(torch.tensor([[3.0, 0, 1]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
+    bent = replace(pinhole_cameras(c2w, 70.0, 64, 48), lens=torch.full((1, 6), 0.1), lens_model="radial_tangential")
+    cameras = Orbit(num_frames=3).cameras(frame_of(bent, torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    assert cameras.lens_model == "pinhole"
+    assert cameras.lens.tolist() == [[0.0] * 6] * 3
+    assert cameras.focal.tolist() == [[70.0, 70.0]] * 3
+
+
+@pytest.mark.parametrize("name", options("path"))
+def test_the_yaml_lists_the_constructors_defaults(name):
+    listed = OmegaConf.to_container(loaded("path", name))
+    path = get_class(listed.pop("_target_"))
+    assert listed.pop("file", "???") == "???"
+    defaults = {name: each.default for name, each in inspect.signature(path).parameters.items()}
+    assert listed == {name: value for name, value in defaults.items() if value is not inspect.Parameter.empty}
+
+
+def ring(degrees, elevation=40.0, radius=4.0):
+    """Cameras that look at the frame's centre from azimuths in degrees."""
+    azimuth, height = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)), math.radians(elevation)
+    level = torch.stack([azimuth.cos(), azimuth.sin()], dim=-1) * math.cos(height)
+    offsets = torch.cat([level, torch.full_like(level[:, :1], math.sin(height))], dim=-1)
+    center = frame().center
+    eyes = center + radius * offsets
+    return look_at(eyes, center.expand_as(eyes), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_what_was_photographed_from_all_sides_is_filmed_from_all_sides_at_that_height():
+    cameras = AutoPath(num_frames=6).cameras(frame(poses=ring([0.0, 72.0, 144.0, 216.0, 288.0])))
+    wanted = Orbit(num_frames=6, elevation=40.0).cameras(frame())
+    torch.testing.assert_close(cameras.c2w, wanted.c2w)
+
+
+def test_what_was_photographed_from_one_side_is_filmed_from_there():
+    around = frame(poses=ring([-20.0, -10.0, 0.0, 10.0, 20.0]))
+    cameras = AutoPath(num_frames=16).cameras(around)
+    assert is_rigid(cameras.c2w).all()
+    mean = around.poses[:, :, 3].mean(dim=0)
+    most = (around.poses[:, :, 3] - mean).norm(dim=-1).max()
+    assert ((cameras.c2w[:, :, 3] - mean).norm(dim=-1) < most).all()
+    seen = torch.stack([project(cameras, view, around.center) for view in range(16)])
+    torch.testing.assert_close(seen, cameras.center)
+
+
+def test_the_widest_gap_does_not_depend_on_the_world():
+    offsets = torch.randn(8, 3, dtype=torch.float64)
+    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    up = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    assert widest_gap(offsets, up) == pytest.approx(widest_gap(3 * offsets @ rotation.mT, rotation @ up))
+
+
+def test_a_forward_facing_capture_is_looked_at_from_in_front():
+    cameras = replace(pinhole_cameras(torch.eye(4)[None, :3], 70.0, 64, 48), ndc=torch.ones(1, 2))
+    around = frame_of(cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    assert around.center.tolist() == [0.0, 0.0, -5.0]
+    assert around.up.tolist() == [0.0, 1.0, 0.0]
+
+
+def test_a_film_is_no_larger_than_asked():
+    large = replace(frame(), width=4000, height=3000, focal=3000.0)
+    cameras = AutoPath(num_frames=2).cameras(large)
+    assert (int(cameras.width[0]), int(cameras.height[0])) == (480, 360)
+    assert float(cameras.focal[0, 0]) == pytest.approx(360.0)
+    assert int(AutoPath(num_frames=2, width=800).cameras(large).height[0]) == 600
+    assert int(AutoPath(num_frames=2).cameras(frame()).width[0]) == 100

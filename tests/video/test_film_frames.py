@@ -1,0 +1,158 @@
+"""Frames on the disk: a stopped film goes on, another one begins anew, and nothing is lost when the disk is full."""
+
+import errno
+import json
+
+import pytest
+import torch
+from filelock import FileLock
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.video import frames as film_frames
+from nerf_lightning.video.frames import FilmFrames
+
+PICTURE = torch.full((8, 10, 3), 100, dtype=torch.uint8)
+
+
+def frames(folder, form="video", films=("video", "depth")):
+    return FilmFrames(folder, films, 4, form)
+
+
+def opened(each, fingerprint="a", measured=(1.0, 2.0)):
+    return each.open(fingerprint, lambda: measured)
+
+
+def stop_after(folder, *numbers, form="video"):
+    each = frames(folder, form)
+    opened(each)
+    for number in numbers:
+        for film in each.films:
+            each.save(film, number, PICTURE)
+    each.close()
+
+
+def test_a_stopped_film_goes_on_with_what_is_missing_and_the_same_colours(tmp_path):
+    stop_after(tmp_path, 0, 2)
+    again = frames(tmp_path)
+    missing, depths = opened(again, measured=(7.0, 9.0))
+    assert (missing, depths) == ([1, 3], (1.0, 2.0))
+    for number in missing:
+        for film in again.films:
+            again.save(film, number, PICTURE)
+    again.finish(fps=4)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
+    assert again.results() == [tmp_path / "video.mp4", tmp_path / "depth.mp4"]
+
+
+def test_another_film_begins_anew(tmp_path):
+    stop_after(tmp_path, 0, 2)
+    missing, depths = opened(frames(tmp_path), fingerprint="b", measured=(7.0, 9.0))
+    assert (missing, depths) == ([0, 1, 2, 3], (7.0, 9.0))
+    assert not list((tmp_path / ".frames").glob("*/*.png"))
+
+
+def test_frames_that_are_the_result_are_replaced_by_another_films_and_else_kept(tmp_path):
+    stop_after(tmp_path, 0, 1, 2, 3, form="frames")
+    (tmp_path / "video" / "frame_0009.png").write_bytes(b"of a longer film")
+    (tmp_path / "video" / "note.txt").write_text("mine")
+    each = frames(tmp_path, "frames")
+    assert opened(each)[0] == []
+    each.finish(fps=4)
+    assert (tmp_path / "video" / "frame_0003.png").is_file()
+    assert opened(frames(tmp_path, "frames"), fingerprint="b")[0] == [0, 1, 2, 3]
+    assert [file.name for file in (tmp_path / "video").iterdir()] == ["note.txt"]
+
+
+def test_an_empty_file_is_no_frame(tmp_path):
+    stop_after(tmp_path, 0, 1)
+    (tmp_path / ".frames" / "depth" / "frame_0001.png").write_bytes(b"")
+    assert opened(frames(tmp_path))[0] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("note", ["", "[]", "{}", '{"fingerprint": "a"}', '{"fingerprint": "a", "depth_range": [1]}'])
+def test_a_note_that_says_nothing_is_not_believed(tmp_path, note):
+    stop_after(tmp_path, 0, 1)
+    (tmp_path / ".frames" / "film.json").write_text(note)
+    assert opened(frames(tmp_path))[0] == [0, 1, 2, 3]
+    assert json.loads((tmp_path / ".frames" / "film.json").read_text())["depth_range"] == [1.0, 2.0]
+
+
+def full(*arguments, **options):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_is_said_in_one_paragraph_and_the_frames_are_kept(tmp_path, monkeypatch):
+    stop_after(tmp_path, 0, 1)
+    each = frames(tmp_path)
+    opened(each)
+    monkeypatch.setattr(film_frames, "save_png", full)
+    with pytest.raises(
+        InputError, match=r"No space left.*2 of 4 frames are kept in .*goes on with the missing"
+    ) as said:
+        each.save("video", 2, PICTURE)
+    assert "\n" not in str(said.value)
+    each.close()
+    monkeypatch.undo()
+    assert opened(frames(tmp_path))[0] == [2, 3]
+
+
+def full_for_ffmpeg(*arguments, **options):
+    raise InputError("ffmpeg failed with code 228: No space left on device.")
+
+
+@pytest.mark.parametrize("failure", [full, full_for_ffmpeg])
+def test_a_disk_that_is_full_when_the_video_is_made_keeps_the_frames(tmp_path, monkeypatch, failure):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    each = frames(tmp_path)
+    opened(each)
+    monkeypatch.setattr(film_frames, "write_video", failure)
+    with pytest.raises(InputError, match=r"No space left.*4 of 4 frames are kept"):
+        each.finish(fps=4)
+    each.close()
+    assert opened(frames(tmp_path))[0] == []
+
+
+def test_a_frame_that_cannot_be_read_is_named(tmp_path):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    (tmp_path / ".frames" / "video" / "frame_0002.png").write_bytes(b"no picture")
+    each = frames(tmp_path)
+    opened(each)
+    with pytest.raises(InputError, match=r"frame_0002.png cannot be read. Remove it.*the same command"):
+        each.finish(fps=4)
+    assert not list(tmp_path.glob("*.mp4"))
+    each.close()
+
+
+def test_two_processes_do_not_film_into_one_folder(tmp_path):
+    (tmp_path / ".frames").mkdir()
+    with FileLock(tmp_path / ".frames" / "lock"), pytest.raises(InputError, match="in use by another process"):
+        opened(frames(tmp_path))
+
+
+def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    each, other = frames(tmp_path), frames(tmp_path)
+    opened(each)
+    release = each.close
+
+    def closed():
+        release()
+        opened(other, fingerprint="b")  # at the first chance
+        other.save("video", 0, PICTURE)
+
+    monkeypatch.setattr(each, "close", closed)
+    each.finish(fps=4)
+    assert (tmp_path / ".frames" / "video" / "frame_0000.png").is_file()
+    with pytest.raises(InputError, match="in use by another process"):
+        opened(frames(tmp_path), fingerprint="b")
+    other.close()
+    assert opened(frames(tmp_path, films=("video",)), fingerprint="b")[0] == [1, 2, 3]
+
+
+def test_nothing_hidden_stays_beside_a_finished_film(tmp_path):
+    stop_after(tmp_path, 0, 1, 2, 3)
+    (tmp_path / ".frames" / ".film.json.77.part").write_text("of a process that was killed")
+    each = frames(tmp_path)
+    opened(each)
+    each.finish(fps=4)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]

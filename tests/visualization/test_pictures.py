@@ -1,0 +1,140 @@
+import os
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerf_lightning.visualization.pictures import (
+    ERROR_SCALE,
+    color_map,
+    depth_picture,
+    error_picture,
+    mosaic,
+    save_png,
+    side_by_side,
+    to_bytes,
+    visible_range,
+)
+
+
+def test_bytes_are_clamped_and_rounded():
+    rgb = torch.tensor([[[-0.2, 0.0, 0.499 / 255], [0.501 / 255, 1.0, 1.7]]])
+    assert to_bytes(rgb).tolist() == [[[0, 0, 0], [1, 255, 255]]]
+
+
+def test_every_byte_survives_the_way_through_floats():
+    steps = torch.arange(256).repeat(3, 1).T
+    assert torch.equal(to_bytes(steps / 255), steps.to(torch.uint8))
+    assert to_bytes(torch.full((1, 3), float("nan"))).tolist() == [[0, 0, 0]]
+
+
+def test_a_saved_picture_reads_back_equal(tmp_path):
+    picture = torch.randint(0, 256, (5, 7, 3), dtype=torch.uint8)
+    path = tmp_path / "deep" / "er" / "a.png"
+    save_png(path, picture)
+    assert np.array_equal(np.asarray(Image.open(path)), picture.numpy())
+    assert [p.name for p in path.parent.iterdir()] == ["a.png"]
+
+
+def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    save_png(path, torch.zeros(2, 2, 3, dtype=torch.uint8))
+    before = path.read_bytes()
+
+    def full_disk(self, target, format):
+        target.write_bytes(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Image.Image, "save", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        save_png(path, torch.ones(2, 2, 3, dtype=torch.uint8))
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.png"]
+
+
+def test_colors_grow_brighter_from_low_to_high():
+    ramp = color_map(torch.linspace(2, 6, 64)[None], 2.0, 6.0)[0]
+    luma = ramp @ torch.tensor([0.2126, 0.7152, 0.0722])
+    assert (luma.diff() > 0).all()
+    assert luma[0] < 0.05
+    assert luma[-1] > 0.9
+    reversed_ramp = color_map(torch.linspace(2, 6, 64)[None], 6.0, 2.0)[0]
+    torch.testing.assert_close(reversed_ramp, ramp.flip(0))
+
+
+def test_colors_outside_the_range_are_its_ends():
+    low, high, inside_out = float("-inf"), float("inf"), float("nan")
+    ends = color_map(torch.tensor([[low, 0.0, inside_out, 1.0, 9.0, high]]), 0.0, 1.0)[0]
+    assert torch.equal(ends[0], ends[1])
+    assert torch.equal(ends[2], ends[1])
+    assert torch.equal(ends[3], ends[4])
+    assert torch.equal(ends[3], ends[5])
+    assert color_map(torch.full((1, 1), 3.0), 3.0, 3.0).isfinite().all()
+
+
+def test_side_by_side_keeps_the_pixels_and_whitens_the_gap():
+    one, two = torch.full((4, 3, 3), 10, dtype=torch.uint8), torch.full((2, 5, 3), 20, dtype=torch.uint8)
+    row = side_by_side([one, two], gap=2)
+    assert row.shape == (4, 10, 3)
+    assert (row[:, :3] == 10).all()
+    assert (row[:, 3:5] == 255).all()
+    assert (row[2:, 5:] == 20).all()
+    assert (row[:2, 5:] == 255).all()
+
+
+def test_visible_range_ignores_what_light_passes_through():
+    depth = torch.linspace(2, 4, 100).reshape(10, 10)
+    depth[0], depth[-1] = 100.0, float("inf")
+    opacity = torch.ones(10, 10)
+    opacity[0] = 0.1
+    near, far = visible_range(depth, opacity)
+    assert 2.2 <= near < 2.3
+    assert 3.7 < far <= 3.8
+    assert visible_range(depth, torch.zeros(10, 10))[1] > 50
+
+
+@pytest.mark.parametrize("size", [24, 100, 301])
+def test_the_depth_picture_keeps_the_pixels_left_of_its_scale(size):
+    depth = torch.linspace(2, 6, size).expand(size, size)
+    picture = depth_picture(depth, 2.0, 6.0)
+    expected = to_bytes(color_map(depth, 6.0, 2.0))
+    assert torch.equal(picture[:, :size], expected)
+    assert picture.shape[0] == size
+    assert picture.shape[1] < 1.25 * size + 40
+    # The bar runs from near (bright) on top to far.
+    bar = picture[:, size + max(3, max(10, round(0.03 * size)) // 3) + 1].float().mean(dim=-1)
+    assert bar[0] > 200
+    assert bar[-1] < 10
+
+
+def test_depth_fades_to_grey_where_nothing_is():
+    opacity = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
+    picture = depth_picture(torch.full((2, 2), 6.0), 2.0, 6.0, opacity)
+    assert picture[0, 1].tolist() == [237, 237, 237]
+    assert picture[0, 0].max() < 10
+
+
+def test_error_has_a_fixed_scale():
+    truth = torch.zeros(30, 30, 3)
+    render = truth.clone()
+    render[:, 10:20] = ERROR_SCALE
+    render[:, 20:] = -2 * ERROR_SCALE
+    picture = error_picture(truth, render)
+    ends = to_bytes(color_map(torch.tensor([[0.0, 1.0]]), 0.0, 1.0))[0]
+    assert torch.equal(picture[0, 0], ends[0])
+    assert torch.equal(picture[0, 15], ends[1])
+    assert torch.equal(picture[0, 25], ends[1])
+
+
+@pytest.mark.parametrize("size", [8, 100, 200])
+def test_the_mosaic_shows_truth_and_render_unscaled(size):
+    truth, render = torch.rand(size, size, 3), torch.rand(size, size, 3)
+    picture = mosaic(truth, render, torch.rand(size, size) + 2, torch.ones(size, size))
+    corner = max(10, round(0.03 * size)) // 2
+    top = picture.shape[0] - corner - size
+    assert torch.equal(picture[top : top + size, corner : corner + size], to_bytes(truth))
+    squares = picture[top : top + size].unfold(1, size, 1).permute(1, 0, 3, 2)  # at every column of the row
+    assert any(torch.equal(square, to_bytes(render)) for square in squares)
+    assert (picture[:corner] == 255).all()
+    assert (picture[:top] < 255).any(), "captions"
