@@ -49,7 +49,7 @@ class Budgets:
     event_bytes: int = 1 << 29
     """Of a run's TensorBoard files."""
     film_frames: int = 100_000
-    """Of a camera path that is given by times; an hour at 24 frames per second is less."""
+    """Of a camera path; an hour at 24 frames per second is less."""
     folders: int = 1_000_000
     """That are searched for runs."""
 

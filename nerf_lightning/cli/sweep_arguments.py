@@ -1,5 +1,6 @@
 """The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
 
+import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -116,5 +117,5 @@ def _swept(arguments: list[str]) -> list[str]:
 
 
 def _current_value(key: str) -> str:
-    is_group = (conf_folder() / key).is_dir()
+    is_group = os.path.isdir(conf_folder() / key)
     return f"${{hydra.runtime.choices.{key}}}" if is_group else f"${{{key}}}"

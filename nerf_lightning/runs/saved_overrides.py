@@ -148,7 +148,7 @@ def _is_harmless_alone(override: Override) -> bool:
         return False
     if package is not None and (_belongs(package, OF_THE_USER) or not all(map(KEY.fullmatch, package.split(".")))):
         return False
-    if package is not None or "/" in key or (conf_folder() / key).is_dir():
+    if package is not None or "/" in key or os.path.isdir(conf_folder() / key):
         names = value if isinstance(value, list) else [value]
         if key.partition("/")[0] == "hydra" or not all(_is_option(name) for name in names):
             return isinstance(value, dict) and _is_plain(key, value)

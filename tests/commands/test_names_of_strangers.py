@@ -66,6 +66,17 @@ def test_a_photograph_without_a_pose_has_a_name_too(tmp_path, name):
         read("colmap", root)
 
 
+@pytest.mark.parametrize("name", BAD[:3])
+def test_a_frame_without_a_picture_is_refused_for_its_name_first(tmp_path, name):
+    root = write_transforms(tmp_path / "capture", Known(c2w=ring()))
+    path = root / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["file_path"] = f"images/{name}"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"frames\[1\] has the name 'images/p_\\.*', which holds control characters"):
+        read("transforms", root)
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_a_frame_of_the_blender_format_is_refused(tmp_path, name):
     root = write_blender(tmp_path / "capture", {"train": 3, "val": 1, "test": 1})

@@ -245,6 +245,11 @@ OVERRIDES = {
 }
 
 
+def test_a_key_longer_than_names_of_files_is_no_group(run):
+    write_overrides(run, f"{'s' * 300}=1")
+    assert former_overrides(run, []) == [f"{'s' * 300}=1"]
+
+
 @pytest.mark.parametrize("line", OVERRIDES.values(), ids=OVERRIDES)
 def test_an_override_that_cannot_be_read_is_not_repeated(run, line):
     write_overrides(run, line)

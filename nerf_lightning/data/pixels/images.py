@@ -8,7 +8,7 @@ import threading
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from io import BufferedReader
 from pathlib import Path
 
@@ -46,6 +46,9 @@ DECODER_ERRORS = (
 
 # Python's list of warning filters belongs to all threads at once.
 _filters = threading.Lock()
+# Small files can announce large pictures, each of which takes gigabytes while it is decoded.
+LARGE = 40_000_000
+_one_large_picture = threading.RLock()
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -193,7 +196,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         if image.format == "JPEG":
             _check_jpeg(image, file, path)
         _check_plain(image, path)
-        yield image
+        with _one_large_picture if image.width * image.height > LARGE else nullcontext():
+            yield image
 
 
 def _check_jpeg(image: Image.Image, file: BufferedReader, path: Path) -> None:

@@ -17,7 +17,7 @@ from nerf_lightning.data.pixels.images import ENDINGS, image_size
 from nerf_lightning.data.pixels.photographs import Photograph
 from nerf_lightning.data.readers.transforms_intrinsics import focal_of, lens_of, number_of, size_of
 from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.escaping import listed, require_printable
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.nerf.geometry.frames import unit_of
@@ -137,6 +137,7 @@ def _absent(path: Path) -> str:
 def _picture(path: Path, where: str, name: object) -> Path:
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: file_path is {name!r}, but it must be the image's path as text.")
+    require_printable(name, where)
     # Windows writes backslashes; instant-ngp leaves endings out.
     named = path.parent / name.replace("\\", "/")
     found = [named] if named.suffix.lower() in ENDINGS else []

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
@@ -152,7 +153,10 @@ class CameraPath(ABC):
 
     def __post_init__(self) -> None:
         width, height, fov = self.width, self.height, self.fov
+        most = allowed().film_frames
         check_setting("num_frames", self.num_frames, self.num_frames >= 1, "at least 1")
+        limit = f"at most {most:,} (more with budgets.film_frames)"
+        check_setting("num_frames", self.num_frames, self.num_frames <= most, limit)
         check_setting("width", width, width is None or width >= 1, "at least 1 pixel, or null")
         check_setting("height", height, height is None or height >= 1, "at least 1 pixel, or null")
         check_setting("fov", fov, fov is None or 0 < fov < 180, "between 0 and 180 degrees, both excluded, or null")

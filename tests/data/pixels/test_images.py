@@ -1,4 +1,5 @@
 import struct
+import threading
 import zlib
 
 import numpy as np
@@ -7,6 +8,7 @@ from PIL import Image
 from support.budget import budget
 from support.captures import picture
 
+from nerf_lightning.data.pixels import images
 from nerf_lightning.data.pixels.images import (
     area_downscale,
     crop_to_multiple,
@@ -223,3 +225,16 @@ def test_a_page_without_a_size_is_damage(tmp_path):
     (tmp_path / "a.tif").write_bytes(content[:end] + struct.pack("<I", len(content)) + content[end + 4 :] + bytes(6))
     with pytest.raises(InputError, match=r"a.tif cannot be read: Missing dimensions. It is damaged"):
         image_size(tmp_path / "a.tif")
+
+
+def test_large_pictures_are_decoded_one_at_a_time(tmp_path, monkeypatch):
+    Image.new("RGB", (20, 10)).save(tmp_path / "a.png")
+    for least, waits in ((199, True), (200, False)):
+        monkeypatch.setattr(images, "LARGE", least)
+        read = threading.Event()
+        other = threading.Thread(target=lambda read=read: (images.read_rgba(tmp_path / "a.png"), read.set()))
+        with images._opened(tmp_path / "a.png"):
+            other.start()
+            assert read.wait(timeout=0.3 if waits else 30) is not waits
+        other.join()
+        assert read.is_set()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hydra.utils import get_class
 from omegaconf import OmegaConf
+from support.budget import budget
 from support.configs import loaded, options
 
 from nerf_lightning.errors import InputError
@@ -191,3 +192,12 @@ def test_a_film_is_no_larger_than_asked():
     assert float(cameras.focal[0, 0]) == pytest.approx(360.0)
     assert int(AutoPath(num_frames=2, width=800).cameras(large).height[0]) == 600
     assert int(AutoPath(num_frames=2).cameras(frame()).width[0]) == 100
+
+
+def test_a_film_has_no_more_frames_than_agreed():
+    with pytest.raises(
+        InputError, match=r"num_frames is 1000000000, .* at most 100,000 \(more with budgets\.film_frames\)"
+    ):
+        AutoPath(num_frames=10**9)
+    with budget(film_frames=10**9):
+        assert AutoPath(num_frames=10**9).num_frames == 10**9
