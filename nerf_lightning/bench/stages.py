@@ -36,7 +36,7 @@ def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.op
         found.append(positions_of(rays, samples))
 
     with torch.no_grad():
-        walking, screening = seconds_of(walk), seconds_of(lambda: level.field.screen(found[0]))
+        walking, screening = seconds_of(walk), seconds_of(lambda: level.field.density_and_features(found[0]))
     rest = whole - walking - screening
     return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
 

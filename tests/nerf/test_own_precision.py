@@ -46,7 +46,7 @@ PRODUCTS = {"matmul", "mm", "bmm", "mv", "dot", "einsum", "linear", "addmm", "ba
 RAYS = 40
 CONTRACTS = {"Encoder", "Sampler", "AnySampler", "CameraPath"}
 """Classes that are tried through those that follow them."""
-FORWARD_AGAIN = {"recall"}
+FORWARD_AGAIN = {"attach_gradients", "from_features"}
 """Methods that do what `forward` does, with what it returned before."""
 
 
@@ -135,7 +135,7 @@ def known() -> dict[str, Any]:
         "truth_normals": nn.functional.normalize(picture - 0.5, dim=-1), "mse": 0.01 * background, "render": picture,
         "truth": (picture + 0.05).clamp(max=1), "kept": picture[..., 0] > 0.1, "rgb": background,
         "weight": torch.ones(RAYS), "history": [composite(output(RAYS, 8), dense, rays, background)],
-        "screen_fn": lambda x: (x.square().sum(-1), None), "density_fn": lambda x: x.square().sum(-1) * 5,
+        "density_and_features": lambda x: (x.square().sum(-1), None), "density_fn": lambda x: x.square().sum(-1) * 5,
         "step": 0, "key": 3, 
         "around": frame_of(scene.cameras, scene.aabb, to_user=to_user, view_names=scene.view_names),
         "number": torch.arange(64), "found": torch.rand(64, generator=drawn), "decay": 0.95, "cascade": 0,

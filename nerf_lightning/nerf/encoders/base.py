@@ -22,7 +22,7 @@ class Encoder(nn.Module, ABC):
     def forward(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points features"]:
         """Return the features, in the points' dtype."""
 
-    def recall(
+    def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:
         """Return the features of points, with gradients, where they have been computed without them before."""

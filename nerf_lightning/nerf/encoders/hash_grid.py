@@ -67,7 +67,7 @@ class HashGridEncoder(Encoder):
         """Return the features, coarsest level first."""
         return self._interpolate(points, None)
 
-    def recall(
+    def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:
         """Return the features of points, with gradients, where they have been computed without them before."""

@@ -49,20 +49,20 @@ class Field(nn.Module, ABC):
     ) -> FieldOutput:
         """Return density and colour along rays; `random` is None outside training."""
 
-    def screen(
+    def density_and_features(
         self, positions: Float[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
-        """Return the density, and whatever `recall` can use instead of computing it again; None for nothing."""
+        """Return the density, and whatever `from_features` can use instead of computing it again; None for nothing."""
         return self.density(positions), None
 
-    def recall(
+    def from_features(
         self,
         positions: Float[Tensor, "*rays samples 3"],
         directions: Float[Tensor, "*rays 1 3"],
         random: RayRandom | None,
         features: Float[Tensor, "*rays samples features"],
     ) -> FieldOutput:
-        """Return what `forward` returns, given what `screen` found at the same positions; gradients included."""
+        """Return what `forward` returns, given the features of the same positions; gradients included."""
         return self(positions, directions, random)
 
     @abstractmethod

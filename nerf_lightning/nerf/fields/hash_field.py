@@ -82,9 +82,9 @@ class HashField(Field):
 
     def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Return the density per unit length, without paying for colour."""
-        return self.screen(positions)[0]
+        return self.density_and_features(positions)[0]
 
-    def screen(
+    def density_and_features(
         self, positions: Float[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density, and the encoder's features."""
@@ -100,7 +100,7 @@ class HashField(Field):
         """Return density and colour; density does not depend on the direction."""
         return self._output(self.position_encoder(self._unit(positions)), positions, directions)
 
-    def recall(
+    def from_features(
         self,
         positions: Float[Tensor, "*rays samples 3"],
         directions: Float[Tensor, "*rays 1 3"],
@@ -108,7 +108,9 @@ class HashField(Field):
         features: Float[Tensor, "*rays samples features"],
     ) -> FieldOutput:
         """Return what `forward` returns, without encoding the positions again."""
-        return self._output(self.position_encoder.recall(self._unit(positions), features), positions, directions)
+        return self._output(
+            self.position_encoder.attach_gradients(self._unit(positions), features), positions, directions
+        )
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -37,10 +37,10 @@ class DenseLevel(Level):
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
         along = samples.midpoints[..., None] * rays.directions[..., None, :]
-        output = self.ask(rays.origins[..., None, :] + along, rays.view_directions[..., None, :], random)
+        output = self.field_output(rays.origins[..., None, :] + along, rays.view_directions[..., None, :], random)
         return composite(output, samples, rays, background)
 
-    def ask(
+    def field_output(
         self,
         positions: Float[Tensor, "*rays samples 3"],
         directions: Float[Tensor, "*rays 1 3"],

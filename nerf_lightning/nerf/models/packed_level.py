@@ -103,7 +103,7 @@ class PackedLevel(GridLevel):
         """Render rays; without random numbers round by round, until each ray is opaque or has left the scene."""
         if random is None and not torch.is_grad_enabled():
             return self._render(rays, background)
-        samples, features = self.sampler(rays, self.field.screen, random)
+        samples, features = self.sampler(rays, self.field.density_and_features, random)
         capacity = self.sampler.capacity_on(rays.near.device)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         count = torch.full_like(samples.found, rays.near.shape[0])
@@ -121,19 +121,19 @@ class PackedLevel(GridLevel):
         if features is None:
             output = self.field(positions, directions, random)
         else:
-            output = self.field.recall(positions, directions, random, features[:, None])
+            output = self.field.from_features(positions, directions, random, features[:, None])
         return FieldOutput(density=output.density[:, 0], rgb=output.rgb[:, 0])
 
     def _look(self, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
         # Most samples are all but transparent: their colour, which costs most, is not asked for.
         positions = positions_of(rays, samples)
-        density, features = self.field.screen(positions)
+        density, features = self.field.density_and_features(positions)
         if features is None:
             return self._ask(rays, samples, None)
         rgb = density.new_zeros(density.shape[0], 3)
         seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
         directions = rays.view_directions[samples.ray_index[seen]]
-        output = self.field.recall(positions[seen][:, None], directions[:, None], None, features[seen][:, None])
+        output = self.field.from_features(positions[seen][:, None], directions[:, None], None, features[seen][:, None])
         rgb[seen] = output.rgb[:, 0]
         return FieldOutput(density=density, rgb=rgb)
 

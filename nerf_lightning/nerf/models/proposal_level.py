@@ -13,7 +13,7 @@ class ProposalLevel(DenseLevel):
 
     has_color = False
 
-    def ask(
+    def field_output(
         self,
         positions: Float[Tensor, "*rays samples 3"],
         directions: Float[Tensor, "*rays 1 3"],

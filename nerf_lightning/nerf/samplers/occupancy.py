@@ -45,7 +45,9 @@ RANGES = {
     "capacity": (1, 1 << 31),
 }
 DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
-ScreenFn = Callable[[Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]]
+DensityAndFeatures = Callable[
+    [Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]
+]
 
 
 class OccupancySampler(OccupancyGrid, AnySampler):
@@ -149,13 +151,13 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             )
 
     def forward(
-        self, rays: RayBundle, screen_fn: ScreenFn, random: RayRandom | None
+        self, rays: RayBundle, density_and_features: DensityAndFeatures, random: RayRandom | None
     ) -> tuple[PackedSamples, Float[Tensor, "capacity f"] | None]:
         """Return the occupied intervals of each ray up to where it is opaque, and their features.
 
         Args:
             rays: unit directions.
-            screen_fn: the field's, asked without gradients.
+            density_and_features: the field's, asked without gradients.
             random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
         """
         capacity = self.capacity_on(rays.near.device)
@@ -163,7 +165,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         if capacity is not None or self.opaque_below == 0:
             return samples, None
         with torch.no_grad():
-            density, features = screen_fn(positions_of(rays, samples))
+            density, features = density_and_features(positions_of(rays, samples))
             kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
             return samples.at(*kept), None if features is None else features[kept[0]]
 

@@ -16,13 +16,13 @@ def test_it_starts_near_zero():
     assert 0 < float(table.detach().abs().max()) <= 1e-4
 
 
-def test_recalled_features_have_the_gradients_of_computed_ones():
+def test_known_features_have_the_gradients_of_computed_ones():
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40)
     points, grad = torch.rand(50, 3), torch.randn(50, 12)
     with torch.no_grad():
         known = encoder(points)
     results = []
-    for features in (encoder(points), encoder.recall(points, known)):
+    for features in (encoder(points), encoder.attach_gradients(points, known)):
         encoder.table.grad = None
         features.backward(grad)
         results.append((features.detach(), encoder.table.grad.clone()))

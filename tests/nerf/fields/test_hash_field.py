@@ -45,14 +45,14 @@ def test_the_exponential_and_its_gradient_stay_finite():
 
 
 @pytest.mark.parametrize("encoder", [FrequencyEncoder(3), HashGridEncoder(num_levels=2, log2_table_size=8)])
-def test_screened_points_are_recalled_with_the_same_result(encoder):
+def test_features_that_are_known_give_the_same_result(encoder):
     field = HashField(encoder, SphericalHarmonicsEncoder(2), width=8)
     positions = 2 * torch.rand(30, 3) - 1
     directions = torch.nn.functional.normalize(torch.randn(30, 1, 3), dim=-1)
     with torch.no_grad():
-        density, features = field.screen(positions)
+        density, features = field.density_and_features(positions)
     whole = field(positions[:, None], directions, None)
-    again = field.recall(positions[:, None], directions, None, features[:, None])
+    again = field.from_features(positions[:, None], directions, None, features[:, None])
     torch.testing.assert_close(density, whole.density[:, 0])
     torch.testing.assert_close(again.rgb, whole.rgb)
     torch.testing.assert_close(again.density, whole.density)
