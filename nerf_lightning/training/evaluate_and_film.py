@@ -78,7 +78,8 @@ class Finish:
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
-        lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
+        if (folder / "tensorboard").is_dir():
+            lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
         say(*lines)
         return None if psnr is None else float(psnr)
 

@@ -1,0 +1,129 @@
+"""Structure from motion from beginning to end: photographs or a video in, a capture in a folder out, or nothing."""
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from nerf_lightning.console import StageProgress
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+from nerf_lightning.sfm.image_pairs import chosen_matching
+from nerf_lightning.sfm.photographs import FoundPhotograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.sfm.reconstruction import SparseModel, reconstruct
+from nerf_lightning.sfm.settings import SfmSettings, stage_costs
+from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sharp_frames
+
+READING, FRAMES = "reading photographs", "choosing frames"
+READING_COST, FRAME_COST = 0.1, 0.02
+UNFINISHED = ".poses.part"
+
+
+@contextmanager
+def _unfinished(folder: Path) -> Iterator[Path]:
+    """Lend a folder in `folder` that vanishes at the end, and `folder` with it if nothing came to lie in it."""
+    work, is_new = folder / UNFINISHED, not folder.exists()
+    work.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(work / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise InputError(
+            f"{folder} is in use by another process that finds poses there. Wait for it, or give another folder with "
+            "paths.output_dir=DIR."
+        ) from error
+    try:
+        _remove_content(work)  # what a killed process left
+        yield work
+    finally:
+        lock.release()
+        shutil.rmtree(work, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
+
+
+def _remove_content(work: Path) -> None:
+    for path in work.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "lock":
+            path.unlink()
+
+
+def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_outside: bool) -> tuple[SparseModel, str]:
+    """Find the cameras of a folder of photographs, and write a capture.
+
+    Args:
+        source: the photographs.
+        folder: to write; it may be the one that holds them, in `images`.
+        settings: of the reconstruction.
+        allow_outside: follow links out of the folder.
+
+    Returns:
+        What was found, and how photographs were paired.
+
+    Raises:
+        InputError: photographs that cannot be used, or whose cameras cannot be found.
+    """
+    photographs = find_photographs(source, allow_outside)
+    in_place = (folder / "images").exists()
+    turned = [photograph.path.name for photograph in photographs if not photograph.upright]
+    if in_place and turned:
+        raise InputError(
+            f"{listed(turned)} in {source} are stored turned (EXIF orientation) and must be written anew, but they lie "
+            "in the output folder itself. Give another folder with paths.output_dir=DIR."
+        )
+    costs = {READING: READING_COST * sum(p.width * p.height for p in photographs) / 1e6}
+    with _unfinished(folder) as work, StageProgress(costs | stage_costs(photographs, settings)) as report:
+        images = folder / "images" if in_place else work / "images"
+        images.mkdir(exist_ok=True)
+        for number, photograph in enumerate(photographs):
+            report(READING, number / len(photographs))
+            check_pixels(photograph)
+            if not in_place:
+                put_upright(photograph, images)
+        model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+        _publish(work, folder)
+    return model, chosen_matching(settings.matching, len(photographs))
+
+
+def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettings) -> tuple[SparseModel, str]:
+    """Choose sharp frames of a video, one of `every` (None: some hundred), find their cameras, and write a capture.
+
+    Raises:
+        InputError: no video, or one whose cameras cannot be found.
+    """
+    num_frames = count_frames(video)
+    stride = frame_stride(num_frames, every)
+    with _unfinished(folder) as work:
+        images = work / "images"
+        images.mkdir()
+        with StageProgress({FRAMES: FRAME_COST * num_frames}) as report:
+            write_sharp_frames(video, images, stride, lambda count: report(FRAMES, count / num_frames))
+        photographs = _frames(video, images, stride, num_frames)
+        with StageProgress(stage_costs(photographs, settings)) as report:
+            model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+        _publish(work, folder)
+    return model, chosen_matching(settings.matching, len(photographs))
+
+
+def _frames(video: Path, images: Path, stride: int, num_frames: int) -> list[FoundPhotograph]:
+    try:
+        return find_photographs(images)
+    except InputError as error:
+        raise InputError(
+            f"video={video}: one of every {stride} of its {num_frames} frames is not enough, or they are tiny. Give a "
+            "longer or larger video, or a smaller every=."
+        ) from error
+
+
+def _publish(work: Path, folder: Path) -> None:
+    """Move what is finished to its place; sparse/0 comes last, for it says that all is there."""
+    if (work / "images").exists():
+        (work / "images").rename(folder / "images")
+    (folder / "sparse").mkdir(exist_ok=True)
+    (work / "sparse" / "0").rename(folder / "sparse" / "0")
