@@ -2,58 +2,31 @@
 
 import logging
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerf_lightning import ranks
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
-from nerf_lightning.config.instantiate import build, required_path
-from nerf_lightning.config.load_model import load_weights
+from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.saved_overrides import to_give_again
-from nerf_lightning.training.build import build_system
-from nerf_lightning.training.callbacks.checkpoints import Checkpoints
-from nerf_lightning.training.callbacks.folder_guard import FolderGuard, require_run
+from nerf_lightning.training.build import Parts, build_parts
+from nerf_lightning.training.callbacks.folder_guard import require_run
 from nerf_lightning.training.callbacks.hparams import describe_run
-from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.callbacks.watcher import errors_told_once
-from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.memory_plan import announce_memory
-from nerf_lightning.training.system import RadianceFieldSystem
 from nerf_lightning.training.tile_size import measured_tile
 
 log = logging.getLogger(__name__)
-
-
-@dataclass
-class Parts:
-    """Everything that a run is made of, but for its place on the disk."""
-
-    settings: TrainerSettings
-    scene: Scene
-    num_steps: int
-    data: RayDataModule
-    system: RadianceFieldSystem
-    signals: StopSignals
-    callbacks: list[Callback]
-    finish: Finish
 
 
 def run(config: DictConfig) -> float | None:
@@ -69,7 +42,7 @@ def train(config: DictConfig) -> float | None:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
-    parts = _build_parts(config)
+    parts = build_parts(config)
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
@@ -100,44 +73,6 @@ def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> t
     held.append(folder)
     write_config(folder.path, config, HydraConfig.get())
     return folder.path, folder.resume_point()
-
-
-def _build_parts(config: DictConfig) -> Parts:
-    settings: TrainerSettings = build(config.trainer)
-    settings.prepare_machine()
-    finish = Finish.from_config(config)
-    scene: Scene = build(config.scene).read()
-    finish.require_film(scene)
-    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
-    num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
-    choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
-    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
-    progress = Progress()
-    system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
-    if config.init_from is not None:
-        start = read_checkpoint(required_path("init_from", config.init_from))
-        load_weights(system.model, start)
-        system.start_weights = start.weights
-    system.initialize()
-    system.configure_optimizers()  # what it refuses is refused before a folder is taken
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
-    signals = StopSignals()
-    callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
-    if "live_view" in config.viewer:
-        callbacks.append(build(config.viewer.live_view))
-    if config.budget.seconds is not None:
-        callbacks.append(TimeBudget(float(config.budget.seconds)))
-    # Checkpoints come last, so that they save what the others left.
-    callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
-    return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
-
-
-def _chosen_callbacks(config: DictConfig) -> list[Callback]:
-    chosen = build(config.callbacks)
-    for name, callback in chosen.items():
-        if not isinstance(callback, Callback):
-            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
-    return list(chosen.values())
 
 
 def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:

@@ -1,18 +1,86 @@
-"""The system of a run, from its config."""
+"""What a run is made of, from its config: scene, data, system, callbacks, and what follows."""
 
+from dataclasses import dataclass
 from typing import Any
 
-from omegaconf import DictConfig
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback
+from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.load_model import hold_to_budgets
+from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.config.instantiate import build, required_path
+from nerf_lightning.config.load_model import hold_to_budgets, load_weights
+from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
+from nerf_lightning.training.callbacks.folder_guard import FolderGuard
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.system import RadianceFieldSystem
+
+
+@dataclass
+class Parts:
+    """Everything that a run is made of, but for its place on the disk."""
+
+    settings: TrainerSettings
+    scene: Scene
+    num_steps: int
+    data: RayDataModule
+    system: RadianceFieldSystem
+    signals: StopSignals
+    callbacks: list[Callback]
+    finish: Finish
+
+
+def build_parts(config: DictConfig) -> Parts:
+    """Build all that a run is made of, and read its scene; nothing is written.
+
+    Raises:
+        InputError: anything in the config or in the capture that makes no run.
+    """
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    finish = Finish.from_config(config)
+    scene: Scene = build(config.scene).read()
+    finish.require_film(scene)
+    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
+    num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
+    choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
+    progress = Progress()
+    system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+        load_weights(system.model, start)
+        system.start_weights = start.weights
+    system.initialize()
+    system.configure_optimizers()  # what it refuses is refused before a folder is taken
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    signals = StopSignals()
+    callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
+    if "live_view" in config.viewer:
+        callbacks.append(build(config.viewer.live_view))
+    if config.budget.seconds is not None:
+        callbacks.append(TimeBudget(float(config.budget.seconds)))
+    # Checkpoints come last, so that they save what the others left.
+    callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
+    return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
+
+
+def _chosen_callbacks(config: DictConfig) -> list[Callback]:
+    chosen = build(config.callbacks)
+    for name, callback in chosen.items():
+        if not isinstance(callback, Callback):
+            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
+    return list(chosen.values())
 
 
 def build_system(

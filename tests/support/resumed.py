@@ -15,8 +15,8 @@ from support.altered import Altered
 from support.configs import composed
 from support.running import FAST, start
 
-from nerf_lightning.commands.train import _build_parts
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.training.build import build_parts
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.system import RadianceFieldSystem
 
@@ -42,7 +42,7 @@ class Resumed:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
             HydraConfig.instance().set_config(compose("train", return_hydra_config=True))
         settings = ("scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25")
-        parts = _build_parts(composed("train", *settings))
+        parts = build_parts(composed("train", *settings))
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"
