@@ -22,8 +22,7 @@ def rigid(evidence: Evidence) -> Check:
     if bad:
         cure = "Take scale and mirror out of the rotations; the centres keep them."
         return Check("rotations", "wrong", f"{evidence.named(bad)} have poses that are no rotations", cure)
-    apart = torch.cdist(c2w[:, :, 3], c2w[:, :, 3])
-    size = float(apart.max())
+    size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
         cure = "Walk around: depth is seen only from different places. Or the centres were lost in the conversion."
         return Check("rotations", "wrong", "all cameras stand at one place", cure)

@@ -51,3 +51,10 @@ class Evidence:
 
 
 CheckFn = Callable[[Evidence], Check]
+
+PAIRS_AT_ONCE = 1 << 24
+
+
+def rows_at_once(columns: int) -> int:
+    """Return how many of many things are compared at once with each of others: a capture may have 200,000 views."""
+    return max(1, PAIRS_AT_ONCE // columns)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
@@ -67,9 +67,9 @@ def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "conten
         return None
     if scene.space == "ndc":
         return torch.zeros(len(scene.points), dtype=torch.long), -scene.points[:, 2]
-    apart = torch.cdist(scene.cameras.c2w[:, :, 3], scene.points)
-    nearest = apart.min(dim=0)
-    return nearest.indices, nearest.values
+    eyes = scene.cameras.c2w[:, :, 3]
+    nearest = [torch.cdist(eyes, part).min(dim=0) for part in scene.points.split(rows_at_once(len(eyes)))]
+    return torch.cat([each.indices for each in nearest]), torch.cat([each.values for each in nearest])
 
 
 def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:

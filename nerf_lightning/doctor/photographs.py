@@ -1,10 +1,10 @@
 """Checks of the photographs themselves."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.doctor.view_statistics import THUMBNAIL
 
@@ -25,8 +25,8 @@ def duplicates(evidence: Evidence) -> Check:
     flat = evidence.looks.thumbnail.flatten(1)
     flat = flat - flat.mean(dim=1, keepdim=True)
     contrast = flat.std(dim=1)
-    apart = torch.cdist(flat, flat) / THUMBNAIL / contrast[:, None].clamp(min=1e-3)
-    same = ((apart < SAME) & (contrast[:, None] > 1e-3)).triu(diagonal=1).nonzero()
+    parts = torch.arange(len(flat)).split(rows_at_once(len(flat)))
+    same = torch.cat([_pairs_alike(flat, contrast, part) for part in parts])
     if not len(same):
         return Check("duplicates", "ok", "no photograph is there twice")
     scene = evidence.scene
@@ -37,6 +37,16 @@ def duplicates(evidence: Evidence) -> Check:
     if leak:
         message += f"; {len(leak)} of them are in training and held out at once, so scores will be too good"
     return Check("duplicates", "look", message, "Remove one of each (scene.frames, or from the file).")
+
+
+def _pairs_alike(
+    flat: Float[Tensor, "views values"], contrast: Float[Tensor, "views"], rows: Int[Tensor, "rows"]
+) -> Int[Tensor, "pairs 2"]:
+    """Return which later view each of some views equals, relative to its own contrast."""
+    apart = torch.cdist(flat[rows], flat) / THUMBNAIL / contrast[rows, None].clamp(min=1e-3)
+    later = torch.arange(len(flat)) > rows[:, None]
+    pairs = ((apart < SAME) & (contrast[rows, None] > 1e-3) & later).nonzero()
+    return torch.stack([rows[pairs[:, 0]], pairs[:, 1]], dim=1)
 
 
 def blur(evidence: Evidence) -> Check:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
 from nerf_lightning.escaping import listed
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
 from nerf_lightning.nerf.geometry.frames import gaps_around
@@ -90,8 +90,10 @@ def coverage(evidence: Evidence) -> Check:
 
 def _degrees_to_nearest(scene: Scene, held: list[int], train: list[int]) -> Float[Tensor, "held"]:
     towards = functional.normalize(scene.cameras.c2w[:, :, 3] - middle_of(scene), dim=-1)
-    cosine = (towards[held] @ towards[train].T).clamp(-1, 1)
-    return cosine.amax(dim=1).acos().rad2deg() if train else torch.zeros(len(held))
+    if not train or not held:
+        return torch.zeros(len(held))
+    parts = towards[held].split(rows_at_once(len(train)))
+    return torch.cat([(part @ towards[train].T).clamp(-1, 1).amax(dim=1) for part in parts]).acos().rad2deg()
 
 
 CHECKS = (number_of_views, splits, left_out, overlap, coverage)

@@ -9,6 +9,7 @@ from support.scenes import ball_scene
 from nerf_lightning.data.readers.colmap.reader import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.doctor import check
 from nerf_lightning.doctor.examine import examine, gather_evidence
 from nerf_lightning.doctor.view_statistics import sharpness_of
 
@@ -63,6 +64,19 @@ def test_a_duplicate_is_named_and_its_leak_into_the_held_out_views():
         return rgba
 
     judged(with_pictures(copy), "duplicates", "look", "view 0.png and view 1.png", "scores will be too good")
+
+
+def test_views_are_compared_a_few_at_a_time(monkeypatch):
+    def copy(rgba):
+        rgba[1], rgba[9] = rgba[0], rgba[8]
+        return rgba
+
+    evidence = with_pictures(copy)
+    whole = but_poses(evidence)
+    monkeypatch.setattr(check, "PAIRS_AT_ONCE", 5 * VIEWS)
+    assert check.rows_at_once(VIEWS) == 5
+    assert but_poses(evidence) == whole
+    judged(evidence, "duplicates", "look", "2 pairs")
 
 
 def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits():
