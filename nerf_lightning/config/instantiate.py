@@ -72,7 +72,7 @@ def _parameters(target: object) -> dict[str, inspect.Parameter]:
 
 def _require(value: Any, annotation: Any, path: str) -> None:
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
-    known = [option for option in options if option in PLAIN or get_origin(option) is Literal]
+    known = [option for option in options if option in PLAIN or get_origin(option) in (Literal, list)]
     ours = [option for option in options if inspect.isclass(option) and option.__module__.startswith(OURS)]
     if ours and len(known) + len(ours) == len(options) and not isinstance(value, dict):
         if any(_fits(value, option) for option in known):
@@ -87,6 +87,9 @@ def _require(value: Any, annotation: Any, path: str) -> None:
 def _fits(value: Any, option: Any) -> bool:
     if get_origin(option) is Literal:
         return value in get_args(option)
+    if get_origin(option) is list:
+        (each,) = get_args(option)
+        return isinstance(value, list) or (isinstance(value, str) and str in get_args(each))  # one name is a list, too
     if option is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool)
     if option is int:
@@ -97,6 +100,8 @@ def _fits(value: Any, option: Any) -> bool:
 def _words(option: Any) -> str:
     if get_origin(option) is Literal:
         return ", ".join(str(choice) for choice in get_args(option))
+    if get_origin(option) is list:
+        return "a list"
     names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
     return names[option]
 

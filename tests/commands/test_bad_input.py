@@ -162,6 +162,7 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),
         ("path=photographs path.views=[nobody,0]", "path.views: the capture has no photograph nobody"),
+        ("path=photographs path.views=-1", "path.views=-1 does not fit: it must be a list or null"),
         ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
         ("evaluation.split=all", "evaluation.split=all does not fit"),
