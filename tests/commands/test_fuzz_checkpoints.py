@@ -39,7 +39,7 @@ def render_a_pixel(file):
     assert bool(torch.isfinite(rgb).all())
 
 
-@fuzzed(80)
+@fuzzed(50)
 @given(st.data())
 def test_an_altered_checkpoint(runs, data):
     run = data.draw(st.sampled_from(runs))

@@ -190,7 +190,8 @@ def test_a_flood_of_pings_closes_its_client_alone(page, client):
     client.look_from(0)
     client.wait_for(len)
     pings = 200_000 * (b"\x89\xfd\x00\x00\x00\x00" + bytes(125))
-    with pytest.raises(OSError, match=r"reset|pipe"):
+    # Reset by the page, or closed by the client's own thread, which has noticed that first.
+    with pytest.raises(OSError, match=r"reset|pipe|file descriptor"):
         client.socket.socket.sendall(pings)
     page.still_serves()
 

@@ -10,7 +10,7 @@ CHECK = """
 import sys
 sys.path.insert(0, "tests")
 from support.triton_twin import check_against_the_reference
-check_against_the_reference("cpu", 300)
+check_against_the_reference("cpu", 140)
 """
 
 
