@@ -25,8 +25,8 @@ def evaluate(config: DictConfig) -> float:
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
     scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
     origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
+    scoring = build(config.evaluation)
     with torch.no_grad():
-        scored = model, scene, scene.background, opened.tile_points, folder, origin
-        metrics = build(config.evaluation).score(*scored)
+        metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)
     say(*metric_lines(metrics, folder))
     return float(metrics["psnr"])

@@ -12,6 +12,7 @@ from nerf_lightning.doctor.view_statistics import Looks
 from nerf_lightning.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
+PAIRS_AT_ONCE = 1 << 24
 Verdict = Literal["ok", "look", "wrong"]
 """`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be."""
 
@@ -51,8 +52,6 @@ class Evidence:
 
 
 CheckFn = Callable[[Evidence], Check]
-
-PAIRS_AT_ONCE = 1 << 24
 
 
 def rows_at_once(columns: int) -> int:

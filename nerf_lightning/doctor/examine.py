@@ -6,8 +6,7 @@ from contextlib import contextmanager
 import torch
 
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.doctor import cameras, extent, photographs, poses, views
-from nerf_lightning.doctor import memory as cost
+from nerf_lightning.doctor import cameras, extent, memory, photographs, poses, views
 from nerf_lightning.doctor.check import Check, CheckFn, Evidence
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
@@ -21,7 +20,7 @@ CHECKS: tuple[CheckFn, ...] = (
     *extent.CHECKS,
     *views.CHECKS,
     *photographs.CHECKS,
-    *cost.CHECKS,
+    *memory.CHECKS,
 )
 
 

@@ -44,10 +44,7 @@ def _ways_out(folder: Path) -> Iterator[Path]:
 
 def is_there(path: Path) -> bool:
     """Tell whether a file can be found; one whose name no file system takes cannot."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
+    return os.path.isfile(path)
 
 
 def is_absolute(name: str) -> bool:

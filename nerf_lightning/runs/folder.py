@@ -27,9 +27,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
-from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
-from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.summary import folders_of_runs, read_note
 from nerf_lightning.slurm import slurm_job, was_requeued
 from nerf_lightning.training.callbacks.folder_guard import require_run
 
@@ -225,18 +224,17 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
 
 
 def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
-    notes = sorted(_notes_below(root), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in notes:
-        note = read_note(file.parent)
+    for folder in sorted(folders_of_runs(root), key=_time_of_note, reverse=True):
+        note = read_note(folder)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
         finished = number(note.get("finished_at_step"))
         if ours and (finished is None or finished < num_steps):
-            return file.parent
+            return folder
     return None
 
 
-def _notes_below(root: Path) -> list[Path]:
-    return [base / "run.json" for base, _, names in walk(root) if "run.json" in names]
+def _time_of_note(folder: Path) -> float:
+    return (folder / "run.json").stat().st_mtime
 
 
 def _fresh(parent: Path) -> Path:

@@ -7,6 +7,7 @@ from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.json_files import number, read_json_object
+from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
 
 
@@ -45,6 +46,11 @@ def read_run(folder: Path) -> RunSummary:
 def read_note(folder: Path) -> dict[str, Any]:
     """Return the content of `run.json`, empty where it is missing or damaged."""
     return read_json_object(folder / "run.json")
+
+
+def folders_of_runs(root: Path) -> list[Path]:
+    """Return the folders below one, and itself, that hold a `run.json`."""
+    return [folder for folder, _, names in walk(root) if "run.json" in names]
 
 
 def by_key(overrides: list[str]) -> dict[str, str]:

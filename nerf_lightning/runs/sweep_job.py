@@ -21,8 +21,7 @@ from nerf_lightning.config.messages import paragraph
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.files.walk import walk
-from nerf_lightning.runs.summary import read_note
+from nerf_lightning.runs.summary import folders_of_runs, read_note
 from nerf_lightning.slurm import was_requeued
 
 MOST_BYTES = 1 << 20
@@ -126,7 +125,7 @@ def stop_file(sweep_folder: Path) -> Path:
 def _former_run(sweep_folder: Path, own: Path, config: DictConfig) -> Path | None:
     if "sweep" not in config or not (config.sweep.resume or was_requeued()):
         return None
-    others = sorted(base for base, _, names in walk(sweep_folder) if "run.json" in names and base != own)
+    others = sorted(folder for folder in folders_of_runs(sweep_folder) if folder != own)
     return finished_run([own, *others], config)
 
 

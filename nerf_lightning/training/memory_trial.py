@@ -7,7 +7,7 @@ pixels and in the rays of a tile, so a few trials say all.
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,7 +22,7 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.blending import background_colors
-from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.system import RadianceFieldSystem
@@ -107,17 +107,13 @@ def _step(
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
     copies = max(0.0, two - few * (2 * per_batch_ray + per_tile_ray) - gradients)
     tile_rays = num_rays if tile is None else min(num_rays, tile / model.points_per_ray(training=True))
-    loaded = sum(tensor.nbytes for tensor in _tensors(batch)) * (2 if batches.prefetch_for is not None else 1)
+    tensors = _tensors_in([batch.rgba, batch.weight, vars(batch.rays)])
+    loaded = sum(tensor.nbytes for tensor in tensors) * (2 if batches.prefetch_for is not None else 1)
     return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
 
 
 def _few_rays(model: RadianceModel, training: bool) -> int:
     return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
-
-
-def _tensors(batch: Batch) -> list[Tensor]:
-    rays = (getattr(batch.rays, field.name) for field in fields(batch.rays))
-    return [batch.rgba, batch.weight, *rays]
 
 
 def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> int:

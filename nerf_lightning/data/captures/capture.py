@@ -178,8 +178,9 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
         scales.append((x / downscale, y / downscale))
     scale = torch.tensor(scales, dtype=torch.float64)
     focal = column("focal") * scale
-    if not bool(((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all()):
-        view = capture.views[int(((focal < LEAST_FOCAL) | (focal > FARTHEST)).any(dim=-1).int().argmax())]
+    possible = ((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all(dim=-1)
+    if not bool(possible.all()):
+        view = capture.views[possible.tolist().index(False)]
         raise InputError(
             f"{capture.source}: the view {view.name} has a focal length of {view.focal[0]:g}, {view.focal[1]:g} pixels "
             f"of {view.size[0]:g} x {view.size[1]:g}, which no lens has on the picture that is there. Export the "

@@ -154,14 +154,6 @@ def check_divisible(width: int, height: int, downscale: int) -> None:
         )
 
 
-def is_folder(path: Path) -> bool:
-    """Tell whether a folder can be found; one whose name no file system takes cannot."""
-    try:
-        return path.is_dir()
-    except OSError:
-        return False
-
-
 def check_present(files: Iterable[Path], named_in: Path) -> None:
     """Refuse absent files, all at once.
 

@@ -2,13 +2,14 @@
 
 import logging
 import math
+import os
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 from nerf_lightning.data.captures.capture import Capture, cameras_of, check_capture, filtered
-from nerf_lightning.data.captures.checks import check_step, is_folder, known_background
+from nerf_lightning.data.captures.checks import check_step, known_background
 from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
@@ -130,7 +131,7 @@ class CaptureReader(Reader):
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
             raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
-        if not is_folder(folder):
+        if not os.path.isdir(folder):
             where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
             raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder

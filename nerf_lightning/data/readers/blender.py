@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -19,7 +20,6 @@ from nerf_lightning.data.captures.checks import (
     check_present,
     check_step,
     contents,
-    is_folder,
     known_background,
     one_size,
     pose_from_matrix,
@@ -179,7 +179,7 @@ class BlenderReader(Reader):
 
     def _frames(self) -> dict[str, list[Frame]]:
         """Return the frames of each split; a split without a file, or without frames, is an empty list."""
-        if not is_folder(self.root):
+        if not os.path.isdir(self.root):
             raise InputError(f"The folder {self.root} does not exist. Set scene.root to the capture's folder.")
         files = {split: self.root / f"transforms_{split}.json" for split in SPLITS}
         if not files["train"].is_file():

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import contents, is_folder
+from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.photographs import Photograph
 from nerf_lightning.errors import InputError
@@ -63,7 +63,7 @@ class LlffReader(CaptureReader):
     def _pictures(self, root: Path) -> Path:
         asked = [self.images] if self.images else ["images", "images_2", "images_4", "images_8"]
         for name in asked:
-            if is_folder(root / name):
+            if os.path.isdir(root / name):
                 return root / name
         raise InputError(f"{root} has no folder {' or '.join(asked)} with the photographs. Set scene.images to it.")
 

@@ -1,5 +1,6 @@
 """COLMAP reconstructions: `sparse/0` (or `sparse`) beside a folder of photographs."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
-from nerf_lightning.data.captures.checks import is_folder
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.photographs import Photograph
 from nerf_lightning.data.readers.colmap.model import find_model, model_files, read_model
@@ -51,7 +51,7 @@ class ColmapReader(CaptureReader):
             self.require_inside(path)
         model = read_model(folder)
         pictures = root / self.images
-        if not is_folder(pictures):
+        if not os.path.isdir(pictures):
             raise InputError(
                 f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
                 f"their folder below {root}."

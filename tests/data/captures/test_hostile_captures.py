@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 from support.budget import budget
 from support.captures import write_blender, write_npz
+from support.fuzzing import harmless
 from support.malformed import WRITERS, edit_json
 from support.posed_captures import Known, read, write_colmap
 from support.running import refused
@@ -21,6 +22,7 @@ from nerf_lightning.data.captures.reader import picture_files
 from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
 from nerf_lightning.sfm.photographs import find_photographs
 
@@ -170,6 +172,13 @@ def test_a_key_that_stands_twice_in_a_json(tmp_path):
     path = root / "transforms.json"
     path.write_text('{"fl_x": 99.0, ' + path.read_text().lstrip("{"))
     refused(read, "transforms", root, parts=("transforms.json", "the key 'fl_x' stands twice in one object"))
+
+
+def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
+    """Whoever looked back over all keys for each of them would take hours."""
+    keys = ", ".join(f'"{number}": 0' for number in range(200_000))
+    (tmp_path / "many.json").write_text(f'{{{keys}, "199999": 1}}')
+    assert harmless(read_json, tmp_path / "many.json") is None
 
 
 def blender(root, change):
