@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 import torch
 from hydra.utils import instantiate
-from support.configs import loaded, options
+from support.configs import composed, loaded, options
 from support.scenes import ball_scene, some_rays
 from torch import Tensor, nn
 
@@ -226,12 +226,18 @@ def paths(folder: Path) -> list[Any]:
     ]
 
 
+def chosen_sampler(option: str) -> Any:
+    return composed("train", "model=fast", f"sampler@model.levels.fine.sampler={option}").model.levels.fine.sampler
+
+
 @pytest.fixture(scope="module")
 def instances(tmp_path_factory) -> list[Any]:
     """One object of every class with methods that take tensors."""
     torch.manual_seed(0)
     small = {"occupancy": {"resolution": 16, "num_steps": 32}}
-    samplers = [instantiate(loaded("sampler", option), **small.get(option, {})) for option in options("sampler")]
+    samplers = [
+        instantiate(chosen_sampler(option), **small.get(option.partition("_")[0], {})) for option in options("sampler")
+    ]
     for sampler in samplers:
         sampler.fit_to(known()["scene"])
     grid = OccupancyGrid()
