@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from support.scenes import ball_scene
-from support.systems import gradients, make_system
+from support.steps import gradients, make_step
 
 from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import RayBatches
@@ -32,15 +32,15 @@ def test_the_shares_of_a_step_add_up_to_the_step(monkeypatch, world):
     """With masks: a mean of 1 over the whole batch, not over a share."""
     scene = ball_scene()
     scene.pixels.__dict__["mask"] = torch.rand(scene.pixels.rgba.shape[0]) > 0.3
-    whole, losses = gradients(make_system(100), scene)
-    weight = RayBatches(scene, make_system(100).progress, 0, 64, 10).at(0, 0).weight.sum()
+    whole, losses = gradients(make_step(100), scene)
+    weight = RayBatches(scene, make_step(100).progress, 0, 64, 10).at(0, 0).weight.sum()
     total, total_losses = 0.0, 0.0
     for number in range(world):
         monkeypatch.setattr(ranks, "world_size", lambda: world)
         monkeypatch.setattr(ranks, "rank", lambda number=number: number)
         monkeypatch.setattr(ranks, "add_up", lambda tensors: list(tensors))
         monkeypatch.setattr(ranks, "total", lambda own: weight)
-        part, part_losses = gradients(make_system(100), scene)
+        part, part_losses = gradients(make_step(100), scene)
         total, total_losses = total + part, total_losses + part_losses
     assert torch.allclose(total, whole, atol=1e-6)
     assert torch.allclose(total_losses, losses, rtol=1e-5)

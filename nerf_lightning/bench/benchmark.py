@@ -42,10 +42,10 @@ from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, RayBundle
-from nerf_lightning.training.build import build_system
+from nerf_lightning.training.build import build_step
 from nerf_lightning.training.callbacks.watcher import Watcher
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.tile_size import measured_tile
 
 MOST_STEPS = 2000
@@ -56,7 +56,7 @@ class Bench:
     """What is measured, ready to run."""
 
     settings: TrainerSettings
-    system: RadianceFieldSystem
+    step: TrainStep
     data: RayDataModule
     optimizer: torch.optim.Optimizer
     plain_optimizer: torch.optim.Optimizer
@@ -75,14 +75,14 @@ class Bench:
         """Compute gradients and update, and nothing else."""
         optimizer = self.plain_optimizer if plain else self.optimizer
         optimizer.zero_grad()
-        self.system.accumulate_gradients(batch, lambda loss: loss.backward())
+        self.step.gradients(batch)
         optimizer.step()
 
     def take_step(self) -> None:
         """Take one step of training, loading and all."""
         progress = self.batches.progress
         batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
-        self.system.training_step(batch, 0)
+        self.step(batch, self.optimizer)
 
 
 def benchmark(config: DictConfig) -> float:
@@ -102,8 +102,8 @@ def benchmark(config: DictConfig) -> float:
     kinds["train"]()
     peak = peak_memory()  # before the whole batches of the plain kinds
     seconds = _interleaved(kinds, config.rounds)
-    num_rays = bench.batch.rays.near.numel()
-    flops = flops_per_ray(bench.system, bench.batch)
+    num_rays = bench.batch.num_rays
+    flops = flops_per_ray(bench.step, bench.batch)
     seconds["wait"] = loaded_steps.waits[1:]
     per_round = [_round(seconds, i, num_rays, config.steps, config.render_rays, flops) for i in range(config.rounds)]
     result: dict[str, Any] = {name: min_median_max([row[name] for row in per_round]) for name in per_round[0]}
@@ -134,7 +134,7 @@ def _train_first(bench: Bench, config: DictConfig) -> tuple[float, int] | None:
     """Train until a PSNR is reached, and return seconds and steps; or for a number of steps."""
     if config.target_psnr is not None:
         most = config.warmup_steps or MOST_STEPS
-        return seconds_to_psnr(bench.take_step, bench.system, bench.batches, config.target_psnr, most)
+        return seconds_to_psnr(bench.take_step, bench.step, bench.batches, config.target_psnr, most)
     for _ in track(range(config.warmup_steps), "training first", console=stderr_console(), transient=True):
         bench.take_step()
     return None
@@ -146,18 +146,14 @@ def _prepare(config: DictConfig) -> Bench:
     scene = build(config.scene).read()
     progress = Progress()
     num_steps = max(1, config.warmup_steps)
-    system = build_system(config, settings, scene, progress, num_steps, {}).to(settings.device)
-    settings.prepare(system.model)
-    system.initialize()
+    step = build_step(config, settings, scene, progress, num_steps).to(settings.device)
+    settings.prepare(step.model)
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     data.settle(settings.device)
     if settings.measures_tile:
-        settings.tile_points = system.tile_points = measured_tile(settings, system, data.batches)
-    optimizer, plain = system.configure_optimizers(), torch.optim.Adam(system.model.parameters(), lr=1e-6)
-    # Stand-ins for what Lightning's trainer provides.
-    setattr(system, "optimizers", lambda: optimizer)  # noqa: B010
-    setattr(system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
-    return Bench(settings, system, data, optimizer, plain)
+        settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)
+    optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
+    return Bench(settings, step, data, optimizer, plain)
 
 
 def _interleaved(kinds: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
@@ -194,29 +190,29 @@ def _train(bench: Bench, steps: int, plain: bool) -> None:
     with _plainly(bench) if plain else nullcontext():
         for _ in range(steps):
             bench.train_on(bench.batch, plain)
-    bench.system.tile_points = bench.settings.tile_points
+    bench.step.tile_points = bench.settings.tile_points
 
 
 @contextmanager
 def _plainly(bench: Bench) -> Iterator[None]:
     """Compute as one would first write it; our kernel of the hash grid stays."""
-    samplers = [level.sampler for level in bench.system.model.modules() if isinstance(level, PackedLevel)]
+    samplers = [level.sampler for level in bench.step.model.modules() if isinstance(level, PackedLevel)]
     former = [sampler.opaque_below for sampler in samplers]
-    bench.system.tile_points = None
-    bench.system.model.multiply_in("float32")
+    bench.step.tile_points = None
+    bench.step.model.multiply_in("float32")
     for sampler in samplers:
         sampler.opaque_below = 0.0
     _release_gradients(bench)
     with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu"):
         yield
-    bench.settings.prepare(bench.system.model)
+    bench.settings.prepare(bench.step.model)
     for sampler, value in zip(samplers, former, strict=True):
         sampler.opaque_below = value
     _release_gradients(bench)
 
 
 def _release_gradients(bench: Bench) -> None:
-    for parameter in bench.system.model.parameters():
+    for parameter in bench.step.model.parameters():
         parameter.grad = None
         parameter.grad_in_place = False  # type: ignore[attr-defined]
 
@@ -225,7 +221,7 @@ def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[fl
     """Return the share of a step's time that each stage takes, where the model has stages."""
     result: dict[str, list[float]] = {}
     for one in seconds:
-        for name, value in stage_seconds(bench.system, bench.batch, bench.optimizer).items():
+        for name, value in stage_seconds(bench.step, bench.batch, bench.optimizer).items():
             result.setdefault(f"{name}, share of a step", []).append(value * steps / one)
     return result
 
@@ -233,22 +229,21 @@ def _stages(bench: Bench, seconds: list[float], steps: int) -> dict[str, list[fl
 def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
     """Return the seconds per step that go into TensorBoard, in all and by what is shown."""
     watchers = [callback for callback in build(config.callbacks).values() if isinstance(callback, Watcher)]
-    system, data = bench.system, bench.data
-    bench.take_step()  # losses to look at
-    seconds = watching_seconds(watchers, system, data, bench.batch)
+    seconds = watching_seconds(watchers, bench.step, bench.optimizer, bench.data, bench.batch)
     return {"watching, share of a step": sum(seconds.values())} | {
         f"watching: {name}, share of a step": value for name, value in seconds.items()
     }
 
 
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
-    rays = bench.batch.rays[torch.arange(num_rays, device=bench.settings.device) % bench.batch.rays.near.numel()]
-    size = num_rays if plain else tile_rays_for(bench.system.model, bench.settings.inference_tile_points)
+    places = torch.arange(num_rays, device=bench.settings.device) % bench.batch.num_rays
+    rays = bench.step.rays(bench.batch.pixels[places])
+    size = num_rays if plain else tile_rays_for(bench.step.model, bench.settings.inference_tile_points)
     with torch.no_grad(), _plainly(bench) if plain else nullcontext():
         for part in tiles(num_rays, size):
-            _render_tile(bench.system.model, rays[part], bench)
+            _render_tile(bench.step.model, rays[part], bench)
 
 
 def _render_tile(model: RadianceModel, rays: RayBundle, bench: Bench) -> None:
-    behind = background_colors(bench.system.background, rays.near.numel(), rays.near.device, random=None)
+    behind = background_colors(bench.step.background, rays.near.numel(), rays.near.device, random=None)
     model(rays, behind, random=None)

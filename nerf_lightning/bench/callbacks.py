@@ -8,11 +8,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from lightning.pytorch.loggers import TensorBoardLogger
+from torch.optim import Optimizer
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.watcher import Watcher
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 # A first look may have to load or compile something. A long one is not repeated: it counts for little there.
@@ -21,7 +23,8 @@ LONG_SECONDS = 5.0
 
 def watching_seconds(
     watchers: Iterable[Watcher],
-    system: RadianceFieldSystem,
+    step: TrainStep,
+    optimizer: Optimizer,
     data: RayDataModule,
     batch: Batch,
 ) -> dict[str, float]:
@@ -29,14 +32,17 @@ def watching_seconds(
 
     Args:
         watchers: those of a run's callbacks that look every few steps.
-        system: the model in training.
+        step: of the model in training; one is taken, so that there is something to look at.
+        optimizer: its own.
         data: its scene and rays.
         batch: the rays of a step.
     """
     seconds = {}
+    outputs = step(batch, optimizer, measure_gradients=True)
     with _trainer(data) as trainer:
+        system = _system(step, optimizer)
         for watcher in watchers:
-            look = partial(_look, watcher, trainer, system, batch)
+            look = partial(watcher.watch, trainer, system, outputs)
             first = seconds_of(look)
             seconds[type(watcher).__name__] = (
                 first if first > LONG_SECONDS else seconds_of(look)
@@ -44,9 +50,10 @@ def watching_seconds(
     return seconds
 
 
-def _look(watcher: Watcher, trainer: Any, system: RadianceFieldSystem, batch: Batch) -> None:
-    system.gradient_norms = system.model.gradient_norms()  # a step measures them for the look that follows
-    watcher.watch(trainer, system, batch)
+def _system(step: TrainStep, optimizer: Optimizer) -> RadianceFieldSystem:
+    system = RadianceFieldSystem(step, {})
+    setattr(system, "optimizers", lambda: optimizer)  # noqa: B010  Lightning's are its trainer's
+    return system
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.march.march import march
@@ -14,21 +15,21 @@ from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.rendering.packed import positions_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 LOOK_EVERY = 25
 VALIDATION_RAYS = 8192
 
 
-def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
+def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
     """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing."""
-    level = list(system.model.levels.values())[-1]
+    level = list(step.model.levels.values())[-1]
     if not isinstance(level, PackedLevel):
         return {}
-    rays, sampler = batch.rays, level.sampler
+    rays, sampler = step.rays(batch.pixels), level.sampler
     found: list[Tensor] = []
     optimizer.zero_grad()
-    whole = seconds_of(lambda: system.accumulate_gradients(batch, lambda loss: loss.backward()))
+    whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
 
     def walk() -> None:
@@ -42,23 +43,24 @@ def stage_seconds(system: RadianceFieldSystem, batch: Batch, optimizer: torch.op
 
 
 def seconds_to_psnr(
-    take_step: Callable[[], None], system: RadianceFieldSystem, batches: RayBatches, target: float, most_steps: int
+    take_step: Callable[[], None], training: TrainStep, batches: RayBatches, target: float, most_steps: int
 ) -> tuple[float, int] | None:
     """Train until the validation rays reach a PSNR; return training seconds and steps, or None where they never do."""
     rays = FixedRays(batches.scene, "val", VALIDATION_RAYS, VALIDATION_RAYS)
     used = 0.0
     for step in range(1, most_steps + 1):
         used += seconds_of(take_step)
-        if step % LOOK_EVERY == 0 and _psnr(system, rays) >= target:
+        if step % LOOK_EVERY == 0 and _psnr(training, rays) >= target:
             return used, step
     return None
 
 
 @torch.no_grad()
-def _psnr(system: RadianceFieldSystem, rays: FixedRays) -> float:
-    for number, batch in enumerate(rays):
-        system.validation_step(batch.to(system.device), number)
-    return system.val_errors.summary()["val/psnr"]
+def _psnr(training: TrainStep, rays: FixedRays) -> float:
+    errors = RayErrors()
+    for batch in rays:
+        training.validate(batch.to(training.device), errors)
+    return errors.summary()["val/psnr"]
 
 
 class LoadedSteps:
@@ -107,11 +109,11 @@ def multiplication(settings: TrainerSettings) -> Callable[[], None]:
     return multiply
 
 
-def flops_per_ray(system: RadianceFieldSystem, batch: Batch) -> float:
+def flops_per_ray(step: TrainStep, batch: Batch) -> float:
     """Count the operations that training takes per ray, forward and backward, in matrix products."""
     # Where rays differ in their samples, many make the mean.
-    few = 8 if system.model.points_per_ray(training=True) > 64 else min(1024, batch.rays.near.numel())
+    few = 8 if step.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
     with FlopCounterMode(display=False) as counter, without("mlp.cpu"):  # it counts one thread's
-        system.accumulate_gradients(rays, lambda loss: loss.backward())
+        step.gradients(rays)
     return counter.get_total_flops() / few

@@ -76,18 +76,19 @@ def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> t
 
 
 def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:
+    step = parts.system.step
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder)
         parts.settings.keep_precision(former.precision)
         parts.settings.keep_tile(former.tile_points)
-        parts.system.tile_points = parts.settings.tile_points
+        step.tile_points = parts.settings.tile_points
     parts.settings.prepare(parts.system.model)
     parts.system.record["precision"] = parts.settings.precision
     if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
-        tile = ranks.from_first(lambda: measured_tile(parts.settings, parts.system, parts.data.batches))
-        parts.system.tile_points = parts.settings.tile_points = tile
+        tile = ranks.from_first(lambda: measured_tile(parts.settings, step, parts.data.batches))
+        step.tile_points = parts.settings.tile_points = tile
     if ranks.is_first():
-        announce_memory(parts.settings, parts.system, parts.data)
+        announce_memory(parts.settings, step, parts.data)
     if parts.settings.compile:
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
     trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
@@ -111,7 +112,7 @@ def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
 
 def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
     parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
-    tile = parts.system.tile_points
+    tile = parts.system.step.tile_points
     log.info(
         "run folder %s: %d steps of %d rays, %s parameters, %s, %s",
         folder,

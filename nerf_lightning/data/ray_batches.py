@@ -14,7 +14,6 @@ from torch import Tensor
 from nerf_lightning import ranks
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex
@@ -74,11 +73,11 @@ class PixelDomain:
 
 
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
-    """Return rays, colours and weights of pixels."""
+    """Return colours and weights of pixels."""
     flat = scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
     mask = scene.pixels.mask
     return Batch(
-        rays=rays_through_pixels(scene.cameras, pixels, scene.near, scene.far),
+        pixels=pixels,
         rgba=scene.pixels.rgba[flat].to(torch.float32) / 255.0,
         weight=torch.ones(flat.shape, device=flat.device) if mask is None else mask[flat].to(torch.float32),
     )

@@ -20,6 +20,7 @@ from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
@@ -74,11 +75,12 @@ class Scoring:
         views = self._views(scene)
         shown_views = evenly_spaced_subset(views, self.num_pictures)
         kept = KeptViews(folder, self.split, self.num_worst)
+        rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
         for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
             started = time.perf_counter()
-            picture = render_picture(model, scene.cameras, view, scene.near, scene.far, background, tile_points)
+            picture = render_picture(model, rays_of, view, background, tile_points)
             seconds = time.perf_counter() - started
             row, shown = self._compare(picture, scene, view, background)
             rows.append(row | {"seconds": seconds})

@@ -117,7 +117,7 @@ def _short_rays(model: RadianceModel, at: Tensor, look: Tensor, reach: float) ->
     positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
     output = model.last.field(positions, look[:, None], None)
     near = torch.zeros(len(at), device=at.device)
-    rays = RayBundle(origins, look, near, near + 2.0 * reach, torch.zeros_like(near, dtype=torch.int64), look)
+    rays = RayBundle(origins, look, near, near + 2.0 * reach, look)
     return composite(output, samples, rays, None).rgb
 
 

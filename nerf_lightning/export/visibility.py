@@ -1,7 +1,7 @@
 """What the photographs show: where the light of each pixel was stopped, whether views agree, which faces are seen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,11 +19,11 @@ from nerf_lightning.nerf.geometry.cameras import (
     at_most,
     camera_coordinates,
     project,
-    rays_through_pixels,
 )
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.types.scene import Cameras
 
@@ -66,12 +66,13 @@ def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -
 
 def see(model: RadianceModel, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
     """Render one view; `cameras` are the record's, at whatever size."""
-    picture = render_picture(model, cameras, view, record.near, record.far, record.background, tile_points)
+    rays_of = RayGenerator(cameras, record.near, record.far)
+    picture = render_picture(model, rays_of, view, record.background, tile_points)
     depth = picture.depth
     if cameras.ndc is None:
         # In normalised device coordinates light that escapes has no distance that could be taken out.
         depth = surface_depth(depth, picture.opacity, record.far[view].expand(depth.shape))
-    rays = rays_through_pixels(replace(cameras, ndc=None), all_pixels(cameras, view), record.near, record.far)
+    rays = rays_of.through_world(all_pixels(cameras, view))
     points = rays.origins + depth[..., None] * rays.directions
     normals = normals_from_depth(points) if min(depth.shape) > 1 else torch.zeros_like(points)
     return SeenView(picture.rgb, picture.opacity, depth, points, normals)

@@ -1,7 +1,6 @@
 """What a run is made of, from its config: scene, data, system, callbacks, and what follows."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
@@ -14,6 +13,7 @@ from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
@@ -23,6 +23,7 @@ from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -56,13 +57,9 @@ def build_parts(config: DictConfig) -> Parts:
     choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     progress = Progress()
-    system = build_system(config, settings, scene, progress, num_steps, make_record(scene, text, choices))
-    if config.init_from is not None:
-        start = read_checkpoint(required_path("init_from", config.init_from))
-        load_weights(system.model, start)
-        system.start_weights = start.weights
-    system.initialize()
-    system.configure_optimizers()  # what it refuses is refused before a folder is taken
+    record = make_record(scene, text, choices)
+    step = build_step(config, settings, scene, progress, num_steps)
+    step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
@@ -72,7 +69,7 @@ def build_parts(config: DictConfig) -> Parts:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
     callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
-    return Parts(settings, scene, num_steps, data, system, signals, callbacks, finish)
+    return Parts(settings, scene, num_steps, data, RadianceFieldSystem(step, record), signals, callbacks, finish)
 
 
 def _chosen_callbacks(config: DictConfig) -> list[Callback]:
@@ -83,15 +80,10 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
     return list(chosen.values())
 
 
-def build_system(
-    config: DictConfig,
-    settings: TrainerSettings,
-    scene: Scene,
-    progress: Progress,
-    num_steps: int,
-    record: dict[str, Any],
-) -> RadianceFieldSystem:
-    """Build model, loss, optimizer and schedule into the system.
+def build_step(
+    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, num_steps: int
+) -> TrainStep:
+    """Build model, loss, optimizer and schedule into the step of training.
 
     Raises:
         InputError: a value of the wrong kind, or a model that cannot be cut into tiles.
@@ -105,8 +97,13 @@ def build_system(
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     model.fit_to(scene)
-    return RadianceFieldSystem(
+    start = None
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+        load_weights(model, start)
+    return TrainStep(
         model=model,
+        rays=RayGenerator(scene.cameras, scene.near, scene.far),
         loss=build(config.loss),
         optimizer=optimizer,
         schedule=build(config.scheduler),
@@ -117,5 +114,5 @@ def build_system(
         tile_points=settings.tile_points,
         clip_norm=settings.clip_norm,
         sample_budget=config.data.sample_budget,
-        record=record,
+        start_weights=None if start is None else start.weights,
     )

@@ -11,7 +11,7 @@ from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.memory_trial import Trial, try_out
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 # What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.
 GAPS = 0.25
@@ -75,11 +75,11 @@ class MemoryPlan:
         )
 
 
-def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> MemoryPlan:
+def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> MemoryPlan:
     """Plan by short trials: what a step and a picture hold is counted and scaled up."""
     device, tile = settings.device, settings.tile_points
     free = free_memory(device)
-    trial = try_out(settings, system, data.batches, tile)
+    trial = try_out(settings, step, data.batches, tile)
     pixels = data.scene.pixels
     moves = data.fits(device)
     where = "GPU" if device.type == "cuda" else "memory"
@@ -89,7 +89,7 @@ def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: Ra
         # What lies in memory already is not asked for again.
         there = f"mapped file {pixels.path}" if isinstance(pixels, MappedPixelStore) else "memory, there already"
         row = Row("pixels", num_bytes(pixels), there, counts=False)
-    weights = sum(tensor.nbytes for tensor in [*system.model.parameters(), *system.model.buffers()])
+    weights = sum(tensor.nbytes for tensor in [*step.model.parameters(), *step.model.buffers()])
     steps = [_step(trial, tile, where), _picture(trial, data, where)]
     gaps = 0 if device.type == "cuda" else int(GAPS * max(row.num_bytes for row in steps))
     tables = "lower encoder.log2_table_size or field.width, or choose a smaller model"
@@ -100,7 +100,7 @@ def memory_plan(settings: TrainerSettings, system: RadianceFieldSystem, data: Ra
             Row("gradients", trial.gradients, where, cure=tables),
             Row("optimizer's state", trial.optimizer, where, cure=tables),
             Row("gaps in the heap, about", gaps, where),
-            *([Row("compiled products, about", _compiled(system), where)] if _compiles_products(settings) else []),
+            *([Row("compiled products, about", _compiled(step), where)] if _compiles_products(settings) else []),
         ],
         steps,
         free,
@@ -111,13 +111,13 @@ def _compiles_products(settings: TrainerSettings) -> bool:
     return settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
 
 
-def _compiled(system: RadianceFieldSystem) -> int:
-    return COMPILED_PER_MATRIX * len(matrices_of(system.model))
+def _compiled(step: TrainStep) -> int:
+    return COMPILED_PER_MATRIX * len(matrices_of(step.model))
 
 
-def announce_memory(settings: TrainerSettings, system: RadianceFieldSystem, data: RayDataModule) -> None:
+def announce_memory(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> None:
     """Log the plan; warn where the room is short."""
-    plan = memory_plan(settings, system, data)
+    plan = memory_plan(settings, step, data)
     for line in str(plan).splitlines():
         log.info("%s", line)
     if plan.warning is not None:

@@ -18,6 +18,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
 from nerf_lightning.nerf.randomness import RayRandom
@@ -25,7 +26,7 @@ from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 # So many that rays of different lengths make a mean, and so few that it takes a second at most.
 TRIAL_POINTS, FEWEST_RAYS = 2048, 4
@@ -48,66 +49,66 @@ class Trial:
     """Rendering and measuring the largest picture."""
 
 
-def try_out(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> Trial:
+def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> Trial:
     """Return what the run will hold, by trials that leave nothing behind.
 
     Args:
         settings: the device and the precision.
-        system: ready to train.
+        step: ready to be taken.
         batches: the loader.
         tile: points of a tile; None trains batches whole.
     """
-    system.to(settings.device)
-    trainable = [parameter for parameter in system.model.parameters() if parameter.requires_grad]
+    step.to(settings.device)
+    trainable = [parameter for parameter in step.model.parameters() if parameter.requires_grad]
     gradients = sum(parameter.nbytes for parameter in trainable)
-    with _untouched(system):
-        batch, activations = _step(settings, system, batches, tile, gradients)
-        picture = _picture(settings, system, batches, tile)
-    return Trial(gradients, _optimizer_bytes(system, trainable), batch, activations, picture)
+    with _untouched(step):
+        batch, activations = _step(settings, step, batches, tile, gradients)
+        picture = _picture(settings, step, batches, tile)
+    return Trial(gradients, _optimizer_bytes(step, trainable), batch, activations, picture)
 
 
 @contextmanager
-def _untouched(system: RadianceFieldSystem) -> Iterator[None]:
+def _untouched(step: TrainStep) -> Iterator[None]:
     """Put everything back that trial steps change; no trial changes weights."""
-    buffers, former = list(system.model.buffers()), [buffer.clone() for buffer in system.model.buffers()]
-    tile = system.tile_points
+    buffers, former = list(step.model.buffers()), [buffer.clone() for buffer in step.model.buffers()]
+    tile = step.tile_points
     try:
         yield
     finally:
-        system.tile_points = tile
-        system.forget_measurements()
+        step.tile_points = tile
+        step.forget_measurements()
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
 
 
 def _step(
-    settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None, gradients: int
+    settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, gradients: int
 ) -> tuple[int, int]:
     """Return what grows with the batch, and what grows with the tile."""
-    model, optimizer = system.model, system.configure_optimizers()
+    model, optimizer = step.model, step.new_optimizer()
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
-    num_rays = batch.rays.near.numel()
+    num_rays = batch.num_rays
 
     def held(tile_rays: int, parts: int) -> int:
         points = model.points_per_ray(training=True)
-        system.tile_points = None if model.needs_whole_batch else int((tile_rays + 0.5) * points)
+        step.tile_points = None if model.needs_whole_batch else int((tile_rays + 0.5) * points)
         some = batch[torch.arange(parts * tile_rays, device=settings.device) % num_rays]
 
         def work() -> None:
             optimizer.zero_grad()
-            system.accumulate_gradients(some, lambda loss: loss.backward())
+            step.gradients(some)
 
         model.zero_grad(set_to_none=True)
         return peak_bytes(work, settings.device)
 
     held(_few_rays(model, training=True), 1)  # compiles kernels
-    system.learn_points_per_ray()
+    model.update(0, 0)  # how many samples rays have is known from here on
     few = _few_rays(model, training=True)
     two, four, larger = held(few, 2), held(few, 4), held(2 * few, 2)
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
     copies = max(0.0, two - few * (2 * per_batch_ray + per_tile_ray) - gradients)
     tile_rays = num_rays if tile is None else min(num_rays, tile / model.points_per_ray(training=True))
-    tensors = _tensors_in([batch.rgba, batch.weight, vars(batch.rays)])
+    tensors = _tensors_in([batch.rgba, batch.weight, vars(batch.pixels)])
     loaded = sum(tensor.nbytes for tensor in tensors) * (2 if batches.prefetch_for is not None else 1)
     return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
 
@@ -116,16 +117,16 @@ def _few_rays(model: RadianceModel, training: bool) -> int:
     return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
 
 
-def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches, tile: int | None) -> int:
+def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> int:
     """Return what the largest picture of the scene holds while it is rendered and measured."""
-    model, scene = system.model, batches.scene
+    model, scene = step.model, batches.scene
     few = _few_rays(model, training=False)
-    rays = batches.at(0, batches.crop_rays(0)).rays.to(settings.device)
+    rays = step.rays(batches.at(0, batches.crop_rays(0)).pixels.to(settings.device))
 
     def rendered(count: int) -> int:
         some = rays[torch.arange(count, device=settings.device) % rays.near.numel()]
         with torch.no_grad():
-            behind = background_colors(system.background, count, settings.device, None)
+            behind = background_colors(step.background, count, settings.device, None)
             return peak_bytes(lambda: model(some, behind, None), settings.device)
 
     per_ray = (rendered(2 * few) - rendered(few)) / few
@@ -134,12 +135,12 @@ def _picture(settings: TrainerSettings, system: RadianceFieldSystem, batches: Ra
     # A small picture, cut into as many tiles by a stand-in that holds as much for each ray.
     share = TRIAL_SIDE**2 / num_pixels
     side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
-    camera = resized(scene.cameras[:1], side, side)
+    small = RayGenerator(resized(scene.cameras[:1], side, side), scene.near[:1], scene.far[:1])
     stand_in = _StandIn(int(per_ray)).to(settings.device)
 
     def work() -> None:
         tile_points = max(1, int(tile_rays * share))
-        picture = render_picture(stand_in, camera, 0, scene.near[:1], scene.far[:1], scene.background, tile_points)
+        picture = render_picture(stand_in, small, 0, scene.background, tile_points)
         image_metrics(picture.rgb, picture.rgb)
 
     return int(peak_bytes(work, settings.device) / share)
@@ -162,10 +163,10 @@ class _StandIn(RadianceModel):
         return [Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))]
 
 
-def _optimizer_bytes(system: RadianceFieldSystem, trainable: list[nn.Parameter]) -> int:
+def _optimizer_bytes(step: TrainStep, trainable: list[nn.Parameter]) -> int:
     """Return what the optimizer will remember: as much per weight as it does of a small example."""
     example = nn.Parameter(torch.zeros(EXAMPLE, device=trainable[0].device))
-    optimizer = system.build_optimizer([{"params": [example]}])
+    optimizer = step.build_optimizer([{"params": [example]}])
     example.grad = torch.zeros_like(example)
     optimizer.step()
     kept = sum(value.numel() for value in optimizer.state[example].values() if isinstance(value, Tensor))

@@ -1,20 +1,45 @@
-"""The gradients of a batch, tile by tile: what a tile needs stays in the cache, and the sum is the whole batch's."""
+"""One step of training, which needs torch and no trainer: rays, tiles, gradients, update.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+What a tile of rays needs stays in the cache, and the sum of the tiles' gradients is the whole batch's up to rounding.
+"""
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
+from nerf_lightning import ranks
+from nerf_lightning.data.ray_batches import batch_size
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.models.tiles import tiles
-from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
+from nerf_lightning.nerf.optimizers.schedule import Schedule
+from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.scene import Background
+from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 
-LossFn = Callable[..., Sequence[Float[Tensor, ""]]]
+# The number of rays per step changes no more often.
+BATCH_STEPS = 16
+
+log = logging.getLogger(__name__)
+
+Backward = Callable[[Tensor], None]
+
+
+def _backward(loss: Tensor) -> None:
+    loss.backward()
 
 
 @dataclass(frozen=True)
@@ -29,43 +54,241 @@ class Share:
     """Sum of the weights of the whole batch."""
 
 
-def add_gradients(
-    model: RadianceModel,
-    loss: LossFn,
-    backward: Callable[[Tensor], None],
-    batch: Batch,
-    share: Share,
-    random: RayRandom,
-    background: Background,
-    tile_rays: int,
-) -> dict[str, Tensor]:
-    """Send a batch forward and backward.
+class TrainStep:
+    """Take steps of training, one after the other.
+
+    Where a run has several processes, each has its share of the batch, and their gradients are added up once a step.
 
     Args:
-        model: the levels.
-        loss: of renderings, targets and weights: a number per level.
-        backward: adds a loss's gradients to the parameters'.
-        batch: rays, colours, weights.
-        share: what part of the step's batch this is.
-        random: the step's numbers for these rays.
-        background: what lies behind them.
-        tile_rays: most rays at once.
+        model: what learns.
+        rays: makes the rays through a batch's pixels.
+        loss: one number per level; their sum is minimised.
+        optimizer: takes the parameters.
+        schedule: factor on the learning rate as a function of the attempt's step.
+        progress: the run's place; it is changed here, and read by the loader.
+        num_steps: the length of the run.
+        seed: the run's seed.
+        background: what lies behind the training rays.
+        tile_points: most points that a tile may send through a field at once; None trains the batch whole.
+        clip_norm: gradients are scaled down to this norm; None leaves them.
+        sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
+        start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
 
-    Returns:
-        `losses` per level, and each ray's `foreground` light, `target` colour and `weight`, detached.
+    Raises:
+        InputError: a model that cannot be cut into tiles.
     """
-    num_rays = batch.rays.near.numel()
-    behind = background_colors(background, num_rays, batch.rays.near.device, random)
-    target = blend(batch.rgba, behind)
-    # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
-    weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
-    losses, foreground = [], []
-    for tile in tiles(num_rays, tile_rays):
-        renderings = model(batch.rays[tile], None if behind is None else behind[tile], random[tile])
-        part = torch.stack(list(loss(renderings, target[tile], weight[tile])))
-        part = part * (target[tile].shape[0] / share.num_rays)
-        backward(part.sum())
-        losses.append(part.detach())
-        foreground.append(renderings[-1].foreground.detach())
-    seen = {"foreground": torch.cat(foreground), "target": target, "weight": batch.weight}
-    return {"losses": torch.stack(losses).sum(0)} | seen
+
+    def __init__(
+        self,
+        model: RadianceModel,
+        rays: RayGenerator,
+        loss: Loss,
+        optimizer: Callable[[Iterable[Any]], Optimizer],
+        schedule: Schedule,
+        progress: Progress,
+        num_steps: int,
+        seed: int,
+        background: Background,
+        tile_points: int | None = None,
+        clip_norm: int | float | None = None,
+        sample_budget: int | None = None,
+        start_weights: dict[str, Tensor] | None = None,
+    ):
+        self.model, self.rays, self.loss = model, rays, loss
+        self.build_optimizer, self.schedule = optimizer, schedule
+        self.progress, self.num_steps, self.seed = progress, num_steps, seed
+        self.background = background
+        self.tile_points, self.clip_norm = tile_points, clip_norm
+        self.sample_budget = sample_budget
+        self.start_weights = start_weights
+        self.guard = StepGuard()
+        if tile_points is not None and model.needs_whole_batch:
+            raise InputError(
+                "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
+                "add trainer.tile_points=null, or leave batch_norm off."
+            )
+        self.draw_weights()
+
+    def draw_weights(self) -> None:
+        """Draw the weights of this attempt, or take those that it starts from."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(fold(self.seed, self.progress.attempt, "weights"))
+            self.model.reset_parameters()
+        if self.start_weights is not None:
+            self.model.load_state_dict(self.start_weights)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return next(self.model.parameters()).device
+
+    def to(self, device: torch.device) -> "TrainStep":
+        """Move all that is computed with to a device."""
+        self.model.to(device)
+        self.rays.to(device)
+        return self
+
+    def restart(self, optimizer: Optimizer) -> None:
+        """Begin a new attempt with fresh weights, optimizer and order of rays."""
+        self.progress.restart()
+        self.draw_weights()
+        optimizer.state.clear()
+
+    def count_rollback(self, former: Progress, skipped: int) -> None:
+        """Begin a new attempt, with other random numbers, from the state that was just taken up.
+
+        Args:
+            former: where the run stood before.
+            skipped: steps that were left out before.
+        """
+        self.progress.attempt, self.progress.rollbacks = former.attempt + 1, former.rollbacks + 1
+        self.guard.restore([skipped, 0], self.device)
+
+    def new_optimizer(self) -> Optimizer:
+        """Return the optimizer of all that learns; the tables of encoders do not decay.
+
+        Raises:
+            InputError: a setting of the optimizer that it refuses.
+        """
+        tables = tables_of(self.model)
+        known = set(map(id, tables))
+        groups: list[dict[str, Any]] = [{"params": [p for p in self._parameters() if id(p) not in known]}]
+        if tables:
+            groups.append({"params": tables, "weight_decay": 0.0})
+        try:
+            return self.build_optimizer(groups)
+        except (ValueError, TypeError) as error:  # torch looks at its settings here
+            raise InputError(
+                f"The optimizer refuses its settings: {error}. Mend optimizer.*, or leave it out."
+            ) from error
+
+    def __call__(
+        self, batch: Batch, optimizer: Any, backward: Backward = _backward, measure_gradients: bool = False
+    ) -> dict[str, Any]:
+        """Take one step: gradients tile by tile, clipped, update.
+
+        Args:
+            batch: this process's share of the step's pixels.
+            optimizer: torch's, or Lightning's wrapper of it.
+            backward: adds a loss's gradients to the parameters'.
+            measure_gradients: whether to measure the gradients' norms, before they are clipped.
+
+        Returns:
+            What `gradients` returns, with the losses of all processes; the `pixels` of the batch; and `gradient_norms`
+            by level, where they were measured and the step was taken.
+        """
+        progress = self.progress
+        optimizer.zero_grad()
+        self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
+        num_rays = progress.batch_rays
+        share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
+        seen = self.gradients(batch, backward, share)
+        ranks.add_up([seen["losses"]])
+        ranks.add_up_gradients(self._parameters())
+        norms: dict[str, Tensor] = {}
+        if self.guard.allows(seen["losses"], self.model.named_parameters()):
+            norms = self.model.gradient_norms() if measure_gradients else {}
+            self._update(optimizer)
+        progress.advance(num_rays)
+        if progress.step == 1 or progress.step % BATCH_STEPS == 0:
+            ranks.average(self.model.measurements())
+            if self.sample_budget is not None:
+                points = self.model.points_per_ray(training=True)
+                progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
+        return seen | {"pixels": batch.pixels, "gradient_norms": norms}
+
+    def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> dict[str, Tensor]:
+        """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
+
+        Args:
+            batch: pixels, colours, weights.
+            backward: adds a loss's gradients to the parameters'.
+            share: what part of the step's batch this is; None: all of it.
+
+        Returns:
+            `losses` per level, detached, which add up over all shares to the batch's; and of each ray its `foreground`
+            light, its `target` colour and its `weight`.
+        """
+        share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
+        counts = [count.clone() for count in self.model.counts()]
+        while True:
+            try:
+                return self._in_tiles(batch, backward, share)
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                self._take_smaller_tiles(batch, error)
+            for part in (self.model, self.rays):
+                part.zero_grad(set_to_none=False)
+            for count, before in zip(self.model.counts(), counts, strict=True):
+                count.copy_(before)
+
+    def validate(self, batch: Batch, errors: RayErrors) -> None:
+        """Collect the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
+        background = background_colors(self.background, batch.num_rays, batch.weight.device, None)
+        target, rays = blend(batch.rgba, background), self.rays(batch.pixels)
+        for tile in tiles(batch.num_rays, self._tile_rays(batch.num_rays)):
+            behind = None if background is None else background[tile]
+            rendering = self.model(rays[tile], behind, random=None)[-1]
+            errors.add(rendering.rgb, target[tile], batch.weight[tile])
+
+    def forget_measurements(self) -> None:
+        """Undo what trial steps have left behind: gradients and counts, no weights."""
+        for part in (self.model, self.rays):
+            part.zero_grad(set_to_none=True)
+        self.model.forget_measurements()
+
+    def is_sound(self) -> bool:
+        """Tell whether the run is one to come back to: the last step was taken, and the weights are finite."""
+        return self.guard.in_row == 0 and not self.broken_weights()
+
+    def broken_weights(self) -> str | None:
+        """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
+        return first_not_finite(self.model)
+
+    def _parameters(self) -> list[Parameter]:
+        return [*self.model.parameters(), *self.rays.parameters()]
+
+    def _in_tiles(self, batch: Batch, backward: Backward, share: Share) -> dict[str, Tensor]:
+        num_rays, device = batch.num_rays, batch.weight.device
+        key = fold(self.seed, self.progress.attempt, self.progress.step)
+        random = batch_random(key, num_rays, device, share.first)
+        behind = background_colors(self.background, num_rays, device, random)
+        # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
+        weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
+        target = Target(blend(batch.rgba, behind), weight, batch.pixels)
+        losses, foreground = [], []
+        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
+            # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
+            pixels = batch.pixels[tile]
+            rays = replace(self.rays(pixels), photograph=pixels.view)
+            renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
+            part = torch.stack(list(self.loss(renderings, target[tile])))
+            part = part * ((tile.stop - tile.start) / share.num_rays)
+            backward(part.sum())
+            losses.append(part.detach())
+            foreground.append(renderings[-1].foreground.detach())
+        seen = {"foreground": torch.cat(foreground), "target": target.rgb, "weight": batch.weight}
+        return {"losses": torch.stack(losses).sum(0)} | seen
+
+    def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
+        if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) == 1:
+            raise InputError(
+                f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
+                "or tiles (trainer.tile_points=auto)."
+            ) from error
+        points = batch.num_rays * self.model.points_per_ray(training=True)
+        self.tile_points = int(min(self.tile_points, points)) // 2
+        log.warning(
+            "no memory for so large a tile: from now on tiles of %d points; the step is repeated", self.tile_points
+        )
+
+    def _tile_rays(self, num_rays: int, training: bool = False) -> int:
+        return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)
+
+    def _update(self, optimizer: Any) -> None:
+        if self.clip_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self._parameters(), self.clip_norm)
+        for group in optimizer.param_groups:
+            group["lr"] = self.schedule(self.progress.step, self.num_steps) * group.setdefault("base_lr", group["lr"])
+        optimizer.step()

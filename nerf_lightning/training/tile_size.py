@@ -7,7 +7,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
 GPU_TILES = (1 << 18, 1 << 20, 1 << 22)
@@ -21,17 +21,17 @@ FEW_RAYS = 16
 log = logging.getLogger(__name__)
 
 
-def measured_tile(settings: TrainerSettings, system: RadianceFieldSystem, batches: RayBatches) -> int:
+def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> int:
     """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
-    system.to(settings.device)
+    step.to(settings.device)
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
-    num_rays = _rays_in_time(settings, system, batch)
-    points = num_rays * system.model.points_per_ray(training=True)
+    num_rays = _rays_in_time(settings, step, batch)
+    points = num_rays * step.model.points_per_ray(training=True)
     tiles = CPU_TILES if settings.device_type == "cpu" else GPU_TILES
     enough = next((number for number, tile in enumerate(tiles) if tile >= points), len(tiles))
     # Larger ones than the first that takes all points at once would be the same.
-    best = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, system, batch, num_rays, tile))
-    system.forget_measurements()
+    best = fastest(tiles[: enough + 1], lambda tile: _seconds(settings, step, batch, num_rays, tile))
+    step.forget_measurements()
     log.info("tiles of %d points are the fastest of those tried here", best)
     return best
 
@@ -57,15 +57,15 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> int:
     return best
 
 
-def _rays_in_time(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch) -> int:
-    _seconds(settings, system, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
-    system.learn_points_per_ray()
-    few = min(batch.rays.near.numel(), 4 * FEW_RAYS)
-    per_ray = _seconds(settings, system, batch, few, CPU_TILES[0]) / few
-    return max(FEW_RAYS, min(batch.rays.near.numel(), int(LONGEST_SECONDS / per_ray)))
+def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> int:
+    _seconds(settings, step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
+    step.model.update(0, 0)  # how many samples rays have is known from here on
+    few = min(batch.num_rays, 4 * FEW_RAYS)
+    per_ray = _seconds(settings, step, batch, few, CPU_TILES[0]) / few
+    return max(FEW_RAYS, min(batch.num_rays, int(LONGEST_SECONDS / per_ray)))
 
 
-def _seconds(settings: TrainerSettings, system: RadianceFieldSystem, batch: Batch, num_rays: int, tile: int) -> float:
-    system.tile_points = tile
+def _seconds(settings: TrainerSettings, step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
+    step.tile_points = tile
     some = batch[:num_rays]
-    return seconds_of(lambda: system.accumulate_gradients(some, lambda loss: loss.backward()))
+    return seconds_of(lambda: step.gradients(some))

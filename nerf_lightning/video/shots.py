@@ -16,6 +16,7 @@ from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras
 from nerf_lightning.video.paths.base import CameraPath, frame_of
@@ -55,23 +56,26 @@ class Shot:
         """How many of the user's units make one of the scene's."""
         return unit_of(self.subject.scene.to_user)
 
+    @property
+    def rays(self) -> RayGenerator:
+        """What makes the rays of the frames."""
+        return RayGenerator(self.cameras, self.near, self.far)
+
     def picture(self, frame: int) -> Picture:
         """Render one frame."""
         return render_picture(
             self.subject.model,
-            self.cameras,
+            self.rays,
             frame,
-            self.near,
-            self.far,
             self.subject.background,
             self.tile_points,
             self.clip,
-            self.seen_from,
+            None if self.seen_from is None else RayGenerator(self.seen_from, self.near, self.far),
         )
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the unit normals of what the picture shows, in the user's axes."""
-        rays, straight = view_rays(self.cameras, frame, self.near, self.far, self.clip)
+        rays, straight = view_rays(self.rays, frame, self.clip)
         bent = self.cameras.ndc is not None
         surface = picture.depth if bent else surface_depth(picture.depth, picture.opacity, rays.far)
         normals = normals_from_depth(straight.origins + surface[..., None] * straight.directions)

@@ -2,18 +2,19 @@
 
 import time
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.checkpoints.reading import SceneRecord
-from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
@@ -74,7 +75,8 @@ class SlicedRenderer:
         cameras, near, far = camera_of(look, self.scene, height)
         pixels = all_pixels(cameras, 0)
         shape, pixels = pixels.x.shape, pixels.map(torch.flatten)
-        rays = rays_through_pixels(cameras, pixels, near, far)
+        rays_of = RayGenerator(cameras, near, far)
+        rays = rays_of(pixels)
         if look.crop is not None:
             rays = Clip(box=look.crop)(rays, rays, ndc=False)
         parts, start, total = [], 0, rays.near.numel()
@@ -89,8 +91,7 @@ class SlicedRenderer:
         rgb, depth, opacity = (torch.cat(column) for column in list(zip(*parts, strict=True))[:3])
         depth = surface_depth(depth, opacity, rays.far)
         if cameras.ndc is not None:
-            straight = rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)
-            depth = world_distance(straight, depth / rays.far)
+            depth = world_distance(rays_of.through_world(pixels), depth / rays.far)
         return View(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape), cameras)
 
     def _rays_in_a_slice(self, left: int) -> int:

@@ -13,6 +13,7 @@ import torch
 from lightning.pytorch import Callback
 from support.configs import options
 from support.gpu_training import default_callbacks, step_by_step
+from support.steps import rays_of
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.models.occupancy_level import GridLevel
@@ -21,6 +22,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
@@ -42,7 +44,7 @@ def never_waiting(device):
 
 def updates(run) -> set[int]:
     """The steps in which a grid is updated, and read."""
-    levels = [level for level in run.system.model.modules() if isinstance(level, GridLevel)]
+    levels = [level for level in run.training.model.modules() if isinstance(level, GridLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 
@@ -104,10 +106,10 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     settings = TrainerSettings(max_steps=48, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=48)
     model = chosen.model()
     model.fit_to(scene)
-    system = RadianceFieldSystem(
-        model, chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0, None, {}
+    step = TrainStep(
+        model, rays_of(scene), chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0
     )
-    system.initialize()
+    system = RadianceFieldSystem(step, {})
     settings.prepare(model)
     watch = Watch(device)
     quiet = [each for each in default_callbacks() if type(each).__name__ in ("CollapseGuard", "NanGuard", "Monitor")]

@@ -23,7 +23,7 @@ def losses(model, device, tile_points=None):
     run = step_by_step(model, device, tile_points=tile_points)
     for _ in range(STEPS):
         run.step()
-    assert run.system.guard.skipped == 0
+    assert run.training.guard.skipped == 0
     return run.all_losses()
 
 

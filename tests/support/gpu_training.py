@@ -11,9 +11,9 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.models.occupancy_level import GridLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.training.build import build_system
+from nerf_lightning.training.build import build_step
 from nerf_lightning.training.launch.trainer import PRODUCTS, TrainerSettings
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 RAYS = 48
 # Opaque matter is cut off where nothing can be seen of it any more: GPUs do not cut, and the losses are compared.
@@ -22,18 +22,18 @@ CUT = 1e-6
 
 @dataclass
 class StepByStep:
-    """A run without Lightning: the system with stand-ins for what its trainer provides."""
+    """A run without Lightning."""
 
-    system: RadianceFieldSystem
+    training: TrainStep
+    optimizer: torch.optim.Optimizer
     loader: RayBatches
     losses: list[torch.Tensor] = field(default_factory=list)
 
     def step(self) -> None:
         """Make a batch and take a step."""
-        system, progress = self.system, self.system.progress
+        progress = self.training.progress
         batch = self.loader.at(progress.attempt, progress.rays_seen)
-        system.training_step(batch.to(system.device), progress.step)
-        self.losses.append(system.last_step["losses"].sum())
+        self.losses.append(self.training(batch.to(self.training.device), self.optimizer)["losses"].sum())
 
     def all_losses(self) -> torch.Tensor:
         """Return the losses so far, on the host."""
@@ -45,17 +45,13 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
     config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     scene, progress = ball_scene(), Progress()
-    system = build_system(config, settings, scene, progress, 1000, {})
-    for level in system.model.modules():
+    training = build_step(config, settings, scene, progress, 1000).to(device)
+    for level in training.model.modules():
         if isinstance(level, GridLevel):
             level.sampler.opaque_below = CUT
-    system.initialize()
-    system.model.multiply_in(PRODUCTS[precision])
-    system.to(device)
+    training.model.multiply_in(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
-    return StepByStep(system, RayBatches(here, progress, 0, RAYS, 1000))
+    return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, RAYS, 1000))
 
 
 def default_callbacks(*changes: str):

@@ -89,6 +89,5 @@ def some_rays(count: int, generator: torch.Generator | None = None) -> RayBundle
         directions=directions,
         near=torch.full((count,), 2.0),
         far=torch.full((count,), 6.0),
-        camera_index=torch.zeros(count, dtype=torch.long),
         view_directions=directions,
     )

@@ -2,6 +2,7 @@
 
 import torch
 from support.scenes import tiny_model
+from support.steps import rays_of
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
@@ -12,6 +13,7 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -35,8 +37,9 @@ def static_system(name: str, scene, progress, num_steps: int, model=None, loss=N
     """The system that trains one of the two models on whole batches."""
     model = model or MODELS[name]()
     model.fit_to(scene)
-    system = RadianceFieldSystem(
+    step = TrainStep(
         model=model,
+        rays=rays_of(scene),
         loss=loss or MeanSquaredError(),
         optimizer=OPTIMIZERS[name],
         schedule=ExponentialDecay(decay_rate=0.1),
@@ -44,10 +47,6 @@ def static_system(name: str, scene, progress, num_steps: int, model=None, loss=N
         num_steps=num_steps,
         seed=0,
         background=scene.background,
-        tile_points=None,
         clip_norm=1.0,
-        sample_budget=None,
-        record={},
     )
-    system.initialize()
-    return system
+    return RadianceFieldSystem(step, {})

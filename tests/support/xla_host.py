@@ -30,12 +30,14 @@ class Counters(Callback):
     """After each step: its losses, the compilations so far, the numbers read so far, and what ran on the host."""
 
     losses: list = field(default_factory=list)
+    weight: torch.Tensor | None = None
     compilations: list = field(default_factory=list)
     reads: list = field(default_factory=list)
     on_the_host: set = field(default_factory=set)
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        self.losses.append(pl_module.last_step["losses"])
+        self.weight = outputs["weight"]
+        self.losses.append(outputs["losses"])
         if pl_module.device.type != "xla":
             return
         from torch_xla.debug import metrics

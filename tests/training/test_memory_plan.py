@@ -14,7 +14,7 @@ from nerf_lightning.training import memory_plan
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.memory_plan import MemoryPlan, Row
 from nerf_lightning.training.memory_trial import peak_bytes
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 CPU = torch.device("cpu")
 
@@ -26,7 +26,7 @@ import torch
 from support.configs import composed
 from support.scenes import ball_scene
 
-from nerf_lightning.config.instantiate import build; from nerf_lightning.training.build import build_system
+from nerf_lightning.config.instantiate import build; from nerf_lightning.training.build import build_step
 from nerf_lightning.training.memory_plan import memory_plan
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.evaluation.metrics import image_metrics
@@ -52,36 +52,34 @@ def most(work):
 
 def built():
     progress = Progress()
-    system = build_system(config, settings, scene, progress, 10, {})
-    settings.prepare(system.model)
-    system.initialize()
-    system.tile_points = TILE
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
-    return system, build(config.data)(scene=scene, progress=progress, seed=0, num_steps=10)
+    step = build_step(config, settings, scene, progress, 10)
+    settings.prepare(step.model)
+    step.tile_points = TILE
+    return step, build(config.data)(scene=scene, progress=progress, seed=0, num_steps=10)
 
 
-def warm(system, batches):
+def warm(step, batches):
     "Load libraries and kernels, which are in no plan."
     few = batches.at(0, 0)[:8]
-    system.accumulate_gradients(few, lambda loss: loss.backward())
+    step.gradients(few)
     with torch.no_grad():
-        system.model(few.rays, None, None)
+        step.model(step.rays(few.pixels), None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
-    system.forget_measurements()
-    system.learn_points_per_ray()
+    step.forget_measurements()
+    step.model.update(0, 0)
 
 
 def train():
+    optimizer = step.new_optimizer()
     for _ in range(2):
         batches.progress.batch_rays = batches.progress.largest_batch
-        system.training_step(batches.at(0, batches.progress.rays_seen), 0)
+        step(batches.at(0, batches.progress.rays_seen), optimizer)
 
 
 def evaluate():
-    system.eval()
+    step.model.eval()
     with torch.no_grad():
-        picture = render_picture(system.model, scene.cameras, 0, scene.near, scene.far, "white", TILE)
+        picture = render_picture(step.model, step.rays, 0, "white", TILE)
         image_metrics(picture.rgb, picture.rgb)
 
 
@@ -90,9 +88,9 @@ settings = build(config.trainer)
 settings.prepare_machine()
 scene = ball_scene(num_views=6, size=320, background="random")
 settings.tile_points = TILE
-system, data = built()
+step, data = built()
 batches = data.batches
-warm(system, batches)
+warm(step, batches)
 measured = most(lambda: (train(), evaluate()))
 plan = memory_plan(settings, *built())
 print(plan)
@@ -176,7 +174,7 @@ def test_a_plan_is_logged_row_by_row(monkeypatch, caplog):
     """What is logged is escaped, ends of lines too."""
     plan = MemoryPlan([Row("pixels", 10, "memory")], [Row("a step", 20, "memory")], free=1000)
     monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
-    parts = (kind.__new__(kind) for kind in (TrainerSettings, RadianceFieldSystem, RayDataModule))
+    parts = (kind.__new__(kind) for kind in (TrainerSettings, TrainStep, RayDataModule))
     with caplog.at_level(logging.INFO):
         memory_plan.announce_memory(*parts)
     assert caplog.messages == str(plan).splitlines()

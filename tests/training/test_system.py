@@ -1,81 +1,15 @@
-import copy
-
 import pytest
 import torch
-from support.scenes import ball_scene, tiny_model
-from support.systems import gradients, make_system
+from support.scenes import ball_scene
+from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
-
-
-@pytest.mark.parametrize("background", ["white", "black", "random", "none"])
-@pytest.mark.parametrize("tile_points", [16, 100, 512])
-def test_a_tiled_step_equals_the_whole_step_up_to_rounding(tile_points, background):
-    scene = ball_scene()
-    model = tiny_model(density_bias=0.5)
-    whole, losses = gradients(make_system(None, copy.deepcopy(model), background), scene)
-    tiled, tiled_losses = gradients(make_system(tile_points, copy.deepcopy(model), background), scene)
-    torch.testing.assert_close(tiled, whole, rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(tiled_losses, losses, rtol=1e-5, atol=1e-7)
-    assert float(whole.norm()) > 0
-
-
-def test_clipping_scales_the_whole_gradient():
-    gradient, _ = gradients(make_system(100, clip_norm=1e-3), ball_scene())
-    assert abs(float(gradient.norm()) - 1e-3) < 1e-6
-
-
-def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they_are_clipped():
-    clipped, whole = make_system(100, clip_norm=1e-3), make_system(100)
-    clipped.measures_gradients = True
-    gradients(clipped, ball_scene())
-    gradients(whole, ball_scene())
-    assert whole.gradient_norms == {}
-    for name, level in whole.model.levels.items():
-        expected = torch.cat([parameter.grad.flatten() for parameter in level.parameters()]).norm()
-        assert float(expected) > 1e-3
-        torch.testing.assert_close(clipped.gradient_norms[name], expected)
-
-
-def test_batch_norm_with_tiles_is_refused_by_name():
-    with pytest.raises(InputError, match=r"field\.batch_norm=true .* trainer\.tile_points=null"):
-        make_system(64, tiny_model(batch_norm=True))
-    make_system(None, tiny_model(batch_norm=True))
-
-
-def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
-    system = make_system(None)
-    steps = []
-    system.optimizers().step = lambda: steps.append(system.progress.step)
-    color = system.model.levels["fine"].field.color_head.weight
-    good, broken = color.detach().clone(), torch.full_like(color, float("nan"))
-    loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
-    for weights in (good, broken, broken, good):
-        with torch.no_grad():
-            color.copy_(weights)
-        system.training_step(loader.at(0, system.progress.rays_seen), 0)
-    assert steps == [0, 3]
-    assert system.guard.skipped == 2
-    assert system.guard.state() == [2, 0]
-    assert system.progress.step == 4
-
-
-def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
-    system = make_system(None)
-    with torch.no_grad():
-        system.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
-    gradients(system, ball_scene(), steps=7)
-    assert system.guard.in_row == 7
-    assert system.guard.first_module.startswith("levels.fine.field.")
-    assert not system.is_sound()
-    assert system.broken_weights() == "levels.fine.field.color_head"
+from nerf_lightning.training.system import RadianceFieldSystem
 
 
 def test_weights_that_are_not_finite_are_not_saved():
-    system = make_system(None)
+    system = RadianceFieldSystem(make_step(None), {})
     system._trainer = type("T", (), {"global_step": 7, "default_root_dir": "outputs/x"})()
     with torch.no_grad():
         system.model.levels["fine"].field.color_head.bias[0] = float("inf")
@@ -83,45 +17,13 @@ def test_weights_that_are_not_finite_are_not_saved():
         system.on_save_checkpoint({})
 
 
-def test_a_run_that_starts_from_weights_restarts_from_them():
-    system = make_system(None)
-    weights = {name: torch.full_like(value, 0.25) for name, value in system.model.named_parameters()}
-    system.start_weights = system.model.state_dict() | weights
-    system.initialize()
-    assert all(bool((parameter == 0.25).all()) for parameter in system.model.parameters())
-
-
-def test_weights_are_a_function_of_seed_and_attempt_and_zero_is_a_seed():
-    states = []
-    for seed, attempt in [(0, 0), (0, 0), (1, 0), (0, 1)]:
-        torch.rand(3)  # what was drawn before must not matter
-        system = make_system(None, seed=seed)
-        system.progress.attempt = attempt
-        system.initialize()
-        states.append(torch.cat([p.detach().flatten() for p in system.parameters()]))
-    assert torch.equal(states[0], states[1])
-    assert not torch.equal(states[0], states[2])
-    assert not torch.equal(states[0], states[3])
-
-
-def test_the_learning_rate_follows_the_schedule():
-    system = make_system(None)
-    system.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
-    rates = []
-    loader = RayBatches(ball_scene(), system.progress, 0, 16, 10)
-    for _ in range(4):
-        system.training_step(loader.at(0, 0), 0)
-        rates.append(system.optimizers().param_groups[0]["lr"])
-    assert rates == [0.5, 0.5, 0.25, 0.125]
-
-
 def test_validation_has_no_jitter():
-    system = make_system(None)
+    system = RadianceFieldSystem(make_step(None), {})
     logged = {}
     logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
     system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
     system.log = lambda name, value, **options: None
-    loader = RayBatches(ball_scene(), system.progress, 0, 64, 10)
+    loader = RayBatches(ball_scene(), system.step.progress, 0, 64, 10)
     values = []
     for _ in range(2):
         with torch.no_grad():
@@ -130,55 +32,3 @@ def test_validation_has_no_jitter():
         values.append(dict(logged))
     assert values[0] == values[1]
     assert values[0]["val/psnr_standard_error"] > 0
-
-
-def stingy_model(room):
-    """A model that has room for so many rays at once, and a list of what was tried."""
-    model, tried = tiny_model(density_bias=0.5), []
-    render = model.forward
-
-    def forward(rays, background, random):
-        tried.append(rays.near.numel())
-        if tried[-1] > room:
-            raise torch.OutOfMemoryError("CUDA out of memory")
-        return render(rays, background, random)
-
-    model.forward = forward
-    return model, tried
-
-
-def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog):
-    scene = ball_scene()
-    wanted, losses = gradients(make_system(100_000), scene)
-    model, tried = stingy_model(room=20)
-    got, got_losses = gradients(make_system(2_000, model=model), scene)
-    assert torch.allclose(got, wanted, atol=1e-6)
-    assert torch.allclose(got_losses, losses)
-    assert tried[0] == 64
-    assert tried[-1] <= 20
-    assert "from now on tiles of" in caplog.text
-
-
-def test_without_memory_for_a_single_ray_the_run_ends_with_advice():
-    with pytest.raises(InputError, match="There is no memory"):
-        gradients(make_system(100_000, model=stingy_model(room=0)[0]), ball_scene())
-
-
-def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(caplog):
-    scene = ball_scene()
-    wanted = render_picture(tiny_model(density_bias=0.5), scene.cameras, 1, scene.near, scene.far, "white", 10**6)
-    model, tried = stingy_model(room=40)
-    for _ in range(2):
-        picture = render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", 10**6)
-    torch.testing.assert_close(picture.rgb, wanted.rgb)
-    assert tried[:3] == [144, 72, 36]
-    assert max(tried[3:]) == 36
-    assert caplog.text.count("from now on") == 2
-
-
-def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(monkeypatch):
-    model, compiled = tiny_model(), []
-    monkeypatch.setattr(torch.nn.Module, "compile", lambda module, **options: compiled.append((module, options)))
-    model.levels["coarse"].field.compiles = False
-    assert model.compile_fields() == ["fine"]
-    assert compiled == [(model.levels["fine"].field, {"dynamic": False})]

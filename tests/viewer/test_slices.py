@@ -6,10 +6,12 @@ import pytest
 import torch
 from support.scenes import ball_scene, tiny_model
 from support.static_models import fast_model
+from support.steps import rays_of
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.viewer import renderer as slices
 from nerf_lightning.viewer.camera_state import CameraState, camera_of, pose_of
@@ -48,7 +50,7 @@ def test_a_photographs_look_in_slices_is_its_picture(scene, renderer):
     renderer.rays_per_second = 64 / slices.SLICE_SECONDS  # the first slice has 64 rays
     look = CameraState(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1)
     view, count = finished(renderer.slices(look, 16))
-    whole = render_picture(renderer.model, scene.cameras, 1, scene.near, scene.far, "white", 4096)
+    whole = render_picture(renderer.model, rays_of(scene), 1, "white", 4096)
     assert count >= 2
     assert torch.allclose(view.rgb, whole.rgb, atol=1e-6)
     assert torch.allclose(view.opacity, whole.opacity, atol=1e-6)
@@ -57,7 +59,9 @@ def test_a_photographs_look_in_slices_is_its_picture(scene, renderer):
 def test_a_free_look_from_a_photographs_place_sees_what_the_photograph_sees(scene, renderer):
     fov = 2 * float(torch.atan(torch.tensor(0.5 / 1.6)))
     view, _ = finished(renderer.slices(CameraState(scene.cameras.c2w[2], fov, 640, 640), 16))
-    whole = render_picture(renderer.model, scene.cameras, 2, view_near(scene, 2), view_far(scene, 2), "white", 4096)
+    whole = render_picture(
+        renderer.model, RayGenerator(scene.cameras, view_near(scene, 2), view_far(scene, 2)), 2, "white", 4096
+    )
     assert torch.allclose(view.rgb, whole.rgb, atol=1e-4)
 
 
@@ -116,7 +120,7 @@ def test_the_speed_that_was_seen_decides_the_size_while_moving(scene, renderer):
 def test_behind_an_occupancy_grid_slices_are_the_whole_picture(scene, behind_grid):
     behind_grid.rays_per_second = 64 / slices.SLICE_SECONDS
     view, count = finished(behind_grid.slices(CameraState(scene.cameras.c2w[1], 0.6, 160, 120, photograph=1), 16))
-    whole = render_picture(behind_grid.model, scene.cameras, 1, scene.near, scene.far, "white", 4096)
+    whole = render_picture(behind_grid.model, rays_of(scene), 1, "white", 4096)
     assert count >= 2
     assert torch.allclose(view.rgb, whole.rgb, atol=2e-3)  # a ray may end when its light is below 1e-3
     assert torch.allclose(view.opacity, whole.opacity, atol=2e-3)

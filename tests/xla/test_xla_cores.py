@@ -25,7 +25,7 @@ here = train(folder / "cpu", "nerf", "cpu", steps=8)
 torch.testing.assert_close(there.losses, here.losses, rtol=1e-5, atol=0)
 there.counters.require_quiet_after(2)
 import torch_xla
-spread = [torch_xla._XLAC._get_xla_sharding_spec(there.system.last_step["weight"])]
+spread = [torch_xla._XLAC._get_xla_sharding_spec(there.counters.weight)]
 print("equal on", spread)
 """
 

@@ -73,7 +73,7 @@ def rays_through_pixels(
     c2w = cameras.c2w[view]
     directions = (c2w[..., :3] @ local[..., None])[..., 0]
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view, view_directions=directions)
+    rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions)
     return rays if cameras.ndc is None else ndc_rays(rays, cameras.ndc[view])
 
 

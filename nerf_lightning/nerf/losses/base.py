@@ -6,6 +6,8 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.types.rays import Target
+
 
 class Loss(nn.Module, ABC):
     """A weighted mean over rays, so that the losses of tiles add up to that of the batch.
@@ -18,13 +20,10 @@ class Loss(nn.Module, ABC):
     """Whether each level's number is a squared error of colour; else only the last one's is."""
 
     @abstractmethod
-    def forward(
-        self, renderings: list[Any], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
-    ) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
         """Return one number per level, first level first; training minimises their sum.
 
         Args:
             renderings: one per level.
-            target: what the photographs show.
-            weight: of each ray, >= 0; its mean over the whole batch is 1.
+            target: what the photographs show, how much each ray counts, and where in which photograph it lies.
         """

@@ -4,14 +4,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.types.rays import Target
 from nerf_lightning.nerf.types.renderings import Rendering
 
 
 class MeanSquaredError(Loss):
     """Mean squared error of the colour, every level alike, so that the coarse level learns where to look."""
 
-    def forward(
-        self, renderings: list[Rendering], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
-    ) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[Rendering], target: Target) -> list[Float[Tensor, ""]]:
         """Return the weighted mean over rays and channels, per level."""
-        return [((rendering.rgb - target).square() * weight[..., None]).mean() for rendering in renderings]
+        return [((rendering.rgb - target.rgb).square() * target.weight[..., None]).mean() for rendering in renderings]

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.types.rays import Target
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
@@ -27,13 +28,11 @@ class ProposalLoss(Loss):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion
 
-    def forward(
-        self, renderings: list[DenseRendering], target: Float[Tensor, "*rays 3"], weight: Float[Tensor, "*rays"]
-    ) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[DenseRendering], target: Target) -> list[Float[Tensor, ""]]:
         """Return one number per level."""
-        last = renderings[-1]
+        last, weight = renderings[-1], target.weight
         losses = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
-        color = ((last.rgb - target).square() * weight[..., None]).mean()
+        color = ((last.rgb - target.rgb).square() * weight[..., None]).mean()
         if not self.distortion:
             return [*losses, color]
         return [*losses, color + self.distortion * (distortion_loss(last) * weight).mean()]

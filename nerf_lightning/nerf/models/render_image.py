@@ -7,14 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 log = logging.getLogger(__name__)
@@ -35,51 +36,43 @@ class Picture(TensorStruct):
 @torch.no_grad()
 def render_picture(
     model: RadianceModel,
-    cameras: Cameras,
+    rays_of: RayGenerator,
     view: int,
-    near: Float[Tensor, "views"],
-    far: Float[Tensor, "views"],
     background: Background,
     tile_points: int,
     clip: Clip | None = None,
-    seen_from: Cameras | None = None,
+    seen_from: RayGenerator | None = None,
 ) -> Picture:
     """Render one view with the last level, as at evaluation (no jitter).
 
     Args:
         model: in evaluation mode.
-        cameras: among others the one of this view.
+        rays_of: the cameras, the one of this view among them.
         view: its number.
-        near: where rays begin, per view.
-        far: where they end.
         background: what lies behind the scene.
         tile_points: most points that go through a field at once.
         clip: what of the scene is shown; None: all.
-        seen_from: cameras from whose directions the colour is looked up, in place of the view's own.
+        seen_from: other cameras, from whose directions the colour is looked up, in place of the view's own.
     """
-    rays, straight = view_rays(cameras, view, near, far, clip)
+    rays, straight = view_rays(rays_of, view, clip)
     if seen_from is not None:
-        rays = replace(rays, view_directions=view_rays(seen_from, view, near, far)[1].view_directions)
+        rays = replace(rays, view_directions=view_rays(seen_from, view)[1].view_directions)
     columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
     shape = rays.near.shape
     rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
-    if cameras.ndc is not None:
-        whole = rays_through_pixels(cameras, all_pixels(cameras, view), near, far).far
+    if rays_of.cameras.ndc is not None:
+        whole = view_rays(rays_of, view)[0].far
         depth = world_distance(straight, depth / whole)
     return Picture(rgb, depth, opacity, *first)
 
 
-def view_rays(
-    cameras: Cameras,
-    view: int,
-    near: Float[Tensor, "views"],
-    far: Float[Tensor, "views"],
-    clip: Clip | None = None,
-) -> tuple[RayBundle, RayBundle]:
-    """Return a picture of rays as the model takes them, and the same rays through the world."""
+@torch.no_grad()
+def view_rays(rays_of: RayGenerator, view: int, clip: Clip | None = None) -> tuple[RayBundle, RayBundle]:
+    """Return a picture of rays as the model takes them, and the same rays through the world; both on the CPU."""
+    cameras = rays_of.cameras
     pixels = all_pixels(cameras, view)
-    rays = rays_through_pixels(cameras, pixels, near, far)
-    straight = rays if cameras.ndc is None else rays_through_pixels(replace(cameras, ndc=None), pixels, near, far)
+    rays = rays_of(pixels).to("cpu")
+    straight = rays if cameras.ndc is None else rays_of.through_world(pixels).to("cpu")
     if clip is not None:
         rays = clip(rays, straight, ndc=cameras.ndc is not None)
     return rays, straight

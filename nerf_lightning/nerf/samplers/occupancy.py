@@ -179,7 +179,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         half = half * 2.0 ** (self.num_cascades - 1)
         enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
-        return March(enter, leave, jitter, torch.zeros_like(rays.camera_index))
+        return March(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 
     @property
     def grid(self) -> OccupancyCells:

@@ -18,10 +18,12 @@ class RayBundle(TensorStruct):
     """Unit length, so `t` is a distance."""
     near: Float[Tensor, "*rays"]
     far: Float[Tensor, "*rays"]
-    camera_index: Int[Tensor, "*rays"]
     view_directions: Float[Tensor, "*rays 3"]
     """Where the camera looks in the world, unit length: what colour depends on. Differs from `directions` in
     normalised device coordinates."""
+    photograph: Int[Tensor, "*rays"] | None = None
+    """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
+    films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,27 @@ class PixelIndex(TensorStruct):
 
 @dataclass(frozen=True)
 class Batch(TensorStruct):
-    """Rays, all that a model may see, and what the photographs say of them."""
+    """Pixels of photographs and what they show; the rays through them are made in the step (`RayGenerator`)."""
 
-    rays: RayBundle
+    pixels: PixelIndex
     rgba: Float[Tensor, "*rays 4"]
     """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
     weight: Float[Tensor, "*rays"]
     """How much each pixel counts: 0 where it is masked, else 1."""
+
+    @property
+    def num_rays(self) -> int:
+        """How many pixels there are, each with its ray."""
+        return self.weight.numel()
+
+
+@dataclass(frozen=True)
+class Target(TensorStruct):
+    """What the renderings of some rays are compared with."""
+
+    rgb: Float[Tensor, "*rays 3"]
+    """What the photographs show, over the step's background."""
+    weight: Float[Tensor, "*rays"]
+    """Of each ray, >= 0; its mean over the whole batch is 1."""
+    pixels: PixelIndex
+    """Where in which photograph each ray lies."""

@@ -12,6 +12,7 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.selftest.check import Check
@@ -135,4 +136,4 @@ def _film(place: Place) -> float:
 def _picture(
     model: RadianceModel, scene: SceneRecord, cameras: Cameras, view: int, near: Tensor, far: Tensor
 ) -> Picture:
-    return render_picture(model, cameras, view, near, far, scene.background, TILE_POINTS)
+    return render_picture(model, RayGenerator(cameras, near, far), view, scene.background, TILE_POINTS)

@@ -167,7 +167,7 @@ def _march(device: torch.device, capacity: int | None) -> float:
     eyes = 4.0 * torch.nn.functional.normalize(torch.randn(RAYS, 3, generator=random), dim=-1)
     along = torch.nn.functional.normalize(0.3 * torch.randn(RAYS, 3, generator=random) - eyes, dim=-1)
     two, whole = torch.full((RAYS,), 2.0), torch.zeros(RAYS, dtype=torch.long)
-    rays = RayBundle(eyes, along, two, 3 * two, whole, along)
+    rays = RayBundle(eyes, along, two, 3 * two, along)
     enter, leave = distances_in_box(rays, 2.0 * box)
     state = March(enter, leave, torch.rand(RAYS, generator=random), whole)
     cells = (torch.rand(2, 16, 16, 16, generator=random) < 0.3).to(torch.uint8)

@@ -7,9 +7,11 @@ from torch import Tensor
 
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.backends import can_compile, without
 from nerf_lightning.nerf.kernels.compile import CPU_TWINS
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.types.progress import Progress
@@ -17,7 +19,7 @@ from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm
 from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
 # Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
@@ -31,14 +33,15 @@ TORCH_ALONE = (*CPU_TWINS, "mlp.cpu")
 
 
 class Training:
-    """A training in the making: the system with stand-ins for what Lightning's trainer provides."""
+    """A training in the making."""
 
     def __init__(self, method: str, device: torch.device, products: Products, tile_points: int | None):
         scene, progress, chosen = ball_scene(), Progress(), METHODS[method]
         model = chosen.model()
         model.fit_to(scene)
-        self.system = RadianceFieldSystem(
+        self.step = TrainStep(
             model=model,
+            rays=RayGenerator(scene.cameras, scene.near, scene.far),
             loss=chosen.loss(),
             optimizer=chosen.optimizer,
             schedule=ExponentialDecay(decay_rate=0.1),
@@ -47,42 +50,35 @@ class Training:
             seed=SEED,
             background=scene.background,
             tile_points=tile_points,
-            clip_norm=None,
-            sample_budget=None,
-            record={},
-        )
-        self.system.initialize()
+        ).to(device)
         model.multiply_in(products)
-        self.system.to(device)
         here = scene if device.type == "cpu" else on_device(scene, device)
         self.loader = RayBatches(here, progress, SEED, BATCH_RAYS, STEPS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
-        optimizer = self.system.configure_optimizers()
-        setattr(self.system, "optimizers", lambda: optimizer)  # noqa: B010
-        setattr(self.system, "manual_backward", lambda loss: loss.backward())  # noqa: B010
+        self.optimizer = self.step.new_optimizer()
 
     def gradients(self) -> dict[str, Tensor]:
         """Return the gradients of the first batch, with tables as large as trained ones are."""
         # Fresh ones are all but zero: whatever is done with them would hardly matter.
         with torch.no_grad():
-            for table in tables_of(self.system):
+            for table in tables_of(self.step.model):
                 table.mul_(LEARNT)
-        self.system.optimizers().zero_grad()  # type: ignore[union-attr]
-        self.system.accumulate_gradients(self.loader.at(0, 0).to(self.system.device), lambda loss: loss.backward())
-        named = self.system.model.named_parameters()
+        self.optimizer.zero_grad()
+        self.step.gradients(self.loader.at(0, 0).to(self.step.device))
+        named = self.step.model.named_parameters()
         return {name: value.grad.clone() for name, value in named if value.grad is not None}
 
     def psnr(self) -> float:
         """Train, and return the PSNR of the held-out views."""
-        system = self.system
-        for number in range(STEPS):
-            system.training_step(self.loader.at(0, system.progress.rays_seen).to(system.device), number)
+        step, errors = self.step, RayErrors()
+        for _ in range(STEPS):
+            step(self.loader.at(0, step.progress.rays_seen).to(step.device), self.optimizer)
         with torch.no_grad():
-            for number, batch in enumerate(self.held_out):
-                system.validation_step(batch.to(system.device), number)
-        if system.guard.skipped:
-            raise ValueError(f"{system.guard.skipped} of {STEPS} steps had gradients that are not finite")
-        return system.val_errors.summary()["val/psnr"]
+            for batch in self.held_out:
+                step.validate(batch.to(step.device), errors)
+        if step.guard.skipped:
+            raise ValueError(f"{step.guard.skipped} of {STEPS} steps had gradients that are not finite")
+        return errors.summary()["val/psnr"]
 
 
 def checks(place: Place) -> list[Check]:
@@ -141,7 +137,7 @@ def _compiled(place: Place) -> Check:
         if not can_compile(place.device):
             raise CannotRun("there is no C++ compiler, which torch.compile needs on the CPU")
         training = Training(method, place.device, place.chosen, None)
-        if not training.system.model.compile_fields():
+        if not training.step.model.compile_fields():
             raise ValueError("no level was compiled")
         return gradients_apart(training.gradients(), _reference(method)[0])
 
@@ -162,10 +158,13 @@ def _resident(place: Place) -> Check:
             RayBatches(each, Progress(), SEED, BATCH_RAYS, STEPS) for each in (on_device(scene, place.device), scene)
         ]
         there, here = (loader.at(0, 1000) for loader in loaders)
-        if not torch.equal(there.rays.camera_index.cpu(), here.rays.camera_index):
+        if not all(torch.equal(value.cpu(), vars(here.pixels)[name]) for name, value in vars(there.pixels).items()):
             raise ValueError("other pixels are chosen")
-        columns = ((each.rgba, each.rays.origins, each.rays.directions) for each in (there, here))
-        return max(relative(found, expected) for found, expected in zip(*columns, strict=True))
+        rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+        expected = rays_of(here.pixels)
+        found = rays_of.to(place.device)(there.pixels)
+        pairs = [(there.rgba, here.rgba), (found.origins, expected.origins), (found.directions, expected.directions)]
+        return max(relative(ours, theirs) for ours, theirs in pairs)
 
     return Check(
         "batches made of pixels on the device",

@@ -40,7 +40,7 @@ class Checkpoints(Callback):
             InputError: an earlier one could not be written.
         """
         writer(trainer).raise_failure()
-        if trainer.global_step % self.every_steps == 0 and pl_module.is_sound():
+        if trainer.global_step % self.every_steps == 0 and pl_module.step.is_sound():
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
@@ -48,7 +48,7 @@ class Checkpoints(Callback):
         value = trainer.callback_metrics.get(self.monitor)
         if trainer.sanity_checking or value is None:
             return
-        if (self.best is None or float(value) > self.best) and pl_module.is_sound():
+        if (self.best is None or float(value) > self.best) and pl_module.step.is_sound():
             self.best = float(value)
             trainer.save_checkpoint(self.folder(trainer) / BEST)
 

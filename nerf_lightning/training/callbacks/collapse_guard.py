@@ -49,11 +49,11 @@ class CollapseGuard(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look now and then."""
-        progress, batches = pl_module.progress, trainer.datamodule.batches  # type: ignore[attr-defined]
+        progress, batches = pl_module.step.progress, trainer.datamodule.batches  # type: ignore[attr-defined]
         after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
             return
-        seen = whole_batch(pl_module.last_step)
+        seen = whole_batch(outputs)
         self.failed = self.failed + 1 if is_constant(seen, self.ratio) else 0
         if self.failed >= self.patience:
             self.failed = 0
@@ -68,7 +68,7 @@ class CollapseGuard(Callback):
         self.failed = state_dict["failed"]
 
     def _restart(self, trainer: Trainer, system: Any) -> None:
-        step, restarts = trainer.global_step, system.progress.restarts
+        step, restarts = trainer.global_step, system.step.progress.restarts
         if restarts >= self.max_restarts:
             log.warning(
                 "Step %d: the renders are constant again, after %d restarts; training goes on as it is. Check the "
@@ -78,33 +78,33 @@ class CollapseGuard(Callback):
                 restarts,
             )
             return
-        system.restart()
+        system.step.restart(system.optimizers().optimizer)
         message = (
             f"Step {step}: the renders are constant while the photographs are not (a collapsed run). "
             f"Restarted with new weights: attempt {restarts + 2} of at most {self.max_restarts + 1}."
         )
         log.warning(message)
         for logger in trainer.loggers:
-            logger.log_metrics({"train/attempt": system.progress.attempt}, step)
+            logger.log_metrics({"train/attempt": system.step.progress.attempt}, step)
         for writer in tensorboard_writers(trainer.loggers):
             writer.add_text("collapse_guard", message, step)
 
 
-def whole_batch(last_step: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def whole_batch(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return what all processes saw of a step's rays."""
-    parts = ranks.gather({name: last_step[name].cpu() for name in ("foreground", "target", "weight")})
+    parts = ranks.gather({name: outputs[name].cpu() for name in ("foreground", "target", "weight")})
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def is_constant(last_step: dict[str, torch.Tensor], ratio: float) -> bool:
+def is_constant(seen: dict[str, torch.Tensor], ratio: float) -> bool:
     """Tell whether the light that the field itself sends is the same for all rays, unlike the photographs.
 
     Rays of masked pixels do not count: nothing has told the field what lies there.
     """
-    last_step = {name: value.cpu() for name, value in last_step.items()}
-    kept = last_step["weight"] > 0
+    seen = {name: value.cpu() for name, value in seen.items()}
+    kept = seen["weight"] > 0
     if int(kept.sum()) < 2:
         return False
-    target_spread = last_step["target"][kept].std(dim=0).amax()
-    render_spread = last_step["foreground"][kept].std(dim=0).amax()
+    target_spread = seen["target"][kept].std(dim=0).amax()
+    render_spread = seen["foreground"][kept].std(dim=0).amax()
     return bool((target_spread > 1e-3) & (render_spread < ratio * target_spread))

@@ -34,10 +34,11 @@ class EpochFigures(Callback):
         """Collect the loss; draw when an epoch has ended."""
         if trainer.global_step % self.every_steps == 0:
             self.steps.append(trainer.global_step)
-            self.losses.append(float(pl_module.last_step["losses"].cpu().sum()))
+            self.losses.append(float(outputs["losses"].cpu().sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
         per_figure = self.every_epochs * len(batches.whole)
-        seen = pl_module.progress.rays_seen - batches.crop_rays(pl_module.progress.restarts)
+        progress = pl_module.step.progress
+        seen = progress.rays_seen - batches.crop_rays(progress.restarts)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
             self._draw(trainer, pl_module, epoch=seen // len(batches.whole))
 

@@ -8,7 +8,6 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.watcher import Watcher
 
 GIGABYTE = 1e9
@@ -29,31 +28,31 @@ class Monitor(Watcher):
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Start the clock."""
         self.since = time.perf_counter()
-        self.rays_seen = pl_module.progress.rays_seen
+        self.rays_seen = pl_module.step.progress.rays_seen
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, batch: Batch, batch_idx: int) -> None:
-        """Ask for the gradients' norms of a step that gets a row."""
+    def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
+        """Tell whether the step that begins gets a row, and so has to measure the norms of its gradients."""
         # XLA would compile the steps that get a row and those that do not as two programs.
-        always = pl_module.device.type == "xla"
-        pl_module.measures_gradients = always or self.is_time(trainer.global_step + 1, trainer.max_steps)
+        return system.device.type == "xla" or self.is_time(trainer.global_step + 1, trainer.max_steps)
 
-    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+    def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Log a row."""
+        progress = system.step.progress
         now, step = time.perf_counter(), trainer.global_step
-        rays, seconds = system.progress.rays_seen - self.rays_seen, now - self.since
-        self.since, self.rays_seen = now, system.progress.rays_seen
+        rays, seconds = progress.rays_seen - self.rays_seen, now - self.since
+        self.since, self.rays_seen = now, progress.rays_seen
         names = system.model.level_names
-        pictures = names if system.loss.every_level_is_a_picture else names[-1:]
-        values = level_scalars(names, system.last_step["losses"], pictures) | system.model.statistics()
+        pictures = names if system.step.loss.every_level_is_a_picture else names[-1:]
+        values = level_scalars(names, outputs["losses"], pictures) | system.model.statistics()
         values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
-        values["speed/rays_per_step"] = batch.rays.near.numel()
-        values["train/skipped_steps"] = system.guard.skipped
+        values["speed/rays_per_step"] = outputs["weight"].numel()
+        values["train/skipped_steps"] = system.step.guard.skipped
         values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
         if system.device.type == "cuda":
             values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE
-        values |= {f"gradients/norm_{name}": float(norm) for name, norm in system.gradient_norms.items()}
+        values |= {f"gradients/norm_{name}": float(norm) for name, norm in outputs["gradient_norms"].items()}
         for logger in trainer.loggers:
             logger.log_metrics(values, step)
 

@@ -1,6 +1,7 @@
 """The NaN guard: a run whose numbers are not finite any more is stopped, or goes back and on at a lower rate."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,52 +54,52 @@ class NanGuard(Callback):
         Raises:
             InputError: it does not, and is not to be rolled back, or was too often.
         """
-        guard, step = pl_module.guard, pl_module.progress.step
+        guard, step = pl_module.step.guard, pl_module.step.progress.step
         looks = step % self.every_steps == 0
         if (looks or pl_module.device.type == "cpu") and guard.in_row >= self.patience:
             cause = (
                 f"The loss or its gradients are not finite numbers since step {step - guard.in_row + 1} "
                 f"({guard.in_row} steps in a row, all left out; first in the gradient of {guard.first_module})"
             )
-        elif looks and (broken := pl_module.broken_weights()):
+        elif looks and (broken := pl_module.step.broken_weights()):
             cause = f"The weights of step {step} are not finite numbers (first those of {broken})"
         else:
             return
         self._act(trainer, pl_module, cause)
 
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
-        good = ranks.from_first(lambda: _last_good(trainer))
-        if self.on_nan == "stop" or system.progress.rollbacks >= self.max_rollbacks:
+        good, progress = ranks.from_first(lambda: _last_good(trainer)), system.step.progress
+        if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
             raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
         place = f"checkpoint {good}" if good is not None else "beginning, with new weights, as no checkpoint was saved"
         rate = system.optimizers().param_groups[0]["base_lr"]
         message = (
-            f"{cause}. Rolled back to the {place}: attempt {system.progress.attempt + 1}, rollback "
-            f"{system.progress.rollbacks} of at most {self.max_rollbacks}, base learning rate {rate:.3g}."
+            f"{cause}. Rolled back to the {place}: attempt {progress.attempt + 1}, rollback "
+            f"{progress.rollbacks} of at most {self.max_rollbacks}, base learning rate {rate:.3g}."
         )
         log.warning(message)
         for logger in trainer.loggers:
-            logger.log_metrics({"train/attempt": system.progress.attempt}, trainer.global_step)
+            logger.log_metrics({"train/attempt": progress.attempt}, trainer.global_step)
         for board in tensorboard_writers(trainer.loggers):
             board.add_text("nan_guard", message, trainer.global_step)
 
     def _roll_back(self, trainer: Trainer, system: Any, good: Path | None) -> None:
-        attempt, rollbacks, skipped = system.progress.attempt, system.progress.rollbacks, system.guard.skipped
-        lowered = rollbacks
+        step = system.step
+        former, skipped = replace(step.progress), step.guard.skipped
+        lowered = former.rollbacks
         if good is None:
-            system.restart()
+            step.restart(system.optimizers().optimizer)
         else:
             content = trainer.strategy.load_checkpoint(good, weights_only=True)
             system.on_load_checkpoint(content)
             trainer.strategy.load_model_state_dict(content)
             trainer.strategy.load_optimizer_state_dict(content)
             lowered = content["nerf_lightning"]["progress"]["rollbacks"]
-        system.progress.attempt, system.progress.rollbacks = attempt + 1, rollbacks + 1
-        system.guard.restore([skipped, 0], system.device)
+        step.count_rollback(former, skipped)
         for group in system.optimizers().param_groups:
             # The rate in the checkpoint may be that of before an earlier rollback.
-            group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (rollbacks + 1 - lowered)
+            group["base_lr"] = group.get("base_lr", group["lr"]) * self.factor ** (former.rollbacks + 1 - lowered)
 
     def _advice(self, trainer: Trainer, good: Path | None) -> str:
         settings = (

@@ -37,7 +37,7 @@ class TrainingProgress(ProgressBar):
         """Show the bar."""
         self.started = self.shown = time.perf_counter()
         self.first_step = trainer.global_step
-        self.rays_seen = pl_module.progress.rays_seen
+        self.rays_seen = pl_module.step.progress.rays_seen
         console = Console(stderr=True)
         if self.silent or not console.is_terminal:
             return
@@ -61,18 +61,18 @@ class TrainingProgress(ProgressBar):
             return
         per_second = (step - self.first_step) / (now - self.started)
         # Negative after a restart, which counts anew.
-        rays_per_second = max(0.0, (pl_module.progress.rays_seen - self.rays_seen) / (now - self.shown))
-        self.shown, self.rays_seen = now, pl_module.progress.rays_seen
-        loss = pl_module.last_step["losses"].cpu()
+        rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
+        self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
+        loss = outputs["losses"].cpu()
         text = (
             f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "
             f"{rays_per_second:,.0f} rays/s"
         )
         if self.bar is not None:
-            self.bar.update(self.task, completed=step, total=pl_module.num_steps, description=text)
+            self.bar.update(self.task, completed=step, total=pl_module.step.num_steps, description=text)
         else:
-            left = (pl_module.num_steps - step) / per_second
-            log.info("step %d/%d  %s  about %.0f s left", step, pl_module.num_steps, text, left)
+            left = (pl_module.step.num_steps - step) / per_second
+            log.info("step %d/%d  %s  about %.0f s left", step, pl_module.step.num_steps, text, left)
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""

@@ -11,8 +11,9 @@ from nerf_lightning.errors import require_positive
 from nerf_lightning.nerf.models.tiles import weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along
-from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS, Watcher, tensorboard_writers
+from nerf_lightning.training.step import TrainStep
 
 PARTS = 50
 
@@ -33,13 +34,13 @@ class RayHistograms(Watcher):
         require_positive(num_rays=num_rays)
         self.num_rays = num_rays
 
-    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+    def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Write two histograms and a curve for each level."""
         writers = tensorboard_writers(trainer.loggers)
         if not writers:
             return
         step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
-        seen = look_along(system, batch.rays[: self.num_rays], step, endless)
+        seen = look_along(system.step, outputs["pixels"][: self.num_rays], step, endless)
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:
@@ -51,19 +52,20 @@ class RayHistograms(Watcher):
 
 @torch.no_grad()
 def look_along(
-    system: Any, rays: RayBundle, step: int, endless: bool
+    training: TrainStep, pixels: PixelIndex, step: int, endless: bool
 ) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
     """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
-    names, num_rays = system.model.level_names, rays.near.numel()
-    key = fold(system.seed, step, "histograms")
-    tile_points = system.tile_points or WHOLE_BATCH_POINTS
+    model, rays = training.model, training.rays(pixels)
+    names, num_rays = model.level_names, rays.near.numel()
+    key = fold(training.seed, step, "histograms")
+    tile_points = training.tile_points or WHOLE_BATCH_POINTS
     seen: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in names}
-    system.eval()
-    for part, renderings in weighted_renderings(system.model, rays, system.background, key, tile_points):
+    model.eval()
+    for part, renderings in weighted_renderings(model, rays, training.background, key, tile_points):
         for name, rendering in zip(names, renderings, strict=True):
             along = weight_along(rendering, part, PARTS, endless) * part.near.numel() / num_rays
             seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))
-    system.train()
+    model.train()
     return {
         name: (torch.stack([along for along, _ in parts]).sum(0), torch.cat([samples for _, samples in parts]))
         for name, parts in seen.items()

@@ -41,15 +41,15 @@ class TimeBudget(Callback):
         if hasattr(signal, "SIGCONT"):
             self.former = signal.signal(signal.SIGCONT, self._woken)
         if self.used:
-            self._fit_schedule(trainer, pl_module)
+            self._fit_schedule(trainer, pl_module.step)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Estimate the length of the run, and stop when the time is over."""
         now = time.perf_counter()
         # All processes stop at the same step: the slowest clock is everybody's.
         self.used, self.since = ranks.largest(self.used + now - self.since), now
-        if pl_module.progress.step % self.every_steps == 0:
-            self._fit_schedule(trainer, pl_module)
+        if pl_module.step.progress.step % self.every_steps == 0:
+            self._fit_schedule(trainer, pl_module.step)
         if self.used >= self.seconds:
             trainer.should_stop = True
 
@@ -71,6 +71,6 @@ class TimeBudget(Callback):
         # When the stop began is not known: what was done of the step is left out with it.
         self.since = time.perf_counter()
 
-    def _fit_schedule(self, trainer: Trainer, system: Any) -> None:
-        step = system.progress.step
-        system.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))
+    def _fit_schedule(self, trainer: Trainer, training: Any) -> None:
+        step = training.progress.step
+        training.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))

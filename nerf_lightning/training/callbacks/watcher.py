@@ -32,15 +32,18 @@ class Watcher(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Look when it is time."""
         if self.is_time(trainer.global_step, trainer.max_steps):
-            self.watch(trainer, pl_module, batch)
+            self.watch(trainer, pl_module, outputs)
 
     def is_time(self, step: int, last_step: int) -> bool:
         """Tell whether to look after a step."""
         return step % self.every_steps == 0
 
     @abstractmethod
-    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
-        """Look at the run; every process of it is asked, the loggers are the first one's."""
+    def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
+        """Look at the run, and at what its last step returned.
+
+        Every process of it is asked, the loggers are the first one's.
+        """
 
 
 WRITES = "tensorboard.summary.writer.event_file_writer"
@@ -86,8 +89,8 @@ def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int,
     scene = trainer.datamodule.scene
     views = scene.splits["val"]
     view = views[number % len(views)]
-    tile_points = system.tile_points or WHOLE_BATCH_POINTS
+    tile_points = system.step.tile_points or WHOLE_BATCH_POINTS
     system.eval()
-    picture = render_picture(system.model, scene.cameras, view, scene.near, scene.far, scene.background, tile_points)
+    picture = render_picture(system.model, system.rays, view, scene.background, tile_points)
     system.train()
     return view, picture

@@ -132,6 +132,21 @@ M_MMAP_THRESHOLD = -3
 M_TRIM_THRESHOLD = -1
 
 
+def use_threads(number: int) -> None:
+    """Use as many threads as a run has used before, where there are so many cores."""
+    cores = os.cpu_count() or 1
+    if number <= cores:
+        torch.set_num_threads(number)
+    else:
+        log.warning(
+            "The run has used %d threads and this machine has %d cores: it goes on with %d, and may differ in the last "
+            "bits.",
+            number,
+            cores,
+            torch.get_num_threads(),
+        )
+
+
 def prepare_machine(num_threads: int | None) -> None:
     """Set threads and the allocator, once per process; None: one thread per core."""
     torch.set_num_threads(num_threads or ALL_THREADS)

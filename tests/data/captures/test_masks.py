@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 from support.scenes import ball_scene, tiny_model
-from support.systems import gradients, make_system
+from support.steps import gradients, make_step
 
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.evaluation.metrics import image_metrics, masked_out
+from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, masked_out
 from nerf_lightning.evaluation.protocol import split_hash
 from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
@@ -35,35 +35,35 @@ def garbled(scene):
 class PlainMean(MeanSquaredError):
     """The loss without weights."""
 
-    def forward(self, renderings, target, weight):
-        assert float(weight.mean()) == 1.0
-        return [(rendering.rgb - target).square().mean() for rendering in renderings]
+    def forward(self, renderings, target):
+        assert float(target.weight.mean()) == 1.0
+        return [(rendering.rgb - target.rgb).square().mean() for rendering in renderings]
 
 
 @pytest.mark.parametrize("tile_points", [None, 100])
 def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(tile_points):
     model = tiny_model(density_bias=0.5)
-    plain_system = make_system(tile_points, copy.deepcopy(model))
-    plain_system.loss = PlainMean()
-    plain, losses = gradients(plain_system, ball_scene())
-    weighted, weighted_losses = gradients(make_system(tile_points, copy.deepcopy(model)), ball_scene())
+    plain_step = make_step(tile_points, copy.deepcopy(model))
+    plain_step.loss = PlainMean()
+    plain, losses = gradients(plain_step, ball_scene())
+    weighted, weighted_losses = gradients(make_step(tile_points, copy.deepcopy(model)), ball_scene())
     assert torch.equal(weighted, plain)
     assert torch.equal(weighted_losses, losses)
     keep_all = masked(ball_scene(), lambda number: number >= 0)
-    assert torch.equal(gradients(make_system(tile_points, copy.deepcopy(model)), keep_all)[0], plain)
+    assert torch.equal(gradients(make_step(tile_points, copy.deepcopy(model)), keep_all)[0], plain)
 
 
 def test_the_loss_is_the_mean_over_unmasked_pixels():
-    system, scene = make_system(None), masked(ball_scene(), lambda number: number % 3 > 0)
+    step, scene = make_step(None), masked(ball_scene(), lambda number: number % 3 > 0)
     batch = RayBatches(scene, Progress(), 0, 64, 10).at(0, 0)
     kept = batch.weight > 0
     assert 0 < int(kept.sum()) < 64
-    seen = system.accumulate_gradients(batch, lambda loss: loss.backward())
+    seen = step.gradients(batch)
     error = []
-    system.loss.forward = lambda renderings, target, weight: [
-        error.append((r.rgb - target).square()[kept].mean()) or error[-1] for r in renderings
+    step.loss.forward = lambda renderings, target: [
+        error.append((r.rgb - target.rgb).square()[kept].mean()) or error[-1] for r in renderings
     ]
-    system.accumulate_gradients(batch, lambda loss: None)
+    step.gradients(batch, lambda loss: None)
     torch.testing.assert_close(seen["losses"], torch.stack(error))
 
 
@@ -71,8 +71,8 @@ def test_the_loss_is_the_mean_over_unmasked_pixels():
 def test_the_normaliser_is_the_batchs_not_the_tiles(tile_points):
     # Tiles then hold very different numbers of unmasked rays, some none.
     scene, model = masked(ball_scene(), lambda number: number % 7 == 0), tiny_model(density_bias=0.5)
-    whole, losses = gradients(make_system(None, copy.deepcopy(model)), scene)
-    tiled, tiled_losses = gradients(make_system(tile_points, copy.deepcopy(model)), scene)
+    whole, losses = gradients(make_step(None, copy.deepcopy(model)), scene)
+    tiled, tiled_losses = gradients(make_step(tile_points, copy.deepcopy(model)), scene)
     torch.testing.assert_close(tiled, whole, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(tiled_losses, losses, rtol=1e-5, atol=1e-7)
     assert float(whole.norm()) > 0
@@ -80,13 +80,13 @@ def test_the_normaliser_is_the_batchs_not_the_tiles(tile_points):
 
 def test_the_colours_of_masked_pixels_do_not_matter():
     scene, model = masked(ball_scene(), lambda number: number % 2 > 0), tiny_model(density_bias=0.5)
-    one, _ = gradients(make_system(None, copy.deepcopy(model)), scene)
-    other, _ = gradients(make_system(None, copy.deepcopy(model)), garbled(scene))
+    one, _ = gradients(make_step(None, copy.deepcopy(model)), scene)
+    other, _ = gradients(make_step(None, copy.deepcopy(model)), garbled(scene))
     assert torch.equal(one, other)
 
 
 def test_a_batch_of_masked_pixels_alone_has_no_gradient():
-    gradient, losses = gradients(make_system(None), masked(ball_scene(), lambda number: number < 0))
+    gradient, losses = gradients(make_step(None), masked(ball_scene(), lambda number: number < 0))
     assert float(gradient.abs().max()) == 0
     assert losses.tolist() == [0.0, 0.0]
 
@@ -99,16 +99,11 @@ def test_gathering_gives_masked_pixels_no_weight():
 
 
 def validation_psnr(scene):
-    system = make_system(None)
-    logged = {}
-    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
-    system._trainer = type("T", (), {"loggers": [logger], "global_step": 3})()
-    system.log = lambda name, value, **options: None
+    step, errors = make_step(None), RayErrors()
     with torch.no_grad():
         for batch in FixedRays(scene, "val", 200, 64):
-            system.validation_step(batch, 0)
-        system.on_validation_epoch_end()
-    return logged["val/psnr"]
+            step.validate(batch, errors)
+    return errors.summary()["val/psnr"]
 
 
 def test_validation_looks_at_unmasked_pixels():

@@ -24,7 +24,7 @@ def forward_rays(count=50, seed=0):
 def bundle(origins, directions):
     directions = directions / directions.norm(dim=-1, keepdim=True)
     zeros = torch.zeros_like(origins[..., 0])
-    return RayBundle(origins, directions, zeros, zeros + 1, zeros.long(), view_directions=directions)
+    return RayBundle(origins, directions, zeros, zeros + 1, view_directions=directions)
 
 
 def test_the_near_plane_is_minus_one_and_infinity_is_one():

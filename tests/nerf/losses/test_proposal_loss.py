@@ -7,7 +7,7 @@ from support.scenes import some_rays
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.losses.proposal import ProposalLoss, distortion_loss, interlevel_loss, outer_weights
 from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.types.rays import RaySamples
+from nerf_lightning.nerf.types.rays import PixelIndex, RaySamples, Target
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 
@@ -60,11 +60,17 @@ def test_distortion_is_the_double_sum():
     torch.testing.assert_close(distortion_loss(seen), expected)
 
 
+def as_target(rgb, weight=None):
+    places = torch.arange(len(rgb))
+    weight = torch.ones(len(rgb)) if weight is None else weight
+    return Target(rgb, weight, PixelIndex(places, places, places))
+
+
 def test_the_levels_losses_are_named_in_order():
     proposal, _ = rendering(random_edges(4, 9), torch.rand(4, 8))
     last, _ = rendering(random_edges(4, 12), torch.rand(4, 11))
     target = torch.rand(4, 3)
-    first, second = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], target, torch.ones(4))
+    first, second = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], as_target(target))
     torch.testing.assert_close(first, 2.0 * interlevel_loss(last, proposal).mean())
     torch.testing.assert_close(second, (last.rgb - target).square().mean() + 0.5 * distortion_loss(last).mean())
 
@@ -73,7 +79,7 @@ def test_a_ray_without_weight_teaches_no_level_anything():
     proposal, density = rendering(random_edges(4, 9), 0.1 * torch.rand(4, 8), requires_grad=True)
     last, last_density = rendering(random_edges(4, 12), torch.rand(4, 11), requires_grad=True)
     weight = torch.tensor([2.0, 0.0, 2.0, 0.0])
-    sum(ProposalLoss()([proposal, last], torch.rand(4, 3), weight)).backward()
+    sum(ProposalLoss()([proposal, last], as_target(torch.rand(4, 3), weight))).backward()
     for gradient in (density.grad, last_density.grad):
         assert (gradient.abs().sum(dim=1) > 0).tolist() == [True, False, True, False]
 

@@ -6,6 +6,7 @@ On the meta device nothing has a value, so whatever reads one is refused; and wh
 import pytest
 import torch
 from support.scenes import ball_scene
+from support.steps import rays_of
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.data.ray_batches import RayBatches
@@ -13,7 +14,7 @@ from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.models import METHODS
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 # The one that asks how much it found, as the CPU does, is not for this.
 ON_DEVICES = [name for name in METHODS if name != "packed hash grid"]
@@ -35,29 +36,23 @@ class FromTheHost(TorchDispatchMode):
         return out
 
 
-def a_system(name: str, scene, progress: Progress, loss=None) -> RadianceFieldSystem:
+def a_step(name: str, scene, progress: Progress, loss=None) -> TrainStep:
     method = METHODS[name]
     model = method.model()
     model.fit_to(scene)
     # torch's fused Adam does not know the device.
     plain = method.optimizer if "hash" in name else lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    system = RadianceFieldSystem(
-        model, loss or method.loss(), plain, ExponentialDecay(), progress, 100, 0, "random", None, 1.0, None, {}
-    )
-    system.initialize()
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
-    return system
+    loss = loss or method.loss()
+    return TrainStep(model, rays_of(scene), loss, plain, ExponentialDecay(), progress, 100, 0, "random", None, 1.0)
 
 
 def sent_within_a_step(name, monkeypatch, loss=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    loader, system = RayBatches(scene, progress, 0, 64, 100), a_system(name, scene, progress, loss)
+    loader, step = RayBatches(scene, progress, 0, 64, 100), a_step(name, scene, progress, loss)
     # What is read once in a run (switches, lattices) or at each update of the grid is read on the host.
-    system.training_step(loader.at(0, 0), 0)
-    system.to("meta")
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.guard.counts, system.guard.place = lambda: optimizer, None, None
+    step(loader.at(0, 0), step.new_optimizer())
+    optimizer = step.to(torch.device("meta")).new_optimizer()
+    step.guard.counts, step.guard.place = None, None
     batch, make, made = loader.at(0, 0).to("meta"), torch.tensor, []
 
     def tensor(*given, **options):
@@ -68,7 +63,7 @@ def sent_within_a_step(name, monkeypatch, loss=None):
         made.clear()
         with FromTheHost() as watch, monkeypatch.context() as patch:
             patch.setattr(torch, "tensor", tensor)
-            system.training_step(batch, 0)
+            step(batch, optimizer)
     return watch.seen + [device for device in made if "meta" in device]
 
 
@@ -82,9 +77,9 @@ class Planted(MeanSquaredError):
         super().__init__()
         self.fault = fault
 
-    def forward(self, renderings, target, weight):
+    def forward(self, renderings, target):
         self.fault(renderings[-1].opacity)
-        return super().forward(renderings, target, weight)
+        return super().forward(renderings, target)
 
 
 @pytest.mark.parametrize(
@@ -108,21 +103,22 @@ def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():
     losses, dropped = [], []
     for name in ("packed hash grid", "packed hash grid, fixed capacity"):
         scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-        system, loader = a_system(name, scene, progress), RayBatches(scene, progress, 0, 64, 100)
+        step, loader = a_step(name, scene, progress), RayBatches(scene, progress, 0, 64, 100)
+        optimizer = step.new_optimizer()
         for _ in range(20):
-            system.training_step(loader.at(0, progress.rays_seen), 0)
-        losses.append(system.last_step["losses"])
-        dropped.append(system.model.statistics()["train/dropped_samples"])
+            seen = step(loader.at(0, progress.rays_seen), optimizer)
+        losses.append(seen["losses"])
+        dropped.append(step.model.statistics()["train/dropped_samples"])
     torch.testing.assert_close(losses[0], losses[1], rtol=1e-4, atol=0)
     assert dropped == [0, 0]
 
 
 def test_without_room_samples_are_dropped_and_counted():
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    system = a_system("packed hash grid, fixed capacity", scene, progress)
-    system.model.last.sampler.capacity = 500
-    loader = RayBatches(scene, progress, 0, 64, 100)
+    step = a_step("packed hash grid, fixed capacity", scene, progress)
+    step.model.last.sampler.capacity = 500
+    loader, optimizer = RayBatches(scene, progress, 0, 64, 100), step.new_optimizer()
     for _ in range(3):
-        system.training_step(loader.at(0, progress.rays_seen), 0)
-    assert system.model.statistics()["train/dropped_samples"] > 500
-    assert system.guard.skipped == 0
+        step(loader.at(0, progress.rays_seen), optimizer)
+    assert step.model.statistics()["train/dropped_samples"] > 500
+    assert step.guard.skipped == 0

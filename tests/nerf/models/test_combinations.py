@@ -3,6 +3,7 @@
 import pytest
 import torch
 from support.scenes import ball_scene
+from support.steps import rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
@@ -24,7 +25,7 @@ from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.training.system import RadianceFieldSystem
+from nerf_lightning.training.step import TrainStep
 
 POSITIONS = {
     "frequency": lambda: FrequencyEncoder(4),
@@ -66,8 +67,9 @@ def test_it_learns(model, field, position, direction):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     levels = RadianceModel(MODELS[model](lambda: FIELDS[field](POSITIONS[position](), DIRECTIONS[direction]())))
     levels.fit_to(scene)
-    system = RadianceFieldSystem(
+    step = TrainStep(
         model=levels,
+        rays=rays_of(scene),
         loss=ProposalLoss() if model == "proposal" else MeanSquaredError(),
         optimizer=lambda groups: TableAdam(groups, lr=0.02),
         schedule=ExponentialDecay(decay_rate=1.0),
@@ -76,20 +78,14 @@ def test_it_learns(model, field, position, direction):
         seed=0,
         background="random",
         tile_points=4096,
-        clip_norm=None,
-        sample_budget=None,
-        record={},
     )
-    optimizer = system.configure_optimizers()
-    system.optimizers = lambda: optimizer
-    system.manual_backward = lambda loss: loss.backward()
+    optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 64, 60)
     losses = []
     for _ in range(30):
-        system.training_step(loader.at(0, progress.rays_seen), 0)
-        losses.append(float(system.last_step["losses"][-1]))
+        losses.append(float(step(loader.at(0, progress.rays_seen), optimizer)["losses"][-1]))
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
-    assert system.guard.skipped == 0
+    assert step.guard.skipped == 0
 
 
 def test_rays_per_step_follow_the_budget_in_fixed_sizes():
@@ -100,20 +96,19 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     )
     model = RadianceModel({"fine": level})
     model.fit_to(scene)
-    system = RadianceFieldSystem(
-        model=model, loss=MeanSquaredError(), optimizer=lambda groups: TableAdam(groups),
+    step = TrainStep(
+        model=model, rays=rays_of(scene), loss=MeanSquaredError(), optimizer=lambda groups: TableAdam(groups),
         schedule=ExponentialDecay(decay_rate=1.0), progress=progress, num_steps=100, seed=0, background="white",
-        tile_points=None, clip_norm=None, sample_budget=1000, record={},
+        sample_budget=1000,
     )  # fmt: skip
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    optimizer = step.new_optimizer()
     loader = RayBatches(scene, progress, 0, 512, 60)
     sizes = []
     for _ in range(40):
         sizes.append(progress.batch_rays)
-        system.training_step(loader.at(0, progress.rays_seen), 0)
+        step(loader.at(0, progress.rays_seen), optimizer)
     assert set(sizes) <= {512 >> number for number in range(8)}
-    changes = [step for step in range(1, 40) if sizes[step] != sizes[step - 1]]
+    changes = [place for place in range(1, 40) if sizes[place] != sizes[place - 1]]
     assert changes
     assert set(changes) <= {1, 16, 32}
     wanted = 1000 / model.points_per_ray(training=True)

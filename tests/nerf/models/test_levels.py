@@ -1,5 +1,6 @@
 import torch
 from support.scenes import ball_scene, some_rays, tiny_model
+from support.steps import rays_of
 
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
@@ -36,9 +37,7 @@ def test_tiles_cover_the_batch_evenly():
 
 def test_a_picture_is_the_same_whatever_its_tiles():
     model, scene = tiny_model(density_bias=1.0), ball_scene()
-    pictures = [
-        render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", points) for points in (64, 10**6)
-    ]
+    pictures = [render_picture(model, rays_of(scene), 1, "white", points) for points in (64, 10**6)]
     assert pictures[0].rgb.shape == (12, 12, 3)
     torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
     torch.testing.assert_close(pictures[0].depth, pictures[1].depth)

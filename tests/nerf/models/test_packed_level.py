@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from support.scenes import ball_scene, some_rays, tiny_field
+from support.steps import rays_of
 
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
@@ -95,7 +96,7 @@ def test_samples_per_ray_are_measured_kept_and_loaded():
 
 def test_a_picture_is_the_same_whatever_its_tiles():
     model, scene = RadianceModel({"fine": a_level()}), ball_scene()
-    pictures = [render_picture(model, scene.cameras, 1, scene.near, scene.far, "white", n) for n in (64, 10**6)]
+    pictures = [render_picture(model, rays_of(scene), 1, "white", n) for n in (64, 10**6)]
     torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
 
 

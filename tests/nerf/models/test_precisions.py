@@ -1,20 +1,18 @@
 """The same weights see the same in float32 and in bfloat16, in every model of conf/model."""
 
 import pytest
-import torch
 from support.configs import composed, options
 from support.scenes import ball_scene
+from support.steps import rays_of
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.models.tiles import tile_rays_for
-from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.training.step import Share, add_gradients
+from nerf_lightning.training.step import TrainStep
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
 STEPS, SIDE, TILE_POINTS = 40, 16, 8192
@@ -32,20 +30,15 @@ def trained(name, scene):
     model, loss = build(config.model), build(config.loss)
     assert isinstance(loss, Loss)
     model.fit_to(scene)
-    torch.manual_seed(2)
-    model.reset_parameters()
+    progress = Progress()
+    step = TrainStep(
+        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, STEPS, 2, "random",
+        TILE_POINTS,
+    )  # fmt: skip
     model.multiply_in("bfloat16")
-    optimizer = build(config.optimizer)([{"params": list(model.parameters())}])
-    rays = RAYS.get(name, MOST_RAYS)
-    batches = RayBatches(scene, Progress(), seed=0, batch_rays=rays, num_steps=STEPS)
-    for step in range(STEPS):
-        optimizer.zero_grad()
-        model.update(step, step)
-        batch = batches.at(0, step * rays)
-        share = Share(0, rays, batch.weight.sum())
-        tile = tile_rays_for(model, TILE_POINTS, training=True)
-        add_gradients(model, loss, lambda x: x.backward(), batch, share, batch_random(step, rays), "random", tile)
-        optimizer.step()
+    batches, optimizer = RayBatches(scene, progress, 0, RAYS.get(name, MOST_RAYS), STEPS), step.new_optimizer()
+    for _ in range(STEPS):
+        step(batches.at(0, progress.rays_seen), optimizer)
     return model.eval()
 
 
@@ -57,7 +50,7 @@ def test_weights_see_the_same_in_both_precisions(name):
         model.multiply_in(products)
         measured = []
         for view in SEEN_FROM:
-            picture = render_picture(model, scene.cameras, view, scene.near, scene.far, "white", TILE_POINTS)
+            picture = render_picture(model, rays_of(scene), view, "white", TILE_POINTS)
             measured.append(image_metrics(picture.rgb, photograph(scene, view, "white")))
         # Of several views, as evaluations are: the coarse level moves the fine one's samples a little, and a field
         # that is half trained shows each move.

@@ -11,6 +11,7 @@ from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -42,7 +43,7 @@ def test_depth_in_normalised_device_coordinates_is_distance_in_the_world(depth):
     bent = replace(straight, ndc=torch.tensor([[10 / 6, 10 / 4.5]]))
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(1 - 2 / depth))})
     near, far = torch.zeros(1), torch.ones(1)
-    picture = render_picture(model, bent, 0, near, far, "black", tile_points=100_000)
+    picture = render_picture(model, RayGenerator(bent, near, far), 0, "black", tile_points=100_000)
     rays = rays_through_pixels(straight, all_pixels(straight, 0), near, far)
     expected = (depth + 0.3) / -rays.directions[..., 2]
     torch.testing.assert_close(picture.depth, expected, rtol=0.01, atol=0)
@@ -55,7 +56,7 @@ def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stay
     near, far = torch.zeros(1), torch.ones(1)
     for box, seen in (((-2.5, -3.5), 1.0), ((-1.5, -2.5), 0.0)):
         clip = Clip(box=CropBox.from_user((-9.0, -9.0, box[1]), (9.0, 9.0, box[0]), torch.eye(4)))
-        picture = render_picture(model, bent, 0, near, far, "black", 100_000, clip)
+        picture = render_picture(model, RayGenerator(bent, near, far), 0, "black", 100_000, clip)
         assert picture.opacity.min() == pytest.approx(seen, abs=1e-3)
         assert picture.opacity.max() == pytest.approx(seen, abs=1e-3)
         if seen:
@@ -65,7 +66,7 @@ def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stay
 def test_where_nothing_is_the_depth_is_far_and_finite():
     bent = replace(pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4), ndc=torch.tensor([[5.0, 5.0]]))
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(8), Wall(2.0))})
-    picture = render_picture(model, bent, 0, torch.zeros(1), torch.ones(1), "black", tile_points=1000)
+    picture = render_picture(model, RayGenerator(bent, torch.zeros(1), torch.ones(1)), 0, "black", tile_points=1000)
     assert bool((torch.isfinite(picture.depth) & (picture.depth > 100)).all())
     assert float(picture.opacity.max()) == 0.0
 
@@ -73,7 +74,9 @@ def test_where_nothing_is_the_depth_is_far_and_finite():
 def test_elsewhere_depth_is_the_distance_along_the_ray():
     cameras = pinhole_cameras(torch.eye(4)[:3][None], 10.0, 4, 4)
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(4000), Wall(-3.0, behind=-1.0))})
-    picture = render_picture(model, cameras, 0, torch.full((1,), 1.0), torch.full((1,), 6.0), "black", 100_000)
+    picture = render_picture(
+        model, RayGenerator(cameras, torch.full((1,), 1.0), torch.full((1,), 6.0)), 0, "black", 100_000
+    )
     rays = rays_through_pixels(cameras, all_pixels(cameras, 0), torch.zeros(1), torch.ones(1))
     torch.testing.assert_close(picture.depth, 3.0 / -rays.directions[..., 2], rtol=0.01, atol=0)
 
@@ -89,10 +92,13 @@ class Ball(Wall):
         return FieldOutput(self.density(positions), (0.5 + 0.5 * directions).expand_as(positions))
 
 
+def looking_along(pose):
+    cameras = pinhole_cameras(pose[None], 20.0, 9, 9)
+    return RayGenerator(cameras, torch.full((1,), 2.0), torch.full((1,), 6.0))
+
+
 def ball_picture(model, clip=None, seen_from=None):
-    cameras = pinhole_cameras(torch.eye(4)[:3][None], 20.0, 9, 9)
-    near, far = torch.full((1,), 2.0), torch.full((1,), 6.0)
-    return render_picture(model, cameras, 0, near, far, "black", 100_000, clip, seen_from)
+    return render_picture(model, looking_along(torch.eye(4)[:3]), 0, "black", 100_000, clip, seen_from)
 
 
 def test_outside_of_the_box_nothing_is_shown():
@@ -125,7 +131,7 @@ def test_a_later_near_looks_into_things():
 def test_colour_can_be_looked_up_from_elsewhere():
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(100), Ball(1.0))})
     aside = torch.tensor([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]])
-    plain, seen = ball_picture(model), ball_picture(model, seen_from=pinhole_cameras(aside[None], 20.0, 9, 9))
+    plain, seen = ball_picture(model), ball_picture(model, seen_from=looking_along(aside))
     torch.testing.assert_close(plain.depth, seen.depth)
     torch.testing.assert_close(plain.rgb[4, 4], torch.tensor([0.5, 0.5, 0.0]))
     torch.testing.assert_close(seen.rgb[4, 4], torch.tensor([0.0, 0.5, 0.5]))

@@ -32,19 +32,16 @@ class Operations(TorchDispatchMode):
 
 def operations_of_steps(name, steps, model=None, loss=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    system = static_system(name, scene, progress, 100, model, loss)
+    step = static_system(name, scene, progress, 100, model, loss).step
     loader = RayBatches(scene, progress, 0, 64, 100)
     # What is read once in a run (switches, the grid's content) is read on the host.
-    system.model.update(4, 0)
-    system.model(loader.at(0, 0).rays, torch.zeros(64, 3), None)
-    system.to("meta")
-    optimizer = system.configure_optimizers()
-    system.optimizers, system.manual_backward = lambda: optimizer, lambda loss: loss.backward()
+    step.model.update(4, 0)
+    step.model(step.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)
+    optimizer = step.to(torch.device("meta")).new_optimizer()
     lists = []
-    for step in steps:
-        progress.step = step
+    for progress.step in steps:
         with Operations() as operations:
-            system.training_step(loader.at(0, progress.rays_seen).to("meta"), 0)
+            step(loader.at(0, progress.rays_seen).to("meta"), optimizer)
         lists.append(operations.seen)
     return lists
 
@@ -68,9 +65,9 @@ class Planted(MeanSquaredError):
         super().__init__()
         self.fault = fault
 
-    def forward(self, renderings, target, weight):
+    def forward(self, renderings, target):
         self.fault(renderings[-1].opacity)
-        return super().forward(renderings, target, weight)
+        return super().forward(renderings, target)
 
 
 FAULTS = {

@@ -10,7 +10,7 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
 def straight_rays(count, near=0.0, far=1.0):
     rays = some_rays(count)
     return RayBundle(
-        rays.origins, rays.directions, torch.full((count,), near), torch.full((count,), far), rays.camera_index,
+        rays.origins, rays.directions, torch.full((count,), near), torch.full((count,), far),
         rays.view_directions,
     )  # fmt: skip
 

@@ -20,14 +20,18 @@ class StubSystem:
         self.progress = SimpleNamespace(step=0, restarts=0, attempt=0, rays_seen=0)
         self.alive = alive
         self.restarts = 0
+        self.step = self  # the system's step, too
+
+    def optimizers(self):
+        return SimpleNamespace(optimizer=None)
 
     @property
-    def last_step(self):
+    def seen(self):
         target = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
         light = target if self.alive(self.restarts) else torch.zeros(64, 3)
         return {"target": target, "foreground": light, "weight": torch.ones(64)}
 
-    def restart(self):
+    def restart(self, optimizer):
         self.restarts += 1
         self.progress.restarts += 1
         self.progress.attempt += 1
@@ -40,7 +44,7 @@ def run(guard, system, steps):
         trainer.global_step += 1
         system.progress.step += 1
         system.progress.rays_seen += 64
-        guard.on_train_batch_end(trainer, system, None, None, 0)
+        guard.on_train_batch_end(trainer, system, system.seen, None, 0)
 
 
 def test_a_dead_run_is_restarted_and_says_so(caplog):

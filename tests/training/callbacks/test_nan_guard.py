@@ -7,6 +7,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 from support.scenes import ball_scene, tiny_model
+from support.steps import rays_of
 
 from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.data.datamodule import RayDataModule
@@ -17,6 +18,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.nan_guard import NanGuard
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
@@ -25,10 +27,10 @@ class BreaksAtStep(MeanSquaredError):
 
     step, until, limit, holder = 0, 0, 0.0, ()  # the holder hides the system, whose part the loss is
 
-    def __call__(self, renderings, target, weight):
-        coarse, fine = super().__call__(renderings, target, weight)
+    def __call__(self, renderings, target):
+        coarse, fine = super().__call__(renderings, target)
         rate = self.holder[0].optimizers().param_groups[0]["lr"]
-        broken = self.step <= self.holder[0].progress.step < self.until and rate > self.limit
+        broken = self.step <= self.holder[0].step.progress.step < self.until and rate > self.limit
         return [coarse, fine * float("nan") if broken else fine]
 
 
@@ -36,8 +38,9 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
     """Train with a rate of 0.01 and no decay, breaking from `step` on while the rate is above `limit`."""
     scene, progress, loss = ball_scene(), Progress(), BreaksAtStep()
     record = make_record(scene, "", {}) | {"precision": "32-true"}
-    system = RadianceFieldSystem(
+    step_of_training = TrainStep(
         model=tiny_model(density_bias=0.5),
+        rays=rays_of(scene),
         loss=loss,
         optimizer=optimizer or partial(torch.optim.Adam, lr=0.01),
         schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
@@ -45,13 +48,9 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
         num_steps=max_steps,
         seed=0,
         background="white",
-        tile_points=None,
-        clip_norm=None,
-        sample_budget=None,
-        record=record,
     )
+    system = RadianceFieldSystem(step_of_training, record)
     loss.step, loss.until, loss.limit, loss.holder = step, until, limit, (system,)
-    system.initialize()
     data = RayDataModule(scene, progress, 0, max_steps, batch_rays=16, crop_steps=3, val_rays=16)
     folder.mkdir(exist_ok=True)
     trainer = Trainer(
@@ -88,7 +87,7 @@ def test_without_a_checkpoint_it_says_so(tmp_path):
 
 def test_a_few_bad_steps_are_left_out_and_no_more(tmp_path, caplog):
     system = run(tmp_path, NanGuard(patience=4), until=15)
-    assert system.guard.state() == [3, 0]
+    assert system.step.guard.state() == [3, 0]
     assert system.trainer.global_step == 30
     assert "Rolled back" not in caplog.text
 
@@ -105,11 +104,11 @@ def test_a_rollback_goes_on_from_the_last_good_checkpoint_at_a_lower_rate(tmp_pa
     with caplog.at_level(logging.WARNING):
         system = run(tmp_path, NanGuard(on_nan="rollback", patience=4), limit=0.006)
     assert system.trainer.global_step == 30
-    assert (system.progress.attempt, system.progress.rollbacks, system.progress.restarts) == (1, 1, 0)
-    assert system.progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
+    assert (system.step.progress.attempt, system.step.progress.rollbacks, system.step.progress.restarts) == (1, 1, 0)
+    assert system.step.progress.step == 10 + 30 - 12, "12 steps were taken before it went back to the 10th"
     assert [group["lr"] for group in system.optimizers().param_groups] == [pytest.approx(0.005)]
-    assert system.guard.state() == [4, 0]
-    assert system.broken_weights() is None
+    assert system.step.guard.state() == [4, 0]
+    assert system.step.broken_weights() is None
     assert "since step 13" in caplog.text
     assert f"Rolled back to the checkpoint {tmp_path}/checkpoints/last.ckpt" in caplog.text
     assert "attempt 2, rollback 1 of at most 3, base learning rate 0.005" in caplog.text
@@ -126,7 +125,7 @@ def test_what_a_rollback_takes_up_is_what_was_saved(tmp_path, monkeypatch):
         assert all(torch.equal(value, saved["state_dict"][key]) for key, value in system.state_dict().items())
         for number, kept in saved["optimizer_states"][0]["state"].items():
             assert all(torch.equal(torch.as_tensor(moments[number][name]), kept[name]) for name in kept)
-        seen.append((system.progress.step, system.progress.rays_seen))
+        seen.append((system.step.progress.step, system.step.progress.rays_seen))
 
     monkeypatch.setattr(NanGuard, "_roll_back", look)
     run(tmp_path, NanGuard(on_nan="rollback", patience=4), limit=0.006)
@@ -145,7 +144,7 @@ def test_the_rate_falls_with_every_rollback_and_they_are_counted(tmp_path, caplo
 
 def test_a_rollback_without_a_checkpoint_begins_anew_at_a_lower_rate(tmp_path, caplog):
     system = run(tmp_path, NanGuard(on_nan="rollback", patience=2), step=2, limit=0.006)
-    assert (system.progress.attempt, system.progress.rollbacks) == (1, 1)
+    assert (system.step.progress.attempt, system.step.progress.rollbacks) == (1, 1)
     assert system.optimizers().param_groups[0]["lr"] == pytest.approx(0.005)
     assert "Rolled back to the beginning, with new weights" in caplog.text
 
@@ -158,7 +157,7 @@ def test_a_resume_keeps_the_lowered_rate_and_the_attempt(tmp_path, stopped_at):
     whole = run(tmp_path / "whole", guard(), limit=0.006)
     run(tmp_path / "parts", guard(), limit=0.006, max_steps=stopped_at)
     resumed = run(tmp_path / "parts", guard(), limit=0.006, resume=tmp_path / "parts" / "checkpoints" / "last.ckpt")
-    assert resumed.progress == whole.progress
+    assert resumed.step.progress == whole.step.progress
     assert resumed.optimizers().param_groups[0]["lr"] == whole.optimizers().param_groups[0]["lr"]
     assert all(torch.equal(value, whole.state_dict()[key]) for key, value in resumed.state_dict().items())
 
@@ -178,8 +177,8 @@ def test_weights_that_are_not_finite_are_noticed_and_never_saved(tmp_path, caplo
     guard = NanGuard(on_nan="rollback", patience=50, every_steps=7)
     system = run(tmp_path, guard, step=1000, optimizer=partial(Spoils, lr=0.01), max_steps=25)
     assert "The weights of step 14 are not finite numbers (first those of levels.coarse.field" in caplog.text
-    assert system.broken_weights() is None
-    assert system.progress.rollbacks == 1
+    assert system.step.broken_weights() is None
+    assert system.step.progress.rollbacks == 1
 
 
 @pytest.mark.parametrize(

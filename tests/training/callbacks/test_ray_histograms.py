@@ -17,33 +17,32 @@ def a_system(name):
     progress, scene = Progress(), ball_scene(num_views=6)
     model = fast_model(PackedLevel) if name == "fast_dense" else tiny_model()
     system = static_system(name, scene, progress, 10, model=model)
-    return system, RayBatches(scene, progress, 0, 64, 10).at(0, 0)
+    return system.step, RayBatches(scene, progress, 0, 64, 10).at(0, 0)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])
 def test_looking_changes_nothing_that_training_reads(name):
-    system, batch = a_system(name)
-    system.accumulate_gradients(batch, lambda loss: loss.backward())
-    before = copy.deepcopy(system.model.state_dict())
-    gradients = [parameter.grad.clone() for parameter in system.model.parameters()]
+    step, batch = a_system(name)
+    step.gradients(batch)
+    before = copy.deepcopy(step.model.state_dict())
+    gradients = [parameter.grad.clone() for parameter in step.model.parameters()]
     generator = torch.get_rng_state()
-    look_along(system, batch.rays, 7, endless=False)
-    assert system.training
-    assert system.model.training
-    for key, value in system.model.state_dict().items():
+    look_along(step, batch.pixels, 7, endless=False)
+    assert step.model.training
+    for key, value in step.model.state_dict().items():
         assert torch.equal(value, before[key]), key
-    for parameter, gradient in zip(system.model.parameters(), gradients, strict=True):
+    for parameter, gradient in zip(step.model.parameters(), gradients, strict=True):
         assert torch.equal(parameter.grad, gradient)
     assert torch.equal(torch.get_rng_state(), generator)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])
 def test_tiles_do_not_show(name):
-    system, batch = a_system(name)
-    whole = look_along(system, batch.rays, 7, endless=False)
-    system.tile_points = 300
-    parts = look_along(system, batch.rays, 7, endless=False)
-    assert list(whole) == list(system.model.level_names)
+    step, batch = a_system(name)
+    whole = look_along(step, batch.pixels, 7, endless=False)
+    step.tile_points = 300
+    parts = look_along(step, batch.pixels, 7, endless=False)
+    assert list(whole) == list(step.model.level_names)
     for level in whole:
         torch.testing.assert_close(parts[level], whole[level])
 

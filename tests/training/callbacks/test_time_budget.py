@@ -14,26 +14,30 @@ def trainer():
     return create_autospec(Trainer, instance=True, max_steps=200_000)
 
 
+def a_system(step):
+    return SimpleNamespace(step=SimpleNamespace(progress=SimpleNamespace(step=step), num_steps=200_000))
+
+
 def test_a_resumed_run_takes_up_its_schedule_at_once():
     """The fault: until the next estimate the learning rate would jump back to its start."""
     budget = TimeBudget(seconds=10.0)
     budget.load_state_dict({"used": 5.0})
-    system = SimpleNamespace(progress=SimpleNamespace(step=103), num_steps=200_000)
+    system = a_system(step=103)
     budget.on_train_start(trainer(), system)
-    assert system.num_steps == 206
+    assert system.step.num_steps == 206
 
 
 def test_a_new_run_keeps_its_length_until_its_speed_is_known():
-    system = SimpleNamespace(progress=SimpleNamespace(step=0), num_steps=200_000)
+    system = a_system(step=0)
     TimeBudget(seconds=10.0).on_train_start(trainer(), system)
-    assert system.num_steps == 200_000
+    assert system.step.num_steps == 200_000
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no process is stopped there")
 def test_a_stopped_process_uses_no_time(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    budget, system = TimeBudget(seconds=10.0), SimpleNamespace(progress=SimpleNamespace(step=1), num_steps=200_000)
+    budget, system = TimeBudget(seconds=10.0), a_system(step=1)
     former = signal.getsignal(signal.SIGCONT)
     budget.on_train_start(trainer(), system)
     for passed, woken in ((1.0, False), (3600.0, True), (1.0, False)):

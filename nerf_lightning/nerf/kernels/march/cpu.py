@@ -40,7 +40,7 @@ def march(
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
-    rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, one.long(), along)
+    rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, blocks_of(cells), cells.float())
     march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)

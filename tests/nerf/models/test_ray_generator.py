@@ -1,0 +1,74 @@
+"""The one place where cameras become rays: what is bent, what may learn, and what a step tells of its photographs."""
+
+from dataclasses import replace
+
+import torch
+from support.scenes import ball_scene, tiny_model
+from support.steps import make_step, rays_of
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+
+
+def test_a_pixel_has_the_ray_of_its_camera_and_the_weights_know_no_camera():
+    scene = ball_scene()
+    rays_of_scene, pixels = rays_of(scene), all_pixels(scene.cameras, 2)
+    rays = rays_through_pixels(scene.cameras, pixels, scene.near, scene.far)
+    assert torch.equal(rays_of_scene(pixels).directions, rays.directions)
+    assert rays_of_scene(pixels).photograph is None
+    assert not rays_of_scene.state_dict()
+
+
+def test_rays_through_the_world_are_not_bent():
+    scene = ball_scene()
+    forward = replace(scene.cameras, c2w=torch.eye(4)[:3].expand(len(scene.near), 3, 4))
+    bent = RayGenerator(replace(forward, ndc=torch.ones(len(scene.near), 2)), scene.near, scene.far)
+    pixels = all_pixels(forward, 0)
+    straight = RayGenerator(forward, scene.near, scene.far)(pixels)
+    assert torch.equal(bent.through_world(pixels).origins, straight.origins)
+    assert not torch.allclose(bent(pixels).origins, straight.origins)
+
+
+class LearntShifts(RayGenerator):
+    """Cameras that may move: all that it takes is a parameter, and other cameras."""
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.shift = torch.nn.Parameter(torch.zeros(len(self.near), 3))
+
+    @property
+    def cameras(self):
+        given = super().cameras
+        return replace(given, c2w=torch.cat([given.c2w[..., :3], given.c2w[..., 3:] + self.shift[..., None]], dim=-1))
+
+
+def test_cameras_can_learn_in_tiles_and_whole():
+    scene, shifts = ball_scene(), []
+    for tile_points in (None, 200):
+        step = make_step(tile_points)
+        step.rays = LearntShifts(scene.cameras, scene.near, scene.far)
+        step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
+        optimizer = step.new_optimizer()
+        step(RayBatches(scene, step.progress, 0, 64, 10).at(0, 0), optimizer)
+        shifts.append(step.rays.shift.detach())
+    assert float(shifts[0][list(scene.splits["train"])].abs().min()) > 0
+    torch.testing.assert_close(shifts[0], shifts[1], rtol=1e-3, atol=1e-7)
+
+
+def test_a_training_step_says_which_photograph_it_explains_and_validation_does_not():
+    model, seen = tiny_model(density_bias=0.5), []
+    render = model.forward
+
+    def forward(rays, background, random):
+        seen.append(rays.photograph)
+        return render(rays, background, random)
+
+    model.forward = forward
+    step = make_step(None, model)
+    batch = RayBatches(ball_scene(), step.progress, 0, 64, 10).at(0, 0)
+    step(batch, step.new_optimizer())
+    assert torch.equal(seen[0], batch.pixels.view)
+    step.validate(batch, RayErrors())
+    assert seen[1] is None
