@@ -16,7 +16,7 @@ from nerf_lightning.console import StdoutConsole, say, stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.selftest.all_checks import carry_out, find_checks
@@ -65,7 +65,7 @@ def run(config: DictConfig) -> None:
 
 
 def _place(settings: TrainerSettings, work: Path) -> Place:
-    def read_model(path: Path) -> RadianceModel:
+    def read_model(path: Path) -> Model:
         return load_model(read_checkpoint(path))
 
     overrides = [f"trainer={TRAINERS[settings.device_type]}", f"trainer.precision={settings.precision}"]

@@ -19,7 +19,7 @@ from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.visualization.pictures import to_bytes
 
@@ -72,7 +72,7 @@ class PointsExport(Export):
         self.num_points, self.max_views, self.longest = num_points, max_views, longest
         self.min_opacity, self.agreement, self.tolerance = min_opacity, agreement, tolerance
 
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
         views = evenly_spaced_subset(record.splits["train"], self.max_views)
         self._require_memory(record.cameras[views])

@@ -22,7 +22,7 @@ from nerf_lightning.nerf.geometry.cameras import (
 )
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.types.scene import Cameras
@@ -64,7 +64,7 @@ def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -
     )
 
 
-def see(model: RadianceModel, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
+def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
     """Render one view; `cameras` are the record's, at whatever size."""
     rays_of = RayGenerator(cameras, record.near, record.far)
     picture = render_picture(model, rays_of, view, record.background, tile_points)
@@ -128,7 +128,7 @@ RINGS = 2
 
 
 def seen_faces(
-    model: RadianceModel,
+    model: Model,
     record: SceneRecord,
     vertices: Float[ndarray, "vertices 3"],
     faces: Int[ndarray, "faces 3"],

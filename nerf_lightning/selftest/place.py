@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.selftest.runs import Runs
 
@@ -24,7 +24,7 @@ class Place:
     """Whether torch.compile is tried: on a GPU, or where the user asks for it."""
     runs: Runs
     """The command line at work on a small capture."""
-    read_model: Callable[[Path], RadianceModel]
+    read_model: Callable[[Path], Model]
     """Returns the model of a checkpoint, on the CPU."""
 
     @property

@@ -12,7 +12,7 @@ from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
@@ -90,7 +90,7 @@ def build_step(
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
-    model: RadianceModel = build(config.model)
+    model: Model = build(config.model)
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":
         xla.require_static_shapes(model)

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints.reading import Checkpoint, read_checkpoint
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
@@ -19,7 +19,7 @@ class Opened:
 
     settings: TrainerSettings
     checkpoint: Checkpoint
-    model: RadianceModel
+    model: Model
 
     @property
     def tile_points(self) -> int:
@@ -49,6 +49,6 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     return [Opened(settings, each, _model(settings, each, float32)) for each in checkpoints]
 
 
-def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> RadianceModel:
+def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> Model:
     model = load_model(checkpoint)
     return model.to(settings.device) if float32 else settings.prepare(model)

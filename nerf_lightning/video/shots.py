@@ -15,7 +15,7 @@ from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 class Subject:
     """A model to be filmed, and where it was learnt."""
 
-    model: RadianceModel
+    model: Model
     scene: SceneRecord
     background: Background
     label: str = ""

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras
@@ -53,7 +53,7 @@ class SlicedRenderer:
 
     def __init__(
         self,
-        model: RadianceModel,
+        model: Model,
         scene: SceneRecord,
         background: Background,
         tile_points: int,

@@ -11,7 +11,7 @@ from nerf_lightning.checkpoints.reading import SceneRecord, read_checkpoint
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras
@@ -99,7 +99,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     return found
 
 
-def _loaded(place: Place) -> tuple[RadianceModel, SceneRecord]:
+def _loaded(place: Place) -> tuple[Model, SceneRecord]:
     path = _last(place.runs.whole())
     model = place.read_model(path)
     model.multiply_in(place.chosen)
@@ -133,7 +133,5 @@ def _film(place: Place) -> float:
     return max(differences)
 
 
-def _picture(
-    model: RadianceModel, scene: SceneRecord, cameras: Cameras, view: int, near: Tensor, far: Tensor
-) -> Picture:
+def _picture(model: Model, scene: SceneRecord, cameras: Cameras, view: int, near: Tensor, far: Tensor) -> Picture:
     return render_picture(model, RayGenerator(cameras, near, far), view, scene.background, TILE_POINTS)
