@@ -108,7 +108,7 @@ class NerfMLP(Field):
         """Return density and colour; density does not depend on the direction. There are no features."""
         hidden = self._trunk(points.positions)
         raw_density = _exactly(self.density_head, hidden)[..., 0]
-        feature = self.feature(hidden)
+        feature = self.color_feature(hidden, points)
         # Encoded once per ray, not once per sample.
         direction = self.direction_encoder(points.directions).to(feature.dtype)
         direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
@@ -117,6 +117,10 @@ class NerfMLP(Field):
         if points.random is not None and self.density_noise > 0:
             noise = self.density_noise * points.random.normal("density_noise")
         return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def color_feature(self, hidden: Float[Tensor, "*points width"], points: Points) -> Float[Tensor, "*points width"]:
+        """Return what the colour is made of besides the direction; a field that follows this one may add to it."""
+        return self.feature(hidden)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -116,7 +116,9 @@ def test_outside_of_the_box_nothing_is_shown():
 def test_rays_that_miss_the_box_are_not_rendered(monkeypatch):
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(10), Ball(1.0))})
     asked = []
-    monkeypatch.setattr(Ball, "density", lambda self, points: (asked.append(points.positions) or points.positions[..., 0], None))
+    monkeypatch.setattr(
+        Ball, "density", lambda self, points: (asked.append(points.positions) or points.positions[..., 0], None)
+    )
     ball_picture(model, Clip(box=CropBox.from_user((-2.0, -2.0, -4.5), (0.0, 2.0, -3.5), torch.eye(4))))
     assert 0 < sum(part.shape[0] for part in asked) < 60  # of 81
     assert float(torch.cat(asked)[..., 0].max()) <= 0.0
