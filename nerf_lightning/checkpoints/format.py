@@ -9,7 +9,7 @@ from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
 from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Plain, Record, Text, Whole
 from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 
-FORMAT = 3
+FORMAT = 4
 KEY = "nerf_lightning"
 PRECISIONS = ("32-true", "tf32", "bf16-mixed")
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
