@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
@@ -58,7 +58,10 @@ def build_parts(config: DictConfig) -> Parts:
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     progress = Progress()
     record = make_record(scene, text, choices)
-    step = build_step(config, settings, scene, progress, num_steps)
+    start = None
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+    step = build_step(config, settings, scene, progress, num_steps, start)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
     signals = StopSignals()
@@ -81,7 +84,12 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
 
 
 def build_step(
-    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, num_steps: int
+    config: DictConfig,
+    settings: TrainerSettings,
+    scene: Scene,
+    progress: Progress,
+    num_steps: int,
+    start: Checkpoint | None = None,
 ) -> TrainStep:
     """Build model, loss, optimizer and schedule into the step of training.
 
@@ -97,9 +105,7 @@ def build_step(
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     model.fit_to(scene)
-    start = None
-    if config.init_from is not None:
-        start = read_checkpoint(required_path("init_from", config.init_from))
+    if start is not None:
         load_weights(model, start)
     return TrainStep(
         model=model,

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
 from nerf_lightning.nerf.rendering.points import packed_points
-from nerf_lightning.nerf.samplers.base import PackedSampler
+from nerf_lightning.nerf.samplers.base import PackedSampler, Sampler
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering, Rendering
 
@@ -34,7 +34,7 @@ class PackedLevel(Level):
     tally: Tensor
     measured: Tensor
 
-    def __init__(self, sampler: PackedSampler, field: Field):
+    def __init__(self, sampler: Sampler, field: Field):
         super().__init__(sampler, field)
         # Samples and rays since the last update of the grid, and samples that exceeded the capacity, ever.
         self.register_buffer("tally", torch.zeros(3, dtype=torch.int64))
