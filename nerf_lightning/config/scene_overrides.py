@@ -46,12 +46,22 @@ def scene_overrides(path: str) -> list[str]:
     recorded = config.get("scene") if isinstance(config, dict) else None
     if not isinstance(recorded, dict):
         raise UnknownScene(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
-    ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
+    ours = _settings_of(known[name])
     values = _taken(leaves(recorded, "scene"), leaves(ours, "scene"), path)
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
     if ours.get("download") and not os.path.exists(str(values.get("scene.path"))):
         values.pop("scene.path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
     return [f"scene={name}", *(f"{key}={quoted(value)}" for key, value in values.items())]
+
+
+def _settings_of(file: Path) -> dict[str, Any]:
+    """Return the settings of one of our yamls, with those that it takes from another (`/capture@_here_`)."""
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    taken: dict[str, Any] = {}
+    for name in content.pop("defaults", []):
+        base = name.removeprefix("/").removesuffix("@_here_")
+        taken |= _settings_of(conf_folder() / f"{base}.yaml")
+    return taken | content
 
 
 def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[str, Any]:
