@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nerf_lightning.budgets import allowed
+from nerf_lightning.config.key_meanings import PLACES, meaning_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.json_files import number, read_json_object
@@ -16,14 +17,6 @@ from nerf_lightning.runs.summary import RunSummary, read_note, read_run
 
 Measured = Literal["run", "eval"]
 FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
-# Settings by which rows do not differ: where things lie, what is said of a run, and what has a column of its own. What
-# lies below a model or a scene is what was swept.
-NOT_SHOWN = ("seed", "model", "scene", "resume", "path", "logger")
-NOT_SHOWN_BELOW = (
-    *("paths.", "path.", "sweep.", "final.", "evaluation.", "hydra.", "logger."),
-    *("scene.root", "scene.path", "scene.name", "scene.cache_dir", "scene.verify", "scene.allow_outside"),
-    "scene.max_gigabytes",
-)
 SEED = re.compile(r"-?\d{1,18}", re.ASCII)
 
 
@@ -105,7 +98,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
 
 def _is_shown(key: str) -> bool:
     # `scene@PACKAGE` picks from the group that `scene` picks from.
-    return key.partition("@")[0] not in NOT_SHOWN and not key.startswith(NOT_SHOWN_BELOW)
+    return meaning_of(key.partition("@")[0]).shown
 
 
 def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
@@ -113,7 +106,7 @@ def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dic
     name = str(protocol.get("scene", "")) or "not said"
     if name != str(origin.get("scene", overrides.get("scene"))):
         return name
-    root, file = (Path(overrides.get(key, "").strip("'\"")) for key in ("scene.root", "scene.path"))
+    root, file = (Path(overrides.get(key, "").strip("'\"")) for key in PLACES)
     return root.name or file.stem or name
 
 
