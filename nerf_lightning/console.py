@@ -8,6 +8,8 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColum
 from nerf_lightning import ranks
 from nerf_lightning.escaping import for_terminal
 
+DAY = 86_400
+
 
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
     """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
@@ -41,6 +43,24 @@ class StageProgress:
         names = list(self.costs)
         before = sum(self.costs[name] for name in names[: names.index(stage)])
         self.bar.update(self.task, description=stage, completed=before + min(fraction, 1.0) * self.costs[stage])
+
+
+def spoken(seconds: int | float) -> str:
+    """Return a time as people say it.
+
+    >>> [spoken(seconds) for seconds in (7.4, 260, 3600, 3900, 187_200, 3_265_128)]
+    ['7 s', '4 min 20 s', '1 h', '1 h 5 min', '2 days 4 h', '38 days']
+    """
+    whole = round(seconds)
+    if whole >= 3 * DAY:
+        return f"{round(whole / DAY)} days"
+    units = ((DAY, "days" if whole >= 2 * DAY else "day"), (3600, "h"), (60, "min"), (1, "s"))
+    place = next((number for number, (length, _) in enumerate(units) if whole >= length), len(units) - 1)
+    words = []
+    for length, name in units[place : place + 2]:
+        count, whole = divmod(whole, length)
+        words.append((count, name))
+    return " ".join(f"{count} {name}" for count, name in words if count or len(words) == 1)
 
 
 def say(*lines: str) -> None:

@@ -115,7 +115,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         callbacks.collapse_guard.ratio callbacks.collapse_guard.max_restarts
         """,
     ),
-    (OWN_COLUMN, "seed model scene scene.name scene.root"),
+    (OWN_COLUMN, "seed model scene scene.name scene.root scene.video"),
     (FILE, "scene.path"),
     (FETCHED, "scene.download.**"),
     (FIRST_START, "init_from"),
@@ -184,7 +184,7 @@ CHOSEN_GROUPS = (
 SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
 """And those of which the record of a sweep may."""
 
-PLACES = ("scene.root", "scene.path")
+PLACES = ("scene.root", "scene.path", "scene.video")
 """Where a capture lies; a relative one is meant from where the run was started."""
 
 TABLE = {key: meaning for meaning, keys in ROWS for key in keys.split()}

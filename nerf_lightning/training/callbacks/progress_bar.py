@@ -10,6 +10,8 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from nerf_lightning.console import spoken
+
 log = logging.getLogger(__name__)
 
 
@@ -72,7 +74,7 @@ class TrainingProgress(ProgressBar):
             self.bar.update(self.task, completed=step, total=pl_module.step.num_steps, description=text)
         else:
             left = (pl_module.step.num_steps - step) / per_second
-            log.info("step %d/%d  %s  about %.0f s left", step, pl_module.step.num_steps, text, left)
+            log.info("step %d/%d  %s  about %s left", step, pl_module.step.num_steps, text, spoken(left))
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""

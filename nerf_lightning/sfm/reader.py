@@ -1,0 +1,104 @@
+"""Photographs, or a video, and nothing else: their cameras are found, kept, and taken again the next time."""
+
+import hashlib
+import json
+import logging
+import os
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning import ranks
+from nerf_lightning.data.readers.auto import AutoReader
+from nerf_lightning.data.readers.base import Reader
+from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import default_folder
+from nerf_lightning.files.private import make_own_folder
+from nerf_lightning.sfm.find_poses import from_photographs, from_video
+from nerf_lightning.sfm.photographs import SUFFIXES
+from nerf_lightning.sfm.reconstruction import require_pycolmap
+from nerf_lightning.sfm.settings import SfmSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class PhotosReader(AutoReader):
+    """Read photographs whose cameras nobody knows yet; a folder of a known format is read as what it is.
+
+    Args:
+        root: the folder of the photographs; they lie in it, or in `images` below it.
+        video: a video, in place of root.
+    """
+
+    root: str | None = None  # type: ignore[assignment]
+    name: str = "photos"
+    video: str | None = None
+
+    def reader(self) -> Reader:
+        """Find the cameras, unless they are known, and return the reader of what was found.
+
+        Raises:
+            InputError: no photographs, or cameras that cannot be found.
+        """
+        if (self.root is None) == (self.video is None):
+            raise InputError(
+                "scene=photos needs a folder of photographs (scene.root=DIR) or a video (scene.video=FILE), and not "
+                "both."
+            )
+        if self.root is not None and self.known_format(self.folder()) is not None:
+            return super().reader()
+        found = ranks.from_first(self._cameras)
+        log.info("cameras: kept in %s (scene.cache_dir=DIR keeps them elsewhere)", found)
+        chosen = {
+            field.name: getattr(self, field.name)
+            for field in fields(AutoReader)
+            if field.name not in ("root", "masks") and getattr(self, field.name) != field.default
+        }
+        return ColmapReader(root=str(found), **chosen | {"name": self.name})
+
+    def _cameras(self) -> Path:
+        """Return the folder of a capture, which is made where it is not there yet."""
+        source, settings = self._source(), SfmSettings()
+        cache = default_folder("poses") if self.cache_dir is None else Path(self.cache_dir).expanduser() / "poses"
+        folder = cache / _key(source, settings)
+        if (folder / "sparse" / "0").is_dir():
+            return folder
+        require_pycolmap()
+        make_own_folder(cache)
+        log.info("cameras: nobody knows them yet, so they are found first (nerf poses does this alone, with settings)")
+        if self.video is not None:
+            model, _ = from_video(source, None, folder, settings)
+        else:
+            model, _ = from_photographs(source, folder, settings, self.allow_outside)
+        found, total = len(model.registered), len(model.registered) + len(model.left_out)
+        log.info("cameras: found those of %d of %d, to %.2f pixels", found, total, model.reprojection_error)
+        return folder
+
+    def _source(self) -> Path:
+        if self.video is not None:
+            return Path(self.video).expanduser()
+        folder = self.folder()
+        within = folder / "images"
+        return within if within.is_dir() and not _pictures(folder) else folder
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+
+
+def _key(source: Path, settings: SfmSettings) -> str:
+    """Return what found cameras are kept under: the photographs' names, sizes and times of change, and the settings."""
+    try:
+        files = [source] if source.is_file() else _pictures(source)
+        states = [(path.name, *_state(path)) for path in files]
+    except OSError as error:
+        raise InputError(f"{source} cannot be read: {error.strerror}. Check scene.root or scene.video.") from error
+    content: list[Any] = [str(source.resolve()), states, asdict(settings)]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _state(path: Path) -> tuple[int, int]:
+    state = os.stat(path)
+    return state.st_size, state.st_mtime_ns

@@ -1,0 +1,85 @@
+"""Photographs and nothing else: cameras are found once, and kept."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.captures import real_capture
+from support.posed_captures import Known, write_colmap
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.sfm import reader
+from nerf_lightning.sfm.reader import PhotosReader
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """A folder of photographs, and a stand-in for structure from motion that knows their cameras."""
+    folder = tmp_path / "photographs"
+    write_colmap(tmp_path / "known", Known())
+    shutil.move(tmp_path / "known" / "images", folder)
+    return folder
+
+
+@pytest.fixture
+def found(tmp_path, monkeypatch):
+    """The calls of structure from motion, which gives what is known."""
+    calls = []
+
+    class Model:
+        registered, left_out, reprojection_error = ("a", "b", "c"), (), 0.5
+
+    def from_photographs(source, folder, settings, allow_outside):
+        calls.append(source)
+        shutil.copytree(tmp_path / "known" / "sparse", folder / "sparse")
+        shutil.copytree(source, folder / "images")
+        return Model(), "exhaustive"
+
+    monkeypatch.setattr(reader, "from_photographs", from_photographs)
+    monkeypatch.setattr(reader, "require_pycolmap", lambda: None)
+    return calls
+
+
+def test_cameras_are_found_once_and_again_where_a_photograph_has_changed(photographs, found, tmp_path, caplog):
+    caplog.set_level("INFO")
+    settings = {"root": str(photographs), "cache_dir": str(tmp_path / "cache")}
+    first, second = PhotosReader(**settings).read(), PhotosReader(**settings).read()
+    assert first.view_names == second.view_names
+    assert found == [photographs]
+    assert "cameras: found those of 3 of 3, to 0.50 pixels" in caplog.text
+    changed = sorted(photographs.iterdir())[0]
+    Image.fromarray(np.zeros(np.asarray(Image.open(changed)).shape, np.uint8)).save(changed)
+    PhotosReader(**settings).read()
+    assert len(found) == 2
+
+
+def test_photographs_in_images_below_the_folder_are_found(photographs, found, tmp_path):
+    (tmp_path / "capture").mkdir()
+    shutil.move(photographs, tmp_path / "capture" / "images")
+    PhotosReader(root=str(tmp_path / "capture"), cache_dir=str(tmp_path / "cache"), hold_every=2).read()
+    assert found == [tmp_path / "capture" / "images"]
+
+
+def test_a_folder_of_a_known_format_is_read_as_what_it_is(tmp_path, found, caplog):
+    caplog.set_level("INFO")
+    write_colmap(tmp_path / "capture", Known())
+    scene = PhotosReader(root=str(tmp_path / "capture"), cache_dir=str(tmp_path / "cache")).read()
+    assert not found
+    assert "read as scene=colmap" in caplog.text
+    assert scene.background == "black"
+
+
+@pytest.mark.parametrize("given", [{}, {"root": "a", "video": "b"}])
+def test_a_folder_or_a_video_is_needed_and_not_both(given):
+    with pytest.raises(InputError, match=r"scene\.root=DIR\) or a video \(scene\.video=FILE\), and not both"):
+        PhotosReader(**given).read()
+
+
+@pytest.mark.slow
+def test_real_photographs_become_a_scene(tmp_path):
+    pytest.importorskip("pycolmap")
+    source = real_capture("sceaux_photos")
+    scene = PhotosReader(root=str(source), downscale=8, cache_dir=str(tmp_path)).read()
+    assert len(scene.view_names) >= 9
+    assert len(scene.points) > 500
