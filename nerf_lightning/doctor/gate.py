@@ -30,6 +30,6 @@ def _stopped(name: str, wrong: list[Check]) -> str:
     first, others = wrong[0], [check.name for check in wrong[1:]]
     also = f" Wrong, too: {', '.join(others)}." if others else ""
     return (
-        f"The capture {name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}{also} nerf doctor "
-        "shows all that it sees, in a picture; doctor=off trains all the same."
+        f"The capture {name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}{also} nerf "
+        "doctor shows all that it sees, in a picture; doctor=off trains all the same."
     )
