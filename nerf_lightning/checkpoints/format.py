@@ -105,7 +105,7 @@ def checkpoint(resumable: bool) -> Record:
         "epoch": Whole(),
         "pytorch-lightning_version": Text(40, VERSION),
         "loops": Record({key: Plain(most=1000) for key in LOOPS}),
-        "callbacks": Named(name, Plain(), 100),
+        "callbacks": Named(name, Plain(tensors=True), 100),
         "optimizer_states": Many(
             Record({"state": Named(Whole(), kept, 100_000), "param_groups": Many(group, 100, least=1)}), 1, least=1
         ),

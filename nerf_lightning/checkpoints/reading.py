@@ -73,6 +73,8 @@ class Checkpoint:
     tile_points: int | None
     good: bool
     """Saved while all was finite, and no step was being left out."""
+    record: dict[str, Any]
+    """What a checkpoint of this one would keep, beside weights."""
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -119,6 +121,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         precision=record["precision"],
         tile_points=record["tile_points"],
         good=record.get("bad_steps", [0, 0])[1] == 0,
+        record=record,
     )
 
 
@@ -133,6 +136,16 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
         InputError: as `read_checkpoint`.
     """
     content = _load(path)
+    require_ours(content, path, resumable)
+    return content
+
+
+def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
+    """Refuse what was loaded from a file and is not as `format.checkpoint` says.
+
+    Raises:
+        InputError: with the first thing that is not.
+    """
     record = content.get(KEY)
     if not isinstance(record, dict) or "state_dict" not in content:
         raise InputError(
@@ -150,7 +163,6 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
         require_possible_scene(record["scene"], str(path))
     except Unfit as problem:
         raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
-    return content
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:

@@ -42,7 +42,7 @@ def train(config: DictConfig) -> float | None:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
-    parts = build_parts(config)
+    parts = build_parts(config, HydraConfig.get().runtime.choices)
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))

@@ -52,10 +52,10 @@ def most(work):
 
 def built():
     progress = Progress()
-    step = build_step(config, settings, scene, progress, 10)
+    step = build_step(config, settings, scene, progress)
     settings.prepare(step.model)
-    step.tile_points = TILE
-    return step, build(config.data)(scene=scene, progress=progress, seed=0, num_steps=10)
+    step.tile_points, step.num_steps = TILE, 10
+    return step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 
 def warm(step, batches):

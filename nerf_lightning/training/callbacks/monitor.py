@@ -33,7 +33,9 @@ class Monitor(Watcher):
     def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
         """Tell whether the step that begins gets a row, and so has to measure the norms of its gradients."""
         # XLA would compile the steps that get a row and those that do not as two programs.
-        return system.device.type == "xla" or self.is_time(trainer.global_step + 1, trainer.max_steps)
+        return system.device.type == "xla" or self.is_time(
+            trainer.global_step + 1, int(trainer.estimated_stepping_batches)
+        )
 
     def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Log a row."""

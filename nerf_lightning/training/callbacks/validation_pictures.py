@@ -5,7 +5,6 @@ from typing import Any
 
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.rendering.blending import photograph
-from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view, tensorboard_writers
 from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 
@@ -26,7 +25,7 @@ class ValidationPictures(Watcher):
         """Tell whether to render after a step; always after the last one."""
         return super().is_time(step, last_step) or step == last_step
 
-    def watch(self, trainer: Any, system: Any, batch: Batch) -> None:
+    def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Render the view, and save its pictures."""
         if not trainer.is_global_zero:
             return
