@@ -12,6 +12,7 @@ from nerf_lightning.config.overrides import flatten
 # Where a run lies, how long it lasts, what is said of it and what happens after it do not make it another run.
 NOT_IDENTITY = (
     *("paths.", "resume", "sweep.", "trainer.max_steps", "trainer.max_epochs", "trainer.val_every_steps"),
+    "trainer.lightning",
     *("logger.", "evaluation.", "final.", "path.", "callbacks.", "viewer.", "scene.cache_dir", "scene.verify"),
     *("scene.allow_outside", "scene.max_gigabytes", "budgets."),
 )
