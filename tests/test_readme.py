@@ -29,7 +29,11 @@ def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
     # A small scene and short runs, or it would take minutes.
     capture = write_npz(tmp_path / "capture.npz")
     small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
-    for given, instead in (('"scene=bricks"', small), ("max_steps=500", "max_steps=3"), ("max_steps=1000", "max_steps=5")):
+    for given, instead in (
+        ('"scene=bricks"', small),
+        ("max_steps=500", "max_steps=3"),
+        ("max_steps=1000", "max_steps=5"),
+    ):
         assert example.count(given) == 1
         example = example.replace(given, instead)
     check = "\nprint(run.system.step.progress.step, system.step.progress.step)\n"

@@ -19,7 +19,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.devices import use_threads
-from nerf_lightning.training.launch.length import length_of_run, require_beginning
+from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.open_checkpoint import rendering_step
 from nerf_lightning.training.step import TrainStep
 
@@ -44,16 +44,8 @@ class RadianceFieldSystem(LightningModule):
         self.val_errors = RayErrors()
 
     @classmethod
-    def load_from_checkpoint(  # type: ignore[override]
-        cls, checkpoint_path: str | Path, map_location: Any = None
-    ) -> "RadianceFieldSystem":
-        """Return a system whose model renders and can be validated; it does not train, since it has no scene.
-
-        To go on training, build the run again (`build_run`) and give the checkpoint to `Trainer.fit` as `ckpt_path`.
-
-        Args:
-            checkpoint_path: a checkpoint of `nerf train`, or of Lightning's; it may come from anybody.
-            map_location: the device; None: the CPU.
+    def load_from_checkpoint(cls, checkpoint_path: Any, map_location: Any = None) -> Any:  # type: ignore[override]
+        """Return a system that renders and validates, of a file that may come from anybody; to train it has nothing.
 
         Raises:
             InputError: it cannot be read, or asks for what is no part of a model of ours.
@@ -73,10 +65,9 @@ class RadianceFieldSystem(LightningModule):
         """Take the length of the run from the trainer, before any callback reads it or changes it.
 
         Raises:
-            InputError: it has none, or is to begin where no run begins.
+            InputError: it has none, or the trainer cannot fit this system.
         """
-        require_beginning(self.trainer, self.step.progress)
-        self.step.num_steps = length_of_run(self.trainer)
+        self.step.num_steps = length_of_run(self.trainer, self.step.progress)
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return what it saw."""
@@ -121,9 +112,7 @@ class RadianceFieldSystem(LightningModule):
         record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place and thread count decide the last bits of every sum.
-
-        So does the tile, which whoever builds the system chooses (`TrainerSettings.keep_tile`).
+        """Take up the state again: place, threads, and the tile (`TrainerSettings.keep_tile`) decide a sum's last bits.
 
         Raises:
             InputError: the checkpoint is not one of this run; nothing was taken from it.

@@ -161,6 +161,29 @@ def test_a_run_without_end_is_refused(run, trainer):
     refused(trainer(max_steps=-1, max_epochs=-1).fit, one.system, one.data, parts=("max_steps", "max_epochs"))
 
 
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        ({"precision": "bf16-mixed"}, ("precision=bf16-mixed", "trainer.precision=bf16-mixed")),
+        ({"precision": "64-true"}, ("precision=64-true", "32-true, tf32, bf16-mixed")),
+        ({"overfit_batches": 1}, ("overfit_batches=1", "scene.frames")),
+    ],
+)
+def test_what_would_be_computed_otherwise_than_it_says_is_refused(run, trainer, settings, parts):
+    one = run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        refused(trainer(max_steps=2, **settings).fit, one.system, one.data, parts=parts)
+
+
+def test_several_devices_need_a_strategy_that_adds_gradients_once(run, trainer, monkeypatch):
+    """Lightning's own adds them up in each tile's backward, and takes their mean."""
+    one, fit = run(), trainer(max_steps=2)
+    monkeypatch.setattr(Trainer, "world_size", 2)
+    parts = ("several devices", "trainer=ddp", "strategy=OneSumPerStep()")
+    refused(fit.fit, one.system, one.data, parts=parts)
+
+
 def test_lightnings_defaults_are_enough(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     one = run()
