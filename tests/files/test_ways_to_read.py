@@ -22,6 +22,7 @@ OURS = {
     "report/page.py": ["read_text"],
     "runs/published.py": ["read_text"],
     "selftest/checks/files.py": ["read_text"],
+    "machine.py": ["read_text", "read_text", "read_text"],
     "selftest/machine.py": ["read_text", "read_text"],
     "cli/worker.py": ["load", "load"],
     "evaluation/lpips.py": ["load"],
