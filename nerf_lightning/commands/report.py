@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.budgets import allowed
-from nerf_lightning.checkpoints.reading import SceneRecord, newest_checkpoint
+from nerf_lightning.checkpoints.reading import newest_checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.console import StageProgress, say
@@ -23,7 +23,7 @@ from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.files.links import require_nothing_from_outside
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
-from nerf_lightning.nerf.types.scene import PixelStore, Scene
+from nerf_lightning.nerf.types.scene import PixelStore, Scene, SceneRecord
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.embedding import Embedded, embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page

@@ -8,13 +8,12 @@ from urllib.parse import urlsplit
 
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.training.open_checkpoint import open_checkpoint
 from nerf_lightning.viewer.admission import named_places

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
@@ -25,7 +24,7 @@ from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_de
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 # Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
 STRAIGHT = 250

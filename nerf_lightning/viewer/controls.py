@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient

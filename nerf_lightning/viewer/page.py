@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.keyframes import Keyframe, Point, write_keyframes
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.client import ViewerClient

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
@@ -16,7 +15,7 @@ from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_rays
-from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
 
 # How long a slice takes, about: a person may change the wish between two.
