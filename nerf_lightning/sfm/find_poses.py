@@ -22,6 +22,29 @@ READING_COST, FRAME_COST = 0.1, 0.02
 UNFINISHED = ".poses.part"
 
 
+def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
+    """Refuse to write over poses, or over pictures that are not those that the poses are of.
+
+    Args:
+        folder: to write.
+        source: the photographs, or the video.
+        is_video: which of the two.
+
+    Raises:
+        InputError: there are poses in the folder already, or other pictures.
+    """
+    if (folder / "sparse" / "0").exists():
+        raise InputError(
+            f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
+            "with paths.output_dir=DIR."
+        )
+    images = folder / "images"
+    if images.exists() and (is_video or not source.is_dir() or not images.samefile(source)):
+        raise InputError(
+            f"{images} exists already, and is not what images= names. Give an empty folder with paths.output_dir=DIR."
+        )
+
+
 @contextmanager
 def _unfinished(folder: Path) -> Iterator[Path]:
     """Lend a folder in `folder` that vanishes at the end, and `folder` with it if nothing came to lie in it."""

@@ -1,11 +1,14 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
+import logging
 import threading
 import warnings
+import webbrowser
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import torch
 
@@ -25,6 +28,8 @@ START = 1.4
 FULL = (
     f"{limits.MOST_CLIENTS} people look on already, and more are not drawn for: close a page, then load this one again."
 )
+
+log = logging.getLogger(__name__)
 
 
 def require_viser() -> Any:
@@ -146,6 +151,22 @@ def address_of(host: str, port: int) -> str:
     """
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def open_in_browser(address: str) -> None:
+    """Open a page in the user's browser, or say why not."""
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        log.warning(
+            "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
+            "ssh -L %s:%s THIS_MACHINE.",
+            address,
+            urlsplit(address).port,
+            urlsplit(address).netloc,
+        )
 
 
 class _quietly:

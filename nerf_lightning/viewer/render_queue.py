@@ -1,12 +1,16 @@
 """Who is served next: every slice of rendering goes to one of the people who look on."""
 
 import logging
+import signal
 import threading
 import time
+from types import FrameType
 
 from nerf_lightning.viewer.complaints import Complaints
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.renderer import SlicedRenderer
+
+IDLE_SECONDS = 0.2
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +72,12 @@ class RenderQueue:
                 return True
         return False
 
+    def work_until(self, stopped: list[int]) -> None:
+        """Render for everybody, slice by slice, until there is something in the list."""
+        while not stopped:
+            if not self.work():
+                self.wait(IDLE_SECONDS)
+
     @property
     def is_empty(self) -> bool:
         """Whether nobody looks on."""
@@ -76,3 +86,15 @@ class RenderQueue:
     def _in_order(self) -> list[ProgressiveRendering]:
         with self._lock:
             return sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))
+
+
+def received_stop_signals() -> list[int]:
+    """Return a list that SIGINT and SIGTERM are put into from now on; the slice that is being rendered ends first."""
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
+    return received

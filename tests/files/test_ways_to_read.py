@@ -17,7 +17,7 @@ OURS = {
     "evaluation/protocol.py": ["read_text"],
     "training/launch/processes.py": ["open", "read_text"],
     "config/scene_overrides.py": ["read_text"],
-    "commands/view.py": ["open"],
+    "viewer/page.py": ["open"],
     "export/images.py": ["load"],
     "report/page.py": ["read_text"],
     "runs/published.py": ["read_text"],
