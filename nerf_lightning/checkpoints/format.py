@@ -21,7 +21,7 @@ VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"
 
 
 def cameras() -> Record:
-    """Return what the cameras of a scene are."""
+    """Return what the cameras in a checkpoint may be: the fields of `Cameras`, with their shapes and ranges."""
     pixels = allowed().view_pixels
     return Record(
         {

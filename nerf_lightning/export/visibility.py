@@ -91,14 +91,15 @@ def num_agreeing(
     views: Sequence[int],
     tolerance: float,
 ) -> Int[Tensor, "points"]:
-    """Return how many of the views see each point as their surface, within a share `tolerance` of the distance.
+    """Return how many of the views see each point as their surface.
 
     Args:
         points: in the working frame.
         cameras: of all views.
-        depths: of each view that may be asked; inf where nothing opaque is seen.
-        views: those to ask.
-        tolerance: of the distance.
+        depths: by view, the distance along each pixel's ray to the surface (scene units); inf where nothing opaque is
+            seen.
+        views: those that are asked.
+        tolerance: how far the point may lie from the surface, as a share of its distance.
     """
     count = torch.zeros(len(points), dtype=torch.int64)
     for view in views:
