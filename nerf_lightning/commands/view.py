@@ -14,9 +14,9 @@ from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.training.open_checkpoint import open_checkpoint
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.sfm.image_pairs import chosen_matching
-from nerf_lightning.sfm.photographs import FoundPhotograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.sfm.reconstruction import SparseModel, reconstruct
 from nerf_lightning.sfm.settings import SfmSettings, stage_costs
 from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sharp_frames

@@ -12,10 +12,10 @@ from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.viewer.camera_state import CameraState, pose_of
 from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import View
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 # Coarse pictures are sent often, fine ones once.
 COARSE_QUALITY, FINE_QUALITY = 75, 92

@@ -19,9 +19,9 @@ from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import Controls
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 # People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4

@@ -22,7 +22,7 @@ from nerf_lightning.selftest.runs import FILM_VIEWS, STEPS, STOP
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene
 from nerf_lightning.sfm.video_frames import count_frames
 from nerf_lightning.video.paths.base import frame_of
-from nerf_lightning.video.paths.photographs import Photographs
+from nerf_lightning.video.paths.photograph_path import PhotographPath
 
 ONE_STEP = 0.03
 """The learning rate: about what a step moves a weight by."""
@@ -123,7 +123,7 @@ def _film(place: Place) -> float:
     if len(files) != len(FILM_VIEWS):
         raise ValueError(f"{len(files)} frames were written, and {len(FILM_VIEWS)} were asked for")
     model, scene = _loaded(place)
-    path = Photographs(num_frames=len(FILM_VIEWS), views=list(FILM_VIEWS))
+    path = PhotographPath(num_frames=len(FILM_VIEWS), views=list(FILM_VIEWS))
     cameras = path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
     near, far = near_and_far_from(cameras.c2w[:, :, 3], scene)
     differences = []

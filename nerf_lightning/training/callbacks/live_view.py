@@ -13,10 +13,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, require_viser
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import require_address
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 # Steps take their time, so a picture may as well.
 MOVING_SECONDS = 0.5
