@@ -70,7 +70,7 @@ def require_memory(what: str, size: int, needed: Callable[[int], float], named: 
     """Refuse work that takes more memory than can be had; nothing is allocated to find out.
 
     Args:
-        what: is asked for: the setting, and what it makes.
+        what: what is asked for, in words that begin a sentence: the setting, and what it makes.
         size: the whole number that decides how much that takes.
         needed: returns the bytes that a size takes; no larger size takes less.
         named: returns the setting of a size as the user would write it.

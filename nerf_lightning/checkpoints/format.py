@@ -1,4 +1,4 @@
-"""What a checkpoint is, key by key: whoever writes one and whoever reads one hold it against this page."""
+"""What a checkpoint is, key by key: what is written and what is read are both checked against this description."""
 
 from typing import get_args
 

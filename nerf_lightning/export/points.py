@@ -41,7 +41,7 @@ class PointsExport(Export):
         max_views: most training views that are rendered.
         longest: pixels of the longer side of what is rendered, at most.
         min_opacity: share of the light that a pixel must stop.
-        agreement: so many of the nearest 8 other views must see the same surface.
+        agreement: how many of the nearest 8 other views must see the same surface.
         tolerance: share of the distance by which their depths may differ.
     """
 

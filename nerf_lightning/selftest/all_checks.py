@@ -34,7 +34,7 @@ def carry_out(checks: Iterable[Check], announce: Callable[[str], None]) -> list[
 
 @contextmanager
 def bar_of_checks(count: int) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar over so many checks; lent is what moves it on to the check of this name."""
+    """Show a progress bar over this many checks; the function that is lent moves it on to the check of a name."""
     columns = (BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=stderr_console(), transient=True) as bar:
         task = bar.add_task("", total=count, completed=-1)

@@ -98,8 +98,8 @@ class ViewerClient:
     def present(self) -> None:
         """Send the newest view again, as another channel or with the comparison cut elsewhere.
 
-        A slider asks for it more often than it can be done: who finds it being done leaves the next turn to whoever
-        does it.
+        A slider asks for it more often than it can be done: a thread that finds another one at it returns, and the
+        other one sends once more.
         """
         self._wants_present = True
         while self._wants_present and self._presenting.acquire(blocking=False):

@@ -42,7 +42,7 @@ class Frusta:
         self.cameras.visible = visible
 
     def hide_for_photograph(self, hidden: bool) -> None:
-        """Hide everything: who looks through a photograph's camera compares pixels."""
+        """Hide everything while a photograph is compared with its render, pixel by pixel."""
         self.root.visible = not hidden
 
     def draw_box(self, box: CropBox | None) -> None:

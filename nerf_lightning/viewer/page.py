@@ -23,7 +23,7 @@ from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.shown_photographs import Photographs
 
-# People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
+# The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
 FULL = (
     f"{limits.MOST_CLIENTS} people look on already, and more are not drawn for: close a page, then load this one again."
@@ -80,7 +80,7 @@ class Page:
         self.most_height = most_height
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb)
-        # A page that is closed amid a picture is nothing to speak of.
+        # Pages are closed while a picture is on its way to them; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.admission = Admission(host, hosts)
         guard = Guard(self.admission, queue.complaints)

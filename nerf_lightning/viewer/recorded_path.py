@@ -114,7 +114,7 @@ def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]
     block fails.
 
     Raises:
-        OSError: so many there are already, and whoever clicks on would fill the disk; or it cannot be made.
+        OSError: there are `most` such files already (more clicks would fill the disk), or it cannot be made.
     """
     path = _made(folder, stem, ending, most)
     try:

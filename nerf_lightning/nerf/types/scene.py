@@ -10,7 +10,8 @@ from torch import Tensor
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Background = Literal["white", "black", "random", "none"]
-"""What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
+"""What lies behind the scene. `none`: nothing. The last interval of a dense level takes all the light that is left;
+levels behind an occupancy grid have no such interval, and leave it black."""
 
 LensModel = Literal["pinhole", "radial_tangential", "fisheye"]
 """How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`."""
