@@ -7,8 +7,8 @@ from omegaconf import OmegaConf
 from support.configs import composed, loaded
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed, allowed, require_within
+from nerf_lightning.cli.main import find_commands
 from nerf_lightning.errors import InputError
-from nerf_lightning.files.folders import conf_folder
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def test_the_yaml_has_the_table_that_the_code_has():
     assert OmegaConf.to_container(loaded("budgets", "default")) == asdict(Budgets())
 
 
-@pytest.mark.parametrize("command", sorted(file.stem for file in conf_folder().glob("*.yaml")))
+@pytest.mark.parametrize("command", sorted(find_commands()))
 def test_every_command_has_it(command):
     assert composed(command).budgets == asdict(Budgets())
 

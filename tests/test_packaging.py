@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -11,18 +12,28 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 
 
+def python(*arguments, cwd, **env):
+    done = subprocess.run([sys.executable, *arguments], cwd=cwd, env=os.environ | env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def built(kind, folder):
+    """Return the archive of a kind that is made of this checkout."""
+    python("-m", "hatchling", "build", "-t", kind, "-d", str(folder), cwd=REPOSITORY)
+    (archive,) = folder.iterdir()
+    return archive
+
+
+def test_what_is_published_says_how_to_contribute_and_whom_to_tell_of_holes(tmp_path):
+    with tarfile.open(built("sdist", tmp_path)) as content:
+        names = {name.partition("/")[2] for name in content.getnames()}
+    assert {"README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"} <= names
+
+
 @pytest.mark.slow
 def test_a_wheel_installed_elsewhere_gives_a_working_nerf(tmp_path):
-    def python(*arguments, cwd, **env):
-        done = subprocess.run(
-            [sys.executable, *arguments], cwd=cwd, env=os.environ | env, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    python("-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist"), cwd=REPOSITORY)
-    (wheel,) = (tmp_path / "dist").glob("*.whl")
-    with zipfile.ZipFile(wheel) as content:
+    with zipfile.ZipFile(built("wheel", tmp_path / "dist")) as content:
         packed = {name for name in content.namelist() if name.startswith("nerf_lightning/conf/")}
         content.extractall(tmp_path / "site")
     ours = {f"nerf_lightning/{file.relative_to(REPOSITORY)}" for file in (REPOSITORY / "conf").rglob("*.yaml")}

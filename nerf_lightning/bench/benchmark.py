@@ -36,8 +36,8 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.machine import peak_memory, seconds_of
 from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
@@ -244,6 +244,6 @@ def _render(bench: Bench, num_rays: int, plain: bool) -> None:
             _render_tile(bench.step.model, rays[part], bench)
 
 
-def _render_tile(model: RadianceModel, rays: RayBundle, bench: Bench) -> None:
+def _render_tile(model: Model, rays: RayBundle, bench: Bench) -> None:
     behind = background_colors(bench.step.background, rays.near.numel(), rays.near.device, random=None)
     model(rays, behind, random=None)

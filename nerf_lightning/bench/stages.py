@@ -3,16 +3,14 @@
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.rendering.packed import positions_of
+from nerf_lightning.nerf.rendering.points import packed_points
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -23,21 +21,17 @@ VALIDATION_RAYS = 8192
 
 def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
     """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing."""
-    level = list(step.model.levels.values())[-1]
-    if not isinstance(level, PackedLevel):
+    level = next((part for part in step.model.modules() if isinstance(part, PackedLevel)), None)
+    if level is None:
         return {}
     rays, sampler = step.rays(batch.pixels), level.sampler
-    found: list[Tensor] = []
     optimizer.zero_grad()
     whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
 
-    def walk() -> None:
-        samples, _ = march(rays, sampler.start(rays, None), sampler.lattice, sampler.grid)
-        found.append(positions_of(rays, samples))
-
     with torch.no_grad():
-        walking, screening = seconds_of(walk), seconds_of(lambda: level.field.density_and_features(found[0]))
+        points = packed_points(rays, sampler(rays, None), None)
+        walking, screening = seconds_of(lambda: sampler(rays, None)), seconds_of(lambda: level.field.density(points))
     rest = whole - walking - screening
     return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}
 

@@ -1,4 +1,4 @@
-"""What a checkpoint is, key by key: whoever writes one and whoever reads one hold it against this page."""
+"""What a checkpoint is, key by key: what is written and what is read are both checked against this description."""
 
 from typing import get_args
 
@@ -9,7 +9,7 @@ from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
 from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Plain, Record, Text, Whole
 from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 
-FORMAT = 3
+FORMAT = 4
 KEY = "nerf_lightning"
 PRECISIONS = ("32-true", "tf32", "bf16-mixed")
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
@@ -21,7 +21,7 @@ VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"
 
 
 def cameras() -> Record:
-    """Return what the cameras of a scene are."""
+    """Return what the cameras in a checkpoint may be: the fields of `Cameras`, with their shapes and ranges."""
     pixels = allowed().view_pixels
     return Record(
         {

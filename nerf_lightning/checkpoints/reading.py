@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning import __version__
@@ -25,35 +24,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.schema import Unfit, shown
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.nerf.geometry.near_far import near_and_far
-from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, Space
+from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SceneRecord:
-    """What outlives the pictures: enough to render, and to place what is rendered in the user's frame."""
-
-    name: str
-    cameras: Cameras
-    near: Float[Tensor, "views"]
-    far: Float[Tensor, "views"]
-    aabb: Float[Tensor, "2 3"]
-    splits: dict[str, tuple[int, ...]]
-    view_names: tuple[str, ...]
-    background: Background
-    to_user: Float[Tensor, "4 4"]
-    space: Space = "bounded"
-
-    def near_and_far(self, eyes: Float[Tensor, "frames 3"]) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
-        """Return between which distances cameras that stand anywhere see the content (scene units)."""
-        if self.space != "bounded" or self.cameras.ndc is not None:
-            return self.near.min().expand(len(eyes)), self.far.max().expand(len(eyes))
-        return near_and_far(eyes, self.cameras.c2w[:, :, 3], self.aabb.mean(dim=0), self.near, self.far)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ from typing import Any
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.models.base import Level
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.samplers.base import AnySampler
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.level import Level
+from nerf_lightning.nerf.samplers.base import Sampler
 
-CONTRACTS = (Encoder, Field, AnySampler, Level, RadianceModel)
+CONTRACTS = (Encoder, Field, Sampler, Level, Model)
 ROOMS = tuple(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models"))
 LARGEST_NUMBER = 1 << 53
 

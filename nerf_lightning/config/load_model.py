@@ -14,14 +14,14 @@ from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.samplers.base import AnySampler
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.samplers.base import Sampler
 
 SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
 
 
-def load_model(checkpoint: Checkpoint) -> RadianceModel:
+def load_model(checkpoint: Checkpoint) -> Model:
     """Build the model that a checkpoint describes, with its weights, in evaluation mode.
 
     The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
@@ -46,7 +46,7 @@ def load_model(checkpoint: Checkpoint) -> RadianceModel:
     return model.eval()
 
 
-def hold_to_budgets(model: RadianceModel, where: str) -> None:
+def hold_to_budgets(model: Model, where: str) -> None:
     """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
 
     Args:
@@ -57,33 +57,33 @@ def hold_to_budgets(model: RadianceModel, where: str) -> None:
         InputError: it has no level, or more samples than `budgets.samples_per_ray`.
     """
     for part in model.modules():
-        if isinstance(part, AnySampler):
+        if isinstance(part, Sampler):
             part.max_intervals = allowed().intervals
-    if not model.levels:
+    if not model.level_names:
         raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 
-def _widest(model: RadianceModel) -> int:
+def _widest(model: Model) -> int:
     """Return how many features of a point there are at most, in any layer or at the end of any encoder."""
     sides = [max(matrix.shape) for matrix in matrices_of(model)]
     encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
     return max([*sides, *encoded], default=0)
 
 
-def _built(config: dict[str, Any], checkpoint: Checkpoint) -> RadianceModel:
+def _built(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
     try:
         require_fitting_values(config, "model")
         model = instantiate(config, _convert_="all")
     except HydraException as error:
         reason = " ".join(str(error.__cause__ or error).split())[:300]
         raise InputError(f"{checkpoint.path}: its model part cannot be built: {reason}. Use another one.") from error
-    if not isinstance(model, RadianceModel):
+    if not isinstance(model, Model):
         raise InputError(f"{checkpoint.path}: its model part describes a {type(model).__name__}, not a model.")
     return model
 
 
-def _require_fitting(model: RadianceModel, checkpoint: Checkpoint) -> None:
+def _require_fitting(model: Model, checkpoint: Checkpoint) -> None:
     """Refuse a model that would take much more memory than its weights do."""
     asked = sum(tensor.numel() for tensor in (*model.parameters(), *model.buffers()))
     held = sum(tensor.numel() for tensor in checkpoint.weights.values())
@@ -94,7 +94,7 @@ def _require_fitting(model: RadianceModel, checkpoint: Checkpoint) -> None:
         )
 
 
-def load_weights(model: RadianceModel, checkpoint: Checkpoint) -> None:
+def load_weights(model: Model, checkpoint: Checkpoint) -> None:
     """Put a checkpoint's weights into a model.
 
     Raises:

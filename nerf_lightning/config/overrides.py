@@ -59,15 +59,16 @@ def flatten(config: DictConfig) -> dict[str, object]:
     >>> flatten(OmegaConf.create({"a": {"b": 1}, "c": [2]}))
     {'a.b': 1, 'c': [2]}
     """
-    plain = OmegaConf.to_container(config, resolve=False)
-    leaves: dict[str, object] = {}
+    return leaves(OmegaConf.to_container(config, resolve=False))
 
-    def visit(node: object, path: str) -> None:
-        if isinstance(node, dict) and node:
-            for key, value in node.items():
-                visit(value, f"{path}.{key}" if path else str(key))
-        else:
-            leaves[path] = node
 
-    visit(plain, "")
-    return leaves
+def leaves(node: object, path: str = "") -> dict[str, object]:
+    """Return the leaves of nested dictionaries by their dotted keys below `path`.
+
+    >>> leaves({"b": 1, "c": {}}, "a")
+    {'a.b': 1, 'a.c': {}}
+    """
+    if not isinstance(node, dict) or not node:
+        return {path: node}
+    below = (leaves(value, f"{path}.{key}" if path else str(key)) for key, value in node.items())
+    return {key: value for part in below for key, value in part.items()}

@@ -1,22 +1,24 @@
 """The scene that a checkpoint was trained on, as overrides for our own conf/."""
 
+import logging
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
-from nerf_lightning.config.overrides import quoted
+from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_a_class, row_of
+from nerf_lightning.config.overrides import leaves, quoted
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 
-# Settings of scenes that say where a capture lies.
-PLACES = ("root", "path")
-# Settings that say where to write, what to fetch and how far to trust: the user's alone.
-OF_THE_USER = ("download", "cache_dir", "allow_outside", "max_gigabytes")
+PLAIN = (bool, int, float, str)
+TAKEN = (Trust.PLAIN, Trust.IF_THERE)
+
+log = logging.getLogger(__name__)
 
 
 class UnknownScene(InputError):
@@ -24,7 +26,7 @@ class UnknownScene(InputError):
 
 
 def scene_overrides(path: str) -> list[str]:
-    """Return `scene=NAME` and the recorded plain values that our yaml of this name knows.
+    """Return `scene=NAME` and the recorded plain values that our yaml of this name knows and a file may choose.
 
     A relative place that is not found from here is taken from where the run was started, if its folder still says.
 
@@ -44,23 +46,39 @@ def scene_overrides(path: str) -> list[str]:
     recorded = config.get("scene") if isinstance(config, dict) else None
     if not isinstance(recorded, dict):
         raise UnknownScene(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
-    ours = yaml.safe_load(known[name].read_text(encoding="utf-8"))
-    values = dict(_plain_values(recorded, ours))
+    ours = _settings_of(known[name])
+    values = _taken(leaves(recorded, "scene"), leaves(ours, "scene"), path)
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
-    if ours.get("download") and not os.path.exists(str(values.get("path"))):
-        values.pop("path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
-    return [f"scene={name}", *(f"scene.{key}={quoted(value)}" for key, value in values.items())]
+    if ours.get("download") and not os.path.exists(str(values.get("scene.path"))):
+        values.pop("scene.path", None)  # what is fetched lies where our yaml says, not where a stranger's file does
+    return [f"scene={name}", *(f"{key}={quoted(value)}" for key, value in values.items())]
 
 
-def _plain_values(recorded: dict[str, Any], ours: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield what may be taken from a file: plain values of settings that we know, but no classes and no addresses."""
-    for key, value in recorded.items():
-        if key not in ours or key.startswith("_") or key in OF_THE_USER:
-            continue
-        if isinstance(value, dict) and isinstance(ours[key], dict):
-            yield from _plain_values(value, ours[key], f"{path}{key}.")
-        elif value is None or isinstance(value, (bool, int, float, str)):
-            yield f"{path}{key}", value
+def _settings_of(file: Path) -> dict[str, Any]:
+    """Return the settings of one of our yamls, with those that it takes from another (`/capture@_here_`)."""
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    taken: dict[str, Any] = {}
+    for name in content.pop("defaults", []):
+        base = name.removeprefix("/").removesuffix("@_here_")
+        taken |= _settings_of(conf_folder() / f"{base}.yaml")
+    return taken | content
+
+
+def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[str, Any]:
+    """Return what is taken from a file: plain values of settings that our yaml has and the table trusts to files."""
+    undecided = [key for key in recorded if row_of(key) is None and not names_a_class(key)]
+    if undecided:
+        log.warning(
+            "%s was trained with %s. Such settings, which this program does not know, are not taken from a file. "
+            "Give them by hand if they are yours.",
+            for_terminal(path),
+            listed(undecided, cap=5),
+        )
+    return {
+        key: value
+        for key, value in recorded.items()
+        if key in ours and meaning_of(key).trust in TAKEN and (value is None or isinstance(value, PLAIN))
+    }
 
 
 def _found(place: str, checkpoint: Path) -> str:

@@ -17,7 +17,9 @@ import torch
 from torch import nn
 
 from nerf_lightning import __version__
-from nerf_lightning.config.identity import UNWATCHED, fingerprint, is_identity
+from nerf_lightning.config.identity import fingerprint
+from nerf_lightning.config.key_meanings import meaning_of
+from nerf_lightning.config.overrides import leaves
 from nerf_lightning.cores import num_cores
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.types.scene import Background, Scene
@@ -26,9 +28,6 @@ REPOSITORY = Path(__file__).parents[2]
 GIT_SECONDS = 10
 EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras")
 """What must agree between results of different scenes, too."""
-# Where a capture lies and on what machine a run was made do not make it another setting; its seed is stamped beside.
-NOT_SETTINGS = ("seed", "scene.root", "scene.path", "scene.name", "init_from", "trainer.")
-SETTINGS = ("trainer.max_steps", "trainer.max_epochs", "trainer.clip_norm")
 
 
 def measured_how(
@@ -109,13 +108,7 @@ def config_hash(settings: Any) -> str:
     >>> config_hash({"seed": 0, "optimizer": {"lr": 1}}) == config_hash({"seed": 1, "optimizer": {"lr": 1}})
     True
     """
-    leaves = _leaves(settings)
-    kept = {
-        key: value
-        for key, value in leaves.items()
-        if key.startswith(SETTINGS) or (is_identity(key) and not key.startswith(NOT_SETTINGS))
-    }
-    return fingerprint(kept | UNWATCHED)
+    return fingerprint({key: value for key, value in leaves(settings).items() if meaning_of(key).learnt})
 
 
 def weights_hash(weights: Mapping[str, torch.Tensor]) -> str:
@@ -155,13 +148,6 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
 
 def _said(protocol: Mapping[str, Any], key: str) -> str:
     return str(protocol[key])[:80] if key in protocol else "not said"
-
-
-def _leaves(node: Any, path: str = "") -> dict[str, Any]:
-    if not isinstance(node, dict) or not node:
-        return {path: node}
-    parts = [_leaves(value, f"{path}.{key}" if path else str(key)) for key, value in node.items()]
-    return {key: value for part in parts for key, value in part.items()}
 
 
 LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")

@@ -3,16 +3,16 @@
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Export(ABC):
     """Write what a model has learnt as files for other programs."""
 
     @abstractmethod
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write files into `folder` and return where they are.
 
         Args:

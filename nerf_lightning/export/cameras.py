@@ -7,15 +7,14 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.escaping import for_colmap
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.types.scene import Cameras, LensModel
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 
 CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
@@ -37,7 +36,7 @@ class CamerasExport(Export):
     def __init__(self, images: str | None = None):
         self.images = images
 
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the files."""
         cameras = in_user_frame(record)
         transforms = folder / "transforms.json"

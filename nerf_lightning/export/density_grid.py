@@ -10,11 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 Report = Callable[[str, float], None]
 """Takes the name of a stage, and how much of it is done, from 0 to 1."""
@@ -68,14 +68,14 @@ class Lattice:
 
 
 def sample_density(
-    model: RadianceModel, lattice: Lattice, tile_points: int, report: Report, stage: str = "density"
+    model: Model, lattice: Lattice, tile_points: int, report: Report, stage: str = "density"
 ) -> Float[ndarray, "x y z"]:
     """Return the density (per scene unit) that rendering sees at the points of a lattice."""
     device = next(model.parameters()).device
     density = np.empty(lattice.num_points, np.float32)
     for chunk in lattice.chunks():
         points = lattice.points(chunk)
-        parts = [model.last.density(points[part].to(device)).cpu() for part in tiles(len(points), tile_points)]
+        parts = [model.density(points[part].to(device)).cpu() for part in tiles(len(points), tile_points)]
         density[chunk] = torch.cat(parts).numpy()
         report(stage, chunk.stop / lattice.num_points)
     return density.reshape(lattice.shape)

@@ -11,7 +11,6 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
@@ -23,7 +22,8 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
 from nerf_lightning.nerf.geometry.frames import directions_to_user, unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]
@@ -47,7 +47,7 @@ class ImagesExport(Export):
             raise InputError(f"what.max_views={max_views}: give at least one view, or null for all.")
         self.split, self.max_views, self.depth = split, max_views, depth
 
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)

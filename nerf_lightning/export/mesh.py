@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export, refuse_ndc
@@ -18,7 +17,8 @@ from nerf_lightning.export.mesh_files import MeshFormat, require_library, save_m
 from nerf_lightning.export.surface import SeenFrom, surface_colors, surface_level
 from nerf_lightning.export.visibility import seen_faces
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 # The density's grid, and as much again for the mesh.
 BYTES_PER_POINT = 8
@@ -62,7 +62,7 @@ class MeshExport(Export):
         self.resolution, self.threshold, self.colors = resolution, threshold, colors
         self.min_share, self.seen_only, self.faces, self.format = min_share, seen_only, faces, format
 
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
         require_library("trimesh")  # before the work, not after it
@@ -90,9 +90,7 @@ class MeshExport(Export):
         log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
         return [path]
 
-    def _level(
-        self, model: RadianceModel, record: SceneRecord, density: Float[ndarray, "x y z"], tile_points: int
-    ) -> float:
+    def _level(self, model: Model, record: SceneRecord, density: Float[ndarray, "x y z"], tile_points: int) -> float:
         level = self.threshold or surface_level(model, record, tile_points)
         lowest, highest = float(density.min()), float(density.max())
         if level is not None and lowest < level < highest:

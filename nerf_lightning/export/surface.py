@@ -11,11 +11,12 @@ from torch.nn import functional
 from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles, weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.ray_statistics import median_distances
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle, RaySamples
 from nerf_lightning.visualization.pictures import to_bytes
 
@@ -28,7 +29,7 @@ OPAQUE = 0.9
 QUANTILE = 0.2
 
 
-def surface_level(model: RadianceModel, record: SceneRecord, tile_points: int) -> float | None:
+def surface_level(model: Model, record: SceneRecord, tile_points: int) -> float | None:
     """Return the density (per scene unit) at the surface, or None where no ray meets one in the scene's box.
 
     Rays of the training views are rendered; where each opaque one has half of its light behind it the field is asked
@@ -42,7 +43,7 @@ def surface_level(model: RadianceModel, record: SceneRecord, tile_points: int) -
     if not len(seen):
         return None
     device = next(model.parameters()).device
-    density = torch.cat([model.last.density(part.to(device)).cpu() for part in seen.split(tile_points)])
+    density = torch.cat([model.density(part.to(device)).cpu() for part in seen.split(tile_points)])
     density = density[density > 0]  # on the very edge of an empty cell there may be none
     return float(density.quantile(QUANTILE)) if len(density) else None
 
@@ -60,7 +61,7 @@ def _some_rays(record: SceneRecord) -> RayBundle:
 
 
 def _surface_points(
-    model: RadianceModel, rays: RayBundle, record: SceneRecord, tile_points: int
+    model: Model, rays: RayBundle, record: SceneRecord, tile_points: int
 ) -> Iterator[Float[Tensor, "points 3"]]:
     rays, key = rays.to(next(model.parameters()).device), fold(0, "surface")
     for part, renderings in weighted_renderings(model, rays, record.background, key, tile_points):
@@ -74,7 +75,7 @@ SAMPLES = 8
 
 
 def surface_colors(
-    model: RadianceModel,
+    model: Model,
     record: SceneRecord,
     points: Float[Tensor, "points 3"],
     normals: Float[Tensor, "points 3"],
@@ -110,12 +111,12 @@ def surface_colors(
     return colors
 
 
-def _short_rays(model: RadianceModel, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:
+def _short_rays(model: Model, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:
     # From before the surface to behind it; what light is left then ends there.
     edges = torch.linspace(0.0, 2.0 * reach, SAMPLES + 1, device=at.device).expand(len(at), SAMPLES + 1)
     samples, origins = RaySamples(edges), at - reach * look
     positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
-    output = model.last.field(positions, look[:, None], None)
+    output = model.at(Points(positions, look[:, None]))
     near = torch.zeros(len(at), device=at.device)
     rays = RayBundle(origins, look, near, near + 2.0 * reach, look)
     return composite(output, samples, rays, None).rgb

@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.export.base import Export, refuse_ndc
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
@@ -16,8 +15,10 @@ from nerf_lightning.export.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import unit_of
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
+from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 # Density, colour, and the density again in the user's units.
@@ -37,7 +38,7 @@ class VolumeExport(Export):
     def __init__(self, resolution: int = 128):
         self.resolution = resolution
 
-    def export(self, model: RadianceModel, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the grids."""
         refuse_ndc(record, "volume")
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
@@ -68,7 +69,7 @@ def _described(record: SceneRecord, lattice: Lattice) -> dict[str, object]:
 
 
 def _colors(
-    model: RadianceModel,
+    model: Model,
     record: SceneRecord,
     lattice: Lattice,
     density: Float[ndarray, "x y z"],
@@ -89,11 +90,11 @@ def _colors(
 
 
 def _seen(
-    model: RadianceModel, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
+    model: Model, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
     device, colors = next(model.parameters()).device, torch.zeros(len(points), 3)
     looks = looks_from_nearest(points, eyes)
     for look in looks:
-        output = model.last.field(points[:, None].to(device), look[:, None].to(device), None)
-        colors += output.rgb[:, 0].cpu() / len(looks)
+        output = model.at(Points(points.to(device), look.to(device)))
+        colors += output.rgb.cpu() / len(looks)
     return to_bytes(colors)

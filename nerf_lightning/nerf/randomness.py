@@ -63,15 +63,39 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
-        sample = torch.arange(count, device=self.slots.device)
-        ray = mix(self.key ^ purpose_word(purpose)) ^ mix(self.slots & WORD)
-        words = mix((mix(ray)[..., None] + sample * 0x3C6EF35F) & WORD)
-        return (words >> 8).to(torch.float32) * 2.0**-24
+        return self.along(count).uniform(purpose)
 
     def normal(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
-        """Return `count` standard normal numbers per ray (Box and Muller, 1958)."""
-        radius = torch.sqrt(-2.0 * torch.log1p(-self.uniform(purpose, count)))
-        return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle", count))
+        """Return `count` standard normal numbers per ray."""
+        return self.along(count).normal(purpose)
+
+    def along(self, count: int) -> "PointRandom":
+        """Return the numbers of the first `count` samples of each ray."""
+        number = torch.arange(count, device=self.slots.device).expand(*self.slots.shape, count)
+        return PointRandom(self.key[..., None], self.slots[..., None], number)
+
+
+@dataclass(frozen=True)
+class PointRandom(TensorStruct):
+    """The random numbers of points on rays: functions of the ray's slot and of the sample's number on it."""
+
+    key: Int[Tensor, "*#points"]
+    """fold(seed, attempt, step)."""
+    slots: Int[Tensor, "*#points"]
+    """The ray's place in the global batch."""
+    number: Int[Tensor, "*points"]
+    """Of the sample on its ray."""
+
+    def uniform(self, purpose: str) -> Float[Tensor, "*points"]:
+        """Return a number for each point, uniform on [0, 1), in steps of 2^-24."""
+        ray = mix(self.key ^ purpose_word(purpose)) ^ mix(self.slots & WORD)
+        words = mix((mix(ray) + self.number * 0x3C6EF35F) & WORD)
+        return (words >> 8).to(torch.float32) * 2.0**-24
+
+    def normal(self, purpose: str) -> Float[Tensor, "*points"]:
+        """Return a standard normal number for each point (Box and Muller, 1958)."""
+        radius = torch.sqrt(-2.0 * torch.log1p(-self.uniform(purpose)))
+        return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle"))
 
 
 def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu", first: int = 0) -> RayRandom:

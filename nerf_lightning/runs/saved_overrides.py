@@ -1,10 +1,10 @@
 """The overrides that a run or a sweep was started with, repeated where it is gone on with by its folder's name.
 
 They come out of a file in the folder, and the folder may come from anybody: what names a class, looks something
-up (an interpolation), or says where to write or how far to trust is taken from the command line alone.
+up (an interpolation), or is not trusted to files by the table in config/key_meanings.py is taken from the command line
+alone.
 """
 
-import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
@@ -16,29 +16,13 @@ from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
 from nerf_lightning.budgets import require_within
+from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, is_removable, meaning_of
 from nerf_lightning.errors import InputError
-from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
 
-OF_ONE_START = ("resume", "paths", "init_from", "sweep", "viewer", "budgets")
-"""What belongs to one start of a run, not to the run: the viewer opens a server, for whoever sits there then."""
-OF_THE_USER = ("hydra", "logger", "scene.download", "scene.cache_dir", "scene.allow_outside", "scene.max_gigabytes")
-"""Where to write, what to fetch, and what to trust."""
-DOWNLOADED = "scene.path"
-"""Where some scenes put what they fetch: a file that is there already is only read."""
-SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
-SWEEP_NUMBERS = re.compile(r"hydra\.(launcher|sweeper|sweeper\.sampler)\.[A-Za-z]\w*", re.ASCII)
-"""Numbers that say how many jobs there are, at once and in all. Not hydra.sweeper.params: its keys are overrides."""
-SWEEP_WORDS = (
-    "hydra.launcher.batch_size",
-    "hydra.launcher.name",
-    "hydra.launcher.partition",
-    "hydra.sweeper.direction",
-)
 OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
-WORD = re.compile(r"\w[\w-]*", re.ASCII)
 
 
 def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
@@ -88,17 +72,20 @@ def _repeated(lines: Sequence[str], arguments: Sequence[str], saved: Path, of_sw
             flag, kind = ("sweep.resume=true", "sweep") if of_sweep else ("resume=", "run")
             raise InputError(
                 f"{saved} holds {line[:200]!r}, which is not repeated from a file: what names a class, looks something "
-                "up, or says where to write, what to fetch and how far to trust is taken from the command line alone. "
-                f"If it is yours, type it again after {flag}; else do not go on with this {kind}."
+                "up, says where to write, what to fetch and how far to trust, or is no setting that this program "
+                "knows, is taken from the command line alone. If it is yours, type it again after "
+                f"{flag}; else do not go on with this {kind}."
             )
         yield line
 
 
 def _is_of_one_start(override: Override, of_sweep: bool) -> bool:
-    # Jobs of a sweep that have not begun start from there still.
-    if of_sweep and override.key_or_group == "init_from":
-        return False
-    return _belongs(override.key_or_group, OF_ONE_START)
+    return _trust(override.key_or_group, of_sweep) is Trust.ONE_START
+
+
+def _trust(key_or_group: str, of_sweep: bool) -> Trust:
+    meaning = meaning_of(key_or_group.replace("/", "."))
+    return meaning.in_sweep if of_sweep and meaning.in_sweep is not None else meaning.trust
 
 
 def _parsed(line: str) -> Override | None:
@@ -110,11 +97,14 @@ def _parsed(line: str) -> Override | None:
 
 
 def _is_harmless(override: Override, of_sweep: bool) -> bool:
+    words = re.split("[./]", override.key_or_group)
+    if not all(map(KEY.fullmatch, words)):
+        return False
     if not of_sweep:
-        return _is_harmless_alone(override)
-    if _belongs(override.key_or_group, ("hydra",)):
+        return _is_harmless_alone(override, of_sweep)
+    if words[0] == "hydra":
         return _is_sweep_setting(override)
-    return all(job is not None and _is_harmless_alone(job) for job in _of_each_job(override))
+    return all(job is not None and _is_harmless_alone(job, of_sweep) for job in _of_each_job(override))
 
 
 def _is_sweep_setting(override: Override) -> bool:
@@ -123,9 +113,7 @@ def _is_sweep_setting(override: Override) -> bool:
         return False
     if key in SWEEP_GROUPS:
         return isinstance(value, str) and KEY.fullmatch(value) is not None
-    if key in SWEEP_WORDS and isinstance(value, str):
-        return WORD.fullmatch(value) is not None
-    return SWEEP_NUMBERS.fullmatch(key) is not None and (value is None or isinstance(value, (bool, int, float)))
+    return not isinstance(value, (dict, list)) and _is_plain(key, value, of_sweep=True)
 
 
 def _of_each_job(override: Override) -> Iterator[Override | None]:
@@ -140,49 +128,34 @@ def _of_each_job(override: Override) -> Iterator[Override | None]:
         yield override
 
 
-def _is_harmless_alone(override: Override) -> bool:
+def _is_harmless_alone(override: Override, of_sweep: bool) -> bool:
     if override.is_sweep_override():
         return False
     key, value, package = override.key_or_group, override.value(), override.package
-    if not all(KEY.fullmatch(word) for word in re.split(r"[./]", key)):
+    if package is not None and not (meaning_of(package) is PART and all(map(KEY.fullmatch, package.split(".")))):
         return False
-    if package is not None and (_belongs(package, OF_THE_USER) or not all(map(KEY.fullmatch, package.split(".")))):
-        return False
-    if package is not None or "/" in key or os.path.isdir(conf_folder() / key):
+    if key in CHOSEN_GROUPS:
         names = value if isinstance(value, list) else [value]
-        if key.partition("/")[0] == "hydra" or not all(_is_option(name) for name in names):
-            return isinstance(value, dict) and _is_plain(key, value)
-        return True
-    return _is_plain(key, value)
+        return all(_is_option(name) for name in names) or (isinstance(value, dict) and _is_plain(key, value, of_sweep))
+    if "/" in key or package is not None:
+        return False
+    return is_removable(key) if override.is_delete() else _is_plain(key, value, of_sweep)
 
 
 def _is_option(name: Any) -> bool:
     return name is None or (isinstance(name, str) and OPTION.fullmatch(name) is not None)
 
 
-def _is_plain(key: str, value: Any) -> bool:
-    for path, leaf in _leaves(key, value):
-        if _belongs(path, OF_THE_USER) or any(word.startswith("_") for word in path.split(".")):
-            return False
-        if isinstance(leaf, str) and (
-            "${" in leaf or (path == DOWNLOADED and not os.path.exists(os.path.expanduser(leaf)))
-        ):
-            return False
-        if not (leaf is None or isinstance(leaf, (str, int, float, bool))):
-            return False
-    return True
+def _is_plain(key: str, value: Any, of_sweep: bool) -> bool:
+    return all(_trust(path, of_sweep).takes(leaf) for path, leaf in _leaves(key, value))
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
+    if isinstance(value, dict) and value:
         for key, child in value.items():
             yield from _leaves(f"{path}.{key}", child)
-    elif isinstance(value, list):
+    elif isinstance(value, list) and value:
         for child in value:
             yield from _leaves(path, child)
     else:
-        yield path, value
-
-
-def _belongs(key: str, names: Sequence[str]) -> bool:
-    return any(key == name or key.startswith((f"{name}.", f"{name}/", f"{name}@")) for name in names)
+        yield path, value or None if isinstance(value, (dict, list)) else value  # of an empty one, its key alone counts

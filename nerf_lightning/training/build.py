@@ -9,13 +9,13 @@ from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.budgets import Budgets, allow
-from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
@@ -127,7 +127,10 @@ def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettin
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
     progress = Progress()
-    step = build_step(config, settings, scene, progress)
+    start = None
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+    step = build_step(config, settings, scene, progress, start)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed)
     return Run(settings, scene, data, RadianceFieldSystem(step, record))
@@ -141,7 +144,9 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
     return list(chosen.values())
 
 
-def build_step(config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress) -> TrainStep:
+def build_step(
+    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, start: Checkpoint | None = None
+) -> TrainStep:
     """Build model, loss, optimizer and schedule into the step of training.
 
     Raises:
@@ -149,16 +154,14 @@ def build_step(config: DictConfig, settings: TrainerSettings, scene: Scene, prog
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
-    model: RadianceModel = build(config.model)
+    model: Model = build(config.model)
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     model.fit_to(scene)
-    start = None
-    if config.init_from is not None:
-        start = read_checkpoint(required_path("init_from", config.init_from))
+    if start is not None:
         load_weights(model, start)
     return TrainStep(
         model=model,

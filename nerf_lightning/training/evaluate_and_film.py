@@ -15,7 +15,7 @@ from nerf_lightning.console import say
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import measured_of
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -58,7 +58,7 @@ class Finish:
             require_room(lay_path(self.path, record), FilmSettings(), [record])
 
     def __call__(
-        self, settings: TrainerSettings, scene: Scene, model: RadianceModel, trainer: Trainer, folder: Path
+        self, settings: TrainerSettings, scene: Scene, model: Model, trainer: Trainer, folder: Path
     ) -> float | None:
         """Evaluate, film, print a summary, and return the test PSNR (else the validation's)."""
         settings.prepare(model).eval()
@@ -84,7 +84,7 @@ class Finish:
         return None if psnr is None else float(psnr)
 
 
-def _origin(trainer: Trainer, model: RadianceModel, settings: TrainerSettings) -> dict[str, Any]:
+def _origin(trainer: Trainer, model: Model, settings: TrainerSettings) -> dict[str, Any]:
     system: Any = trainer.lightning_module
     record = system.record
     return measured_of(model, record["config"], record["choices"], settings.device, settings.precision)

@@ -17,6 +17,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.geometry.cameras import resized
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
@@ -113,7 +115,7 @@ def _step(
     return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
 
 
-def _few_rays(model: RadianceModel, training: bool) -> int:
+def _few_rays(model: Model, training: bool) -> int:
     return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
 
 
@@ -136,7 +138,7 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
     share = TRIAL_SIDE**2 / num_pixels
     side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
     small = RayGenerator(resized(scene.cameras[:1], side, side), scene.near[:1], scene.far[:1])
-    stand_in = _StandIn(int(per_ray)).to(settings.device)
+    stand_in = RadianceModel({"only": _Hungry(int(per_ray))}).to(settings.device)
 
     def work() -> None:
         tile_points = max(1, int(tile_rays * share))
@@ -146,21 +148,23 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
     return int(peak_bytes(work, settings.device) / share)
 
 
-class _StandIn(RadianceModel):
-    """A model that computes nothing, and takes as much memory for each ray as another does."""
+class _Hungry(Level):
+    """A level that computes nothing, and takes as much memory for each ray as a whole model does."""
 
     def __init__(self, bytes_per_ray: int):
-        super().__init__({})
+        nn.Module.__init__(self)  # it has neither sampler nor field
         self.bytes_per_ray = bytes_per_ray
         self.parameter = nn.Parameter(torch.zeros(()))
 
-    def points_per_ray(self, training: bool) -> float:
+    def points_per_ray(self, before: float, training: bool) -> float:
         return 1.0
 
-    def forward(self, rays: RayBundle, background: Tensor | None, random: RayRandom | None) -> list[Rendering]:
+    def forward(
+        self, rays: RayBundle, background: Tensor | None, history: list[Any], random: RayRandom | None
+    ) -> Rendering:
         torch.empty(rays.near.numel() * self.bytes_per_ray, dtype=torch.uint8, device=rays.near.device)
         rgb = torch.zeros_like(rays.directions)
-        return [Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))]
+        return Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))
 
 
 def _optimizer_bytes(step: TrainStep, trainable: list[nn.Parameter]) -> int:

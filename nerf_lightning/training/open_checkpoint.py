@@ -11,7 +11,7 @@ from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
@@ -25,7 +25,7 @@ class Opened:
 
     settings: TrainerSettings
     checkpoint: Checkpoint
-    model: RadianceModel
+    model: Model
 
     @property
     def tile_points(self) -> int:
@@ -55,7 +55,7 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     return [Opened(settings, each, _model(settings, each, float32)) for each in checkpoints]
 
 
-def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> RadianceModel:
+def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> Model:
     model = load_model(checkpoint)
     return model.to(settings.device) if float32 else settings.prepare(model)
 

@@ -19,7 +19,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.optimizers.schedule import Schedule
@@ -80,7 +80,7 @@ class TrainStep:
 
     def __init__(
         self,
-        model: RadianceModel,
+        model: Model,
         rays: RayGenerator,
         loss: Loss,
         optimizer: Callable[[Iterable[Any]], Optimizer],

@@ -35,6 +35,14 @@ def test_help_of_a_command_lists_groups_and_examples(nerf, command):
     assert "trainer: auto, cpu, ddp, gpu" in result.out
 
 
+def test_the_settings_that_readers_share_are_no_scene_and_no_command(nerf):
+    assert "There is no command 'capture'" in nerf("capture").err
+    refused = nerf("train", "scene=capture").err
+    assert "Could not find 'scene/capture'" in refused
+    assert "colmap" in refused.partition("Available options")[2]
+    assert "capture" not in refused.partition("Available options")[2]
+
+
 def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
     """tests/support/one_composition.py counts on it."""
     configs = [OmegaConf.load(file) for file in conf_folder().rglob("*.yaml")]

@@ -119,6 +119,12 @@ def test_only_our_own_model_parts_are_built(nerf, tmp_path, target, place):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("place", PLACES[:3])
+def test_a_model_setting_that_no_part_has_is_refused(tmp_path, place):
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: place(c["model"], {"unheard_of": "/tmp/evil"})))
+    refused(loaded, file, parts=("a.ckpt", "its model part"))
+
+
 def test_what_lies_beside_the_model_is_not_built(nerf, tmp_path):
     """Callbacks, loggers and the rest of a recorded config are text."""
     mark = tmp_path / "ran"
@@ -259,6 +265,21 @@ def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_
         assert found.get("allow_outside") in (None, False)
         assert "https://x/y" not in str(found)
     assert not (tmp_path / "planted").exists()
+
+
+def test_of_a_recorded_scene_settings_that_nobody_decided_about_are_not_taken(tmp_path, monkeypatch, caplog):
+    """Whether the yaml of this name has them, or not."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nunheard_of: null\n")
+    monkeypatch.setattr("nerf_lightning.config.scene_overrides.conf_folder", lambda: tmp_path)
+    scene = {"root": "data", "unheard_of": "/tmp/evil", "not\x1b[2J in_it": 1, "allow_outside": True}
+    file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
+    assert scene_of(file) == ["scene=mine", "scene.root='data'"]
+    (said_once,) = [record.getMessage() for record in caplog.records]
+    assert "scene.unheard_of" in said_once
+    assert "scene.not\\x1b[2J in_it" in said_once
+    assert "are not taken from a file. Give them by hand" in said_once
+    assert "allow_outside" not in said_once
 
 
 def test_links_beside_a_checkpoint_do_not_lead_out(nerf, sound, tmp_path):

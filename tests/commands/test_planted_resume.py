@@ -143,10 +143,10 @@ def buffer(name, value):
 FAST_CASES = {
     "no moments": (moments(exp_avg=lambda x: torch.zeros(1)), "exp_avg is not a tensor of the shape"),
     "a step that is a tensor": (moments(step=lambda x: torch.tensor(3.0)), "step is not a number"),
-    "a box inside out": (buffer("sampler.aabb", lambda x: x.flip(0)), "box in the model's state"),
+    "a box inside out": (buffer("sampler.grid.aabb", lambda x: x.flip(0)), "box in the model's state"),
     "a field's box of a point": (buffer("field.aabb", lambda x: x * 0), "box in the model's state"),
-    "cells": (buffer("sampler.cells", lambda x: x + 7), "occupancy grid in the model's state"),
-    "far before near": (buffer("sampler.range", lambda x: x.flip(0)), "occupancy grid in the model's state"),
+    "cells": (buffer("sampler.grid.cells", lambda x: x + 7), "occupancy grid in the model's state"),
+    "far before near": (buffer("sampler.grid.range", lambda x: x.flip(0)), "occupancy grid in the model's state"),
     "negative counts": (buffer("tally", lambda x: x - 10), "samples per ray"),
 }
 

@@ -77,11 +77,14 @@ def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path
     assert json.loads((tmp_path / "here/run.json").read_text()) == before
 
 
-def test_a_run_that_is_watched_is_the_same_run(tmp_path):
-    alone, watched = config(tmp_path), config(tmp_path, "viewer=on", "viewer.live_view.port=9000")
+@pytest.mark.parametrize(
+    "more", [["viewer=on", "viewer.live_view.port=9000"], ["logger=none"]], ids=lambda more: more[0]
+)
+def test_a_run_that_is_watched_is_the_same_run(tmp_path, more):
+    alone, watched = config(tmp_path), config(tmp_path, *more)
     run = begin(alone)
     run.release()
-    again = begin(config(tmp_path, "viewer=on", "resume=auto"))
+    again = begin(config(tmp_path, more[0], "resume=auto"))
     assert again.path == run.path
     again.release()
     assert settings_digest(watched) == settings_digest(alone)

@@ -62,6 +62,7 @@ def test_what_was_swept_within_model_or_scene_is_shown(table, tmp_path):
 BESIDE_THE_RESULT = (
     *("model={}", "scene={}", "scene@scene={}", "resume={}", "path={}", "path.num_frames={}", "logger={}"),
     *("logger.tensorboard.name={}", "~logger.tensorboard={}", "paths.output_dir={}", "sweep.resume={}"),
+    *("viewer={}", "viewer.live_view.port={}", "budgets.views={}", "scene.verify={}"),
     *("final.video={}", "evaluation.num_worst={}", "scene.root={}/lego", "scene.name={}", "scene.cache_dir={}"),
 )
 

@@ -105,7 +105,7 @@ def test_haze_in_front_of_a_surface_is_not_taken_for_it(tmp_path):
     """A quarter of the light is stopped before it reaches the ball, so the expected depth lies in the haze."""
     model = solid(ball(RADIUS), inside=50.0)
     clear = model.last.field.density
-    model.last.field.density = lambda positions: clear(positions) + 0.1
+    model.last.field.density = lambda points: (clear(points)[0] + 0.1, None)
     mesh = exported(tmp_path, model, record())
     radii = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(np.median(radii) - RADIUS) < 0.05

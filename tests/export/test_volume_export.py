@@ -24,6 +24,7 @@ from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.training.memory_trial import peak_bytes
 
 CENTER = (0.3, 0.0, -0.2)
@@ -61,15 +62,15 @@ def test_what_rays_pass_by_has_no_density(kind):
     level = kind(OccupancySampler(resolution=8), field)
     model, points = RadianceModel({"fine": level}).eval(), some_rays(500).origins / 4
     with torch.no_grad():
-        assert bool((model.last.density(points) > 0).all())
-        level.sampler.occupy(torch.zeros_like(level.sampler.possible))
-        assert not bool(model.last.density(points).any())
-        half = torch.zeros_like(level.sampler.possible)
+        assert bool((model.density(points) > 0).all())
+        level.sampler.grid.occupy(torch.zeros_like(level.sampler.grid.possible))
+        assert not bool(model.density(points).any())
+        half = torch.zeros_like(level.sampler.grid.possible)
         half[:, 4:] = True
-        level.sampler.occupy(half)
-        found = model.last.density(points)
+        level.sampler.grid.occupy(half)
+        found = model.density(points)
         torch.testing.assert_close(found > 0, points[:, 0] >= 0)
-        torch.testing.assert_close(found[found > 0], field.density(points)[found > 0])
+        torch.testing.assert_close(found[found > 0], field.density(Points(points))[0][found > 0])
 
 
 def test_a_grid_takes_no_more_memory_than_is_asked_for(tmp_path, monkeypatch):

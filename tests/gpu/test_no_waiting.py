@@ -16,7 +16,7 @@ from support.gpu_training import default_callbacks, step_by_step
 from support.steps import rays_of
 
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.nerf.models.occupancy_level import GridLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.models import METHODS
@@ -44,7 +44,7 @@ def never_waiting(device):
 
 def updates(run) -> set[int]:
     """The steps in which a grid is updated, and read."""
-    levels = [level for level in run.training.model.modules() if isinstance(level, GridLevel)]
+    levels = [level for level in run.training.model.modules() if isinstance(level, PackedLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 

@@ -32,6 +32,7 @@ from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.packed import composite_packed
 from nerf_lightning.nerf.rendering.quadrature import composite
+from nerf_lightning.nerf.samplers.base import PackedSampler, _AllAtOnce
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.types.rays import PackedSamples, RaySamples
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -44,9 +45,9 @@ WRITERS = {"evaluation.evaluator", "evaluation.kept_views", "evaluation.metrics_
 """Of what was measured: they compute nothing themselves."""
 PRODUCTS = {"matmul", "mm", "bmm", "mv", "dot", "einsum", "linear", "addmm", "baddbmm", "conv2d", "tensordot", "inner"}
 RAYS = 40
-CONTRACTS = {"Encoder", "Sampler", "AnySampler", "CameraPath"}
+CONTRACTS = {"Encoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
 """Classes that are tried through those that follow them."""
-FORWARD_AGAIN = {"attach_gradients", "from_features"}
+FORWARD_AGAIN = {"attach_gradients"}
 """Methods that do what `forward` does, with what it returned before."""
 
 
@@ -135,8 +136,7 @@ def known() -> dict[str, Any]:
         "truth_normals": nn.functional.normalize(picture - 0.5, dim=-1), "mse": 0.01 * background, "render": picture,
         "truth": (picture + 0.05).clamp(max=1), "kept": picture[..., 0] > 0.1, "rgb": background,
         "weight": torch.ones(RAYS), "history": [composite(output(RAYS, 8), dense, rays, background)],
-        "density_and_features": lambda x: (x.square().sum(-1), None), "density_fn": lambda x: x.square().sum(-1) * 5,
-        "step": 0, "key": 3, 
+                "step": 0, "key": 3, "alive": torch.arange(0, RAYS, 3), "limit": 4, 
         "around": frame_of(scene.cameras, scene.aabb, to_user=to_user, view_names=scene.view_names),
         "number": torch.arange(64), "found": torch.rand(64, generator=drawn), "decay": 0.95, "cascade": 0,
         "within": torch.rand(64, 3, generator=drawn), "occupied": torch.rand(1, 1, 1, 1, generator=drawn) > 2,
@@ -149,6 +149,10 @@ class Known(str):
     """The name of a value in `known()`."""
 
 
+def density_there(positions: Tensor) -> Tensor:
+    return positions.square().sum(-1) * 5
+
+
 # Where a name means something else.
 ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.geometry.cameras.pinhole_cameras": {"focal": 19.3, "width": 12, "height": 12},
@@ -158,8 +162,12 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.rendering.blending.background_colors": {"background": "random"},
     "nerf.rendering.blending.photograph": {"background": "white"},
     "nerf.rendering.packed.composite_packed": {"output": Known("packed output"), "samples": Known("packed samples")},
-    "nerf.rendering.packed.positions_of": {"samples": Known("packed samples")},
+    "nerf.rendering.points.packed_points": {"samples": Known("packed samples")},
     "nerf.rendering.packed.first_of_each_ray": {"samples": Known("packed samples")},
+    "nerf.samplers.base.Sampler.update": {"density": density_there},
+    "nerf.samplers.base.Sampler.reached_density": {"density": density_there},
+    "nerf.samplers.occupancy.OccupancySampler.update": {"density": density_there},
+    "nerf.samplers.occupancy.OccupancySampler.reached_density": {"density": density_there},
     "evaluation.geometry_errors.depth_error": {"far": Known("distances")},
     "nerf.geometry.surfaces.surface_depth": {"far": Known("distances")},
     "nerf.geometry.surfaces.normals_from_depth": {"points": Known("render")},
@@ -240,12 +248,16 @@ def instances(tmp_path_factory) -> list[Any]:
     ]
     for sampler in samplers:
         sampler.fit_to(known()["scene"])
+    packed = [sampler for sampler in samplers if isinstance(sampler, PackedSampler)]
+    walks = [
+        part for sampler in packed for part in (sampler.walk(known()["rays"]), _AllAtOnce(sampler, known()["rays"]))
+    ]
     grid = OccupancyGrid()
     grid.allocate(8, 1)
     crop = CropBox.from_user((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8), known()["to_user"])
     others = [grid, crop, Clip(3.1, crop), Contracted(), RayErrors(), LPIPS(), known()["around"]]
     encoders = [instantiate(loaded("encoder", option)) for option in options("encoder")]
-    return [*encoders, *samplers, *paths(tmp_path_factory.mktemp("paths")), *others]
+    return [*encoders, *samplers, *walks, *paths(tmp_path_factory.mktemp("paths")), *others]
 
 
 def methods(instance: Any) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def other_moment(content):
 
 
 def other_grid(content):
-    content["state_dict"]["model.levels.fine.sampler.cells"].view(-1)[0] ^= 1
+    content["state_dict"]["model.levels.fine.sampler.grid.cells"].view(-1)[0] ^= 1
 
 
 def other_place(content):

@@ -30,7 +30,11 @@ def _composed(command: str, overrides: tuple[str, ...]) -> DictConfig:
 
 
 def loaded(group: str, option: str) -> DictConfig:
-    """Return one yaml as it stands."""
+    """Return one yaml as it stands, with the settings that it takes from one of conf/ itself (`/capture@_here_`)."""
     config = OmegaConf.load(Path(conf_folder()) / group / f"{option}.yaml")
+    for base in [str(each) for each in config.get("defaults", []) if str(each).endswith("@_here_")]:
+        config.defaults.remove(base)
+        name = base.removeprefix("/").removesuffix("@_here_")
+        config = OmegaConf.merge(OmegaConf.load(conf_folder() / f"{name}.yaml"), config)
     assert isinstance(config, DictConfig)
     return config

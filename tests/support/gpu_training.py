@@ -8,7 +8,7 @@ from support.configs import composed
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.models.occupancy_level import GridLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build import build_step
@@ -48,7 +48,7 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
     training = build_step(config, settings, scene, progress).to(device)
     training.num_steps = 1000
     for level in training.model.modules():
-        if isinstance(level, GridLevel):
+        if isinstance(level, PackedLevel):
             level.sampler.opaque_below = CUT
     training.model.multiply_in(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)

@@ -32,11 +32,11 @@ class SolidField(Field):
         self.distance, self.color, self.inside = distance, color, inside
         self.place_of_the_model = torch.nn.Parameter(torch.zeros(1))
 
-    def density(self, positions):
-        return self.inside * torch.sigmoid(-self.distance(positions) / SOFT)
+    def density(self, points):
+        return self.inside * torch.sigmoid(-self.distance(points.positions) / SOFT), None
 
-    def forward(self, positions, directions, random):
-        return FieldOutput(self.density(positions), self.color(positions))
+    def forward(self, points, features=None):
+        return FieldOutput(self.density(points)[0], self.color(points.positions))
 
     def reset_parameters(self):
         pass

@@ -28,6 +28,13 @@ class Encoder(nn.Module, ABC):
         """Return the features of points, with gradients, where they have been computed without them before."""
         return self(points)
 
+    def tables(self) -> list[nn.Parameter]:
+        """Return those of its own parameters that are tables to look up in, not matrices to multiply with.
+
+        Their gradients are all but zero in most rows, and they do not decay.
+        """
+        return []
+
     @abstractmethod
     def reset_parameters(self) -> None:
         """Draw the parameters anew from torch's generator; nothing to do where there are none."""
@@ -44,9 +51,9 @@ def require_direction_encoder(encoder: Encoder) -> None:
 
 
 def tables_of(model: nn.Module) -> list[nn.Parameter]:
-    """Return the parameters of the encoders within a model, each once: tables, where the others are matrices."""
+    """Return the tables of the encoders within a model, each once."""
     encoders = [module for module in model.modules() if isinstance(module, Encoder)]
-    return list({id(table): table for encoder in encoders for table in encoder.parameters()}.values())
+    return list({id(table): table for encoder in encoders for table in encoder.tables()}.values())
 
 
 def matrices_of(model: nn.Module) -> list[nn.Parameter]:

@@ -67,6 +67,10 @@ class HashGridEncoder(Encoder):
         """Return the features, coarsest level first."""
         return self._interpolate(points, None)
 
+    def tables(self) -> list[nn.Parameter]:
+        """Return the one table, in which all levels lie."""
+        return [self.table]
+
     def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:

@@ -6,19 +6,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.products import Linear, Products
-from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
 
 class Field(nn.Module, ABC):
-    """A radiance field. Positions are in scene units, directions have unit length."""
+    """A radiance field: it answers what is asked of points (`types.points`)."""
 
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
-
-    needs_random: bool = False
-    """True where training draws random numbers for each sample."""
 
     compiles: bool = True
     """False where kernels of our own do most of the work, which torch.compile cannot see into."""
@@ -37,33 +34,22 @@ class Field(nn.Module, ABC):
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
     @abstractmethod
-    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Return the density per unit length, without paying for colour."""
+    def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
+        """Return the density per unit length, without paying for colour.
+
+        Returns:
+            The density; and features that spare `forward` what was computed here, None where it has no use for them.
+        """
 
     @abstractmethod
-    def forward(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-    ) -> FieldOutput:
-        """Return density and colour along rays; `random` is None outside training."""
+    def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
+        """Return density and colour.
 
-    def density_and_features(
-        self, positions: Float[Tensor, "*points 3"]
-    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"] | None]:
-        """Return the density, and whatever `from_features` can use instead of computing it again; None for nothing."""
-        return self.density(positions), None
-
-    def from_features(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-        features: Float[Tensor, "*rays samples features"],
-    ) -> FieldOutput:
-        """Return what `forward` returns, given the features of the same positions; gradients included."""
-        return self(positions, directions, random)
+        Args:
+            points: with directions.
+            features: what `density` returned for the same points, with or without gradients; None: nothing was asked
+                before. What comes out is the same, and its gradients too.
+        """
 
     @abstractmethod
     def reset_parameters(self) -> None:

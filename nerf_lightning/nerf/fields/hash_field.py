@@ -12,8 +12,8 @@ from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
-from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -80,37 +80,22 @@ class HashField(Field):
         """
         require_box(self.aabb)
 
-    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Return the density per unit length, without paying for colour."""
-        return self.density_and_features(positions)[0]
+    def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
+        """Return the density per unit length, and the encoder's features."""
+        encoded = self.position_encoder(self._unit(points.positions))
+        return self._density(self._through(self.density_mlp, encoded), points.positions), encoded
 
-    def density_and_features(
-        self, positions: Float[Tensor, "*points 3"]
-    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
-        """Return the density, and the encoder's features."""
-        encoded = self.position_encoder(self._unit(positions))
-        return self._density(self._through(self.density_mlp, encoded), positions), encoded
-
-    def forward(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-    ) -> FieldOutput:
+    def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
-        return self._output(self.position_encoder(self._unit(positions)), positions, directions)
-
-    def from_features(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-        features: Float[Tensor, "*rays samples features"],
-    ) -> FieldOutput:
-        """Return what `forward` returns, without encoding the positions again."""
-        return self._output(
-            self.position_encoder.attach_gradients(self._unit(positions), features), positions, directions
-        )
+        unit = self._unit(points.positions)
+        encoder = self.position_encoder
+        encoded = encoder(unit) if features is None else encoder.attach_gradients(unit, features)
+        hidden = self._through(self.density_mlp, encoded)
+        direction = self.direction_encoder(points.directions).to(hidden.dtype)
+        direction = direction.expand(*hidden.shape[:-1], direction.shape[-1])
+        raw_rgb = self._through(self.color_mlp, torch.cat([hidden, direction], dim=-1))
+        density = self._density(hidden, points.positions)
+        return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
@@ -118,13 +103,6 @@ class HashField(Field):
         self.direction_encoder.reset_parameters()
         for weight in (*self.density_mlp, *self.color_mlp):
             nn.init.kaiming_uniform_(weight, a=5**0.5)
-
-    def _output(self, encoded: Tensor, positions: Tensor, directions: Tensor) -> FieldOutput:
-        features = self._through(self.density_mlp, encoded)
-        direction = self.direction_encoder(directions).to(features.dtype)
-        direction = direction.expand(*features.shape[:-1], direction.shape[-1])
-        raw_rgb = self._through(self.color_mlp, torch.cat([features, direction], dim=-1))
-        return FieldOutput(density=self._density(features, positions), rgb=torch.sigmoid(raw_rgb.float()))
 
     def _through(self, weights: nn.ParameterList, features: Tensor) -> Tensor:
         out = mlp(features.flatten(0, -2), list(weights), self.products)

@@ -12,8 +12,8 @@ from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.boxes import require_box
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.products import Linear, linear
-from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -87,11 +87,6 @@ class NerfMLP(Field):
         self.color_head = nn.Linear(width // 2, 3)
         self.reset_parameters()
 
-    @property
-    def needs_random(self) -> bool:  # type: ignore[override]
-        """Where noise is added to the density."""
-        return self.density_noise > 0
-
     def fit_to(self, scene: Scene) -> None:
         """Take note of the scene's space and box."""
         self.contracted.fit_to(scene)
@@ -105,28 +100,27 @@ class NerfMLP(Field):
         """
         require_box(self.aabb)
 
-    def density(self, positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+    def density(self, points: Points) -> tuple[Float[Tensor, "*points"], None]:
         """Return the density per unit length, without paying for colour."""
-        return self._activate(_exactly(self.density_head, self._trunk(positions))[..., 0], None)
+        return self._activate(_exactly(self.density_head, self._trunk(points.positions))[..., 0], None), None
 
-    def forward(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-    ) -> FieldOutput:
-        """Return density and colour; density does not depend on the direction."""
-        hidden = self._trunk(positions)
+    def forward(self, points: Points, features: Tensor | None = None) -> FieldOutput:
+        """Return density and colour; density does not depend on the direction. There are no features."""
+        hidden = self._trunk(points.positions)
         raw_density = _exactly(self.density_head, hidden)[..., 0]
-        feature = self.feature(hidden)
+        feature = self.color_feature(hidden, points)
         # Encoded once per ray, not once per sample.
-        direction = self.direction_encoder(directions).to(feature.dtype)
+        direction = self.direction_encoder(points.directions).to(feature.dtype)
         direction = direction.expand(*feature.shape[:-1], direction.shape[-1])
         raw_rgb = _exactly(self.color_head, self.color_hidden(torch.cat([feature, direction], dim=-1)))
         noise = None
-        if random is not None and self.density_noise > 0:
-            noise = self.density_noise * random.normal("density_noise", raw_density.shape[-1])
+        if points.random is not None and self.density_noise > 0:
+            noise = self.density_noise * points.random.normal("density_noise")
         return FieldOutput(density=self._activate(raw_density, noise), rgb=torch.sigmoid(raw_rgb.float()))
+
+    def color_feature(self, hidden: Float[Tensor, "*points width"], points: Points) -> Float[Tensor, "*points width"]:
+        """Return what the colour is made of besides the direction; a field that follows this one may add to it."""
+        return self.feature(hidden)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

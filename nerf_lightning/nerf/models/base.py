@@ -1,65 +1,82 @@
-"""The contract of a level: one round of sampling and rendering."""
+"""The contract of a model: what training, bench, exporters and the viewer ask of it, and no more."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 
-from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.samplers.base import AnySampler
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
-class Level(nn.Module):
-    """The contract of a level: one round of sampling and rendering."""
-
-    sampler: AnySampler
-    field: Field
-    has_color = True
-    """Whether its rendering is a picture."""
-
-    sampler_kind: type[AnySampler] = AnySampler
-    """What it can sample with."""
+class Model(nn.Module, ABC):
+    """Render rays, in one round or in several that build on each other; the last one's picture counts."""
 
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+    needs_whole_batch: bool = False
+    """True where the result for one ray depends on the others; such a model is never cut into tiles."""
 
-    def __init__(self, sampler: AnySampler, field: Field):
+    def __init__(self) -> None:
         super().__init__()
-        if not isinstance(sampler, self.sampler_kind):
-            raise ValueError(
-                f"{type(self).__name__} samples with {self.sampler_kind.__name__} or what follows it, and "
-                f"{type(sampler).__name__} does not: choose another sampler, or a model with another level"
-            )
-        self.sampler = sampler
-        self.field = field
+        self.most_rays: int | None = None
+        """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
+        self.register_load_state_dict_post_hook(_look_at_what_was_loaded)
+
+    @property
+    @abstractmethod
+    def level_names(self) -> tuple[str, ...]:
+        """The names of the rounds, first to last."""
+
+    @property
+    def first_picture(self) -> int | None:
+        """The number of the first round whose rendering is a picture, where that is not the last one."""
+        return None
 
     @abstractmethod
     def forward(
-        self,
-        rays: RayBundle,
-        background: Float[Tensor, "*rays 3"] | None,
-        history: list[Any],
-        random: RayRandom | None,
-    ) -> Rendering:
-        """Render rays; `history` is what the earlier levels saw, `random` is None outside training."""
+        self, rays: RayBundle, background: Float[Tensor, "*rays 3"] | None, random: RayRandom | None
+    ) -> list[Rendering]:
+        """Render rays, one rendering for each round, first to last.
+
+        Args:
+            rays: unit directions, scene units.
+            background: colour behind each ray; None closes the ray.
+            random: the step's numbers for these rays; None for evaluation.
+        """
 
     @abstractmethod
-    def points_per_ray(self, before: float, training: bool) -> float:
-        """Return how many points a ray sends through the field at once, given how many the level before had."""
+    def points_per_ray(self, training: bool) -> float:
+        """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
 
+    @abstractmethod
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as the last round's rays find it."""
+
+    @abstractmethod
+    def at(self, points: Points) -> FieldOutput:
+        """Return density and colour of points by themselves, as the last round's field has them."""
+
+    @abstractmethod
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
-        self.field.fit_to(scene)
-        self.sampler.fit_to(scene)
 
-    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density per unit length, as rendering sees it."""
-        return self.field.density(positions).float()
+    @abstractmethod
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
+
+    @abstractmethod
+    def multiply_in(self, products: Products) -> None:
+        """Set the precision of the products with the fields' weights; everything else is float32 always."""
+
+    def update(self, step: int, key: int) -> None:
+        """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
     def counts(self) -> list[Tensor]:
         """Return the buffers in which a training step counts, to put them back where a step is repeated."""
@@ -69,20 +86,34 @@ class Level(nn.Module):
         """Return the buffers that hold means over rays, which the processes of a run must agree on."""
         return []
 
-    def compile_field(self) -> bool:
-        """Compile the field where its shapes do not depend on the data; tell whether it was."""
-        return False
-
-    def update(self, step: int, key: int) -> None:
-        """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
+    def forget_measurements(self) -> None:
+        """Forget what was counted while rendering."""
 
     def statistics(self) -> dict[str, float]:
         """Return what is worth watching while training."""
         return {}
 
-    def forget_measurements(self) -> None:
-        """Forget what was counted while rendering."""
+    def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the Euclidean norms of gradients, by round."""
+        return {self.level_names[-1]: norm_of_gradients(self)}
 
-    def reset_parameters(self) -> None:
-        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
-        self.field.reset_parameters()
+    def compile_fields(self) -> list[str]:
+        """Compile the fields of rounds with static shapes (torch.compile), and return the rounds' names."""
+        return []
+
+
+def norm_of_gradients(module: nn.Module) -> Float[Tensor, ""]:
+    """Return the Euclidean norm of all gradients of a module."""
+    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])
+
+
+def _look_at_what_was_loaded(model: Model, _: Any) -> None:
+    """Let the parts of a model look at what was loaded into them, where they know what it can be.
+
+    Raises:
+        InputError: a part holds what it never can.
+    """
+    for part in model.modules():
+        look = getattr(part, "require_sound_state", None)
+        if look is not None:
+            look()

@@ -3,10 +3,12 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.models.base import Level
+from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.rendering.points import points_along
 from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.samplers.base import DenseSampler
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
@@ -14,8 +16,8 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 class DenseLevel(Level):
     """A level in which every ray has the same number of samples."""
 
-    sampler: Sampler
-    sampler_kind = Sampler
+    sampler: DenseSampler
+    sampler_kind = DenseSampler
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
@@ -36,15 +38,8 @@ class DenseLevel(Level):
     ) -> DenseRendering:
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
-        along = samples.midpoints[..., None] * rays.directions[..., None, :]
-        output = self.field_output(rays.origins[..., None, :] + along, rays.view_directions[..., None, :], random)
-        return composite(output, samples, rays, background)
+        return composite(self.look(points_along(rays, samples, random)), samples, rays, background)
 
-    def field_output(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-    ) -> FieldOutput:
+    def look(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""
-        return self.field(positions, directions, random)
+        return self.field(points)

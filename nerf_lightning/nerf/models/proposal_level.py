@@ -1,10 +1,7 @@
 """A level that only proposes where to look: density without colour."""
 
-from jaxtyping import Float
-from torch import Tensor
-
 from nerf_lightning.nerf.models.dense_level import DenseLevel
-from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 
@@ -13,12 +10,7 @@ class ProposalLevel(DenseLevel):
 
     has_color = False
 
-    def field_output(
-        self,
-        positions: Float[Tensor, "*rays samples 3"],
-        directions: Float[Tensor, "*rays 1 3"],
-        random: RayRandom | None,
-    ) -> FieldOutput:
+    def look(self, points: Points) -> FieldOutput:
         """Return the density, and black."""
-        density = self.field.density(positions)
+        density, _ = self.field.density(points)
         return FieldOutput(density, density.new_zeros(*density.shape, 3))

@@ -4,18 +4,19 @@ from typing import cast
 
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
 
 from nerf_lightning.nerf.geometry.contraction import Contracted
-from nerf_lightning.nerf.models.base import Level
+from nerf_lightning.nerf.models.base import Model, norm_of_gradients
+from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
-class RadianceModel(nn.Module):
+class RadianceModel(Model):
     """The original NeRF is two levels, coarse (stratified) and fine (importance); the last one is the picture.
 
     Args:
@@ -25,10 +26,7 @@ class RadianceModel(nn.Module):
     def __init__(self, levels: dict[str, Level]):
         super().__init__()
         self.levels = nn.ModuleDict(levels)
-        self.most_rays: int | None = None
-        """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
         self.points_per_ray(training=False)  # levels that do not fit each other are refused here
-        self.register_load_state_dict_post_hook(_look_at_what_was_loaded)
 
     @property
     def level_names(self) -> tuple[str, ...]:
@@ -42,12 +40,12 @@ class RadianceModel(nn.Module):
         return numbers[0] if len(numbers) > 1 else None
 
     @property
-    def needs_whole_batch(self) -> bool:
+    def needs_whole_batch(self) -> bool:  # type: ignore[override]
         """Whether any field forbids tiles."""
         return any(level.field.needs_whole_batch for level in self._in_order())
 
     @property
-    def has_static_shapes(self) -> bool:
+    def has_static_shapes(self) -> bool:  # type: ignore[override]
         """Whether no level's shapes depend on what it finds."""
         return all(level.has_static_shapes for level in self._in_order())
 
@@ -62,6 +60,14 @@ class RadianceModel(nn.Module):
     def last(self) -> Level:
         """The level whose picture counts."""
         return self._in_order()[-1]
+
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as the last level's rays find it."""
+        return self.last.density(positions)
+
+    def at(self, points: Points) -> FieldOutput:
+        """Return density and colour of points by themselves, as the last level's field has them."""
+        return self.last.field(points)
 
     def forward(
         self,
@@ -85,17 +91,6 @@ class RadianceModel(nn.Module):
         """Tell the levels where the scene's content lies, once, before training."""
         for level in self._in_order():
             level.fit_to(scene)
-
-    def require_sound_state(self) -> None:
-        """Look at what was loaded into the parts of the model, where they know what it can be.
-
-        Raises:
-            InputError: a part holds what it never can.
-        """
-        for part in self.modules():
-            look = getattr(part, "require_sound_state", None)
-            if part is not self and look is not None:
-                look()
 
     def counts(self) -> list[Tensor]:
         """Return the buffers of all levels in which a training step counts."""
@@ -128,10 +123,7 @@ class RadianceModel(nn.Module):
 
     def gradient_norms(self) -> dict[str, Float[Tensor, ""]]:
         """Return the Euclidean norm of the gradients of each level."""
-        return {
-            name: get_total_norm([parameter.grad for parameter in level.parameters() if parameter.grad is not None])
-            for name, level in zip(self.levels, self._in_order(), strict=True)
-        }
+        return {name: norm_of_gradients(level) for name, level in zip(self.levels, self._in_order(), strict=True)}
 
     def forget_measurements(self) -> None:
         """Forget what was counted while rendering."""
@@ -145,7 +137,3 @@ class RadianceModel(nn.Module):
 
     def _in_order(self) -> list[Level]:
         return cast(list[Level], list(self.levels.values()))
-
-
-def _look_at_what_was_loaded(model: RadianceModel, _: object) -> None:
-    model.require_sound_state()

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
@@ -35,7 +35,7 @@ class Picture(TensorStruct):
 
 @torch.no_grad()
 def render_picture(
-    model: RadianceModel,
+    model: Model,
     rays_of: RayGenerator,
     view: int,
     background: Background,
@@ -83,7 +83,7 @@ def _flat(picture: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def render_rays(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
     """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
 
     Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
@@ -102,7 +102,7 @@ def render_rays(model: RadianceModel, rays: RayBundle, background: Background, t
     return columns
 
 
-def _render_all(model: RadianceModel, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
+def _render_all(model: Model, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
     at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
@@ -116,7 +116,7 @@ def _render_all(model: RadianceModel, rays: RayBundle, background: Background, t
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
 
 
-def _render_in_tiles(model: RadianceModel, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
+def _render_in_tiles(model: Model, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
     device, count = next(model.parameters()).device, rays.near.numel()
     columns: list[Tensor] = []
     for part in tiles(count, at_once):
@@ -128,7 +128,7 @@ def _render_in_tiles(model: RadianceModel, rays: RayBundle, background: Backgrou
     return columns
 
 
-def _render_tile(model: RadianceModel, rays: RayBundle, background: Background) -> list[Tensor]:
+def _render_tile(model: Model, rays: RayBundle, background: Background) -> list[Tensor]:
     behind = background_colors(background, rays.near.numel(), rays.near.device, random=None)
     levels = model(rays, behind, random=None)
     last, first = levels[-1], model.first_picture

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import torch
 
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -27,7 +27,7 @@ def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
         start = stop
 
 
-def tile_rays_for(model: RadianceModel, tile_points: int, training: bool = False) -> int:
+def tile_rays_for(model: Model, tile_points: int, training: bool = False) -> int:
     """Return how many rays make a tile of about `tile_points` points, at least one."""
     return max(1, int(tile_points / model.points_per_ray(training)))
 
@@ -38,7 +38,7 @@ def is_out_of_memory(error: RuntimeError) -> bool:
 
 
 def weighted_renderings(
-    model: RadianceModel, rays: RayBundle, background: Background, key: int, tile_points: int
+    model: Model, rays: RayBundle, background: Background, key: int, tile_points: int
 ) -> Iterator[tuple[RayBundle, list[DenseRendering | PackedRendering]]]:
     """Render rays as a training step does, without its gradients: tile by tile, each with what every level saw.
 

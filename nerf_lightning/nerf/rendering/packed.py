@@ -35,12 +35,6 @@ def composite_packed(
     )
 
 
-def positions_of(rays: RayBundle, samples: PackedSamples) -> Float[Tensor, "capacity 3"]:
-    """Return the samples' midpoints in space."""
-    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
-    return rays.origins[samples.ray_index] + along
-
-
 def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
     """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
     kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]

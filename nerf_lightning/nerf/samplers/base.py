@@ -1,17 +1,23 @@
-"""The contract of a sampler: where along each ray to ask the field."""
+"""The contracts of samplers: where along each ray a field is asked, as often on each ray, or only where it matters."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
-from torch import nn
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
 
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import Scene
 
+DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
+"""A field's density (per unit length) at positions."""
 
-class AnySampler(nn.Module):
-    """What chooses where along rays to ask the field, in whatever layout."""
+
+class Sampler(nn.Module):
+    """What chooses where along rays a field is asked, in whatever layout."""
 
     max_intervals: int = 1 << 17
     """So many steps at most are taken along a ray: near and far may come out of a file."""
@@ -19,8 +25,28 @@ class AnySampler(nn.Module):
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
+    def reset(self) -> None:
+        """Forget what was learnt of the scene while training."""
 
-class Sampler(AnySampler, ABC):
+    def update(self, density: DensityFn, step: int, key: int) -> None:
+        """Learn from the field between steps of training.
+
+        Args:
+            density: the field's.
+            step: steps that this attempt has taken.
+            key: of the next step's random numbers.
+        """
+
+    def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density where rays look for it; 0 where they pass over, whatever the field says."""
+        return density(positions)
+
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training."""
+        return {}
+
+
+class DenseSampler(Sampler, ABC):
     """Choose intervals along rays, as many on each."""
 
     @abstractmethod
@@ -36,3 +62,46 @@ class Sampler(AnySampler, ABC):
     @abstractmethod
     def num_samples_after(self, before: int) -> int:
         """Return how many intervals come out, given how many the level before had (0 for none)."""
+
+
+class Walk(ABC):
+    """Rays on their way through the scene while a picture is rendered, a few samples at a time."""
+
+    @abstractmethod
+    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+        """Return the next samples of some of the rays, about `limit` each at most, and which rays have more of them."""
+
+
+class PackedSampler(Sampler, ABC):
+    """Choose intervals along rays, only where there may be something: their number differs from ray to ray."""
+
+    opaque_below: float = 1e-3
+    """A ray's samples end where less light than this is left; 0 keeps them all."""
+    update_every: int = 16
+    """Training steps between two updates; meanwhile a level counts how many samples rays have."""
+
+    @property
+    @abstractmethod
+    def samples_at_first(self) -> int:
+        """How many samples a ray is taken to have until they have been counted."""
+
+    @abstractmethod
+    def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
+        """Return the intervals that may hold something; `random` is None outside of training."""
+
+    def capacity_on(self, device: torch.device) -> int | None:
+        """Return the size of the arrays of samples where no size may be read on the host; None elsewhere."""
+        return None
+
+    def walk(self, rays: RayBundle) -> Walk:
+        """Begin to render rays; who does not say otherwise takes all samples at once."""
+        return _AllAtOnce(self, rays)
+
+
+class _AllAtOnce(Walk):
+    def __init__(self, sampler: PackedSampler, rays: RayBundle):
+        self.sampler, self.rays = sampler, rays
+
+    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+        """Return all samples of these rays."""
+        return self.sampler(self.rays[alive], None), torch.zeros_like(alive, dtype=torch.bool)

@@ -7,12 +7,12 @@ import torch
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
-from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
-class ImportanceSampler(Sampler):
+class ImportanceSampler(DenseSampler):
     """Add fenceposts drawn from the weights of the level before, and keep its own: the sorted union.
 
     The histogram is that of the interior intervals (the first and last are left out, as in the paper's code, so that

@@ -2,25 +2,22 @@
 
 import logging
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.carving.carve import possible_cells
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, March
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
-from nerf_lightning.nerf.kernels.packed.integrate import num_visible
 from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.rendering.packed import first_of_each_ray, positions_of
-from nerf_lightning.nerf.samplers.base import AnySampler
+from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, Walk
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.scene import Scene
@@ -44,13 +41,9 @@ RANGES = {
     "opaque_below": (0.0, 1.0),
     "capacity": (1, 1 << 31),
 }
-DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
-DensityAndFeatures = Callable[
-    [Float[Tensor, "points 3"]], tuple[Float[Tensor, "points"], Float[Tensor, "points f"] | None]
-]
 
 
-class OccupancySampler(OccupancyGrid, AnySampler):
+class OccupancySampler(PackedSampler):
     """Keep a moving average of the density in each cell, and sample only where it is high enough.
 
     Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
@@ -98,6 +91,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         self.update_every, self.warmup_steps, self.prune_after = update_every, warmup_steps, prune_after
         self.decay, self.min_alpha, self.opaque_below, self.capacity = decay, min_alpha, opaque_below, capacity
         self.contracted = Contracted()
+        self.grid = OccupancyGrid()
         self._fit_to_space()
         # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
         self._lattice: Tensor | None = None
@@ -111,16 +105,16 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         """
         self.contracted.fit_to(scene)
         self._fit_to_space()
-        self.aabb.copy_(scene.aabb)
-        self.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
+        self.grid.aabb.copy_(scene.aabb)
+        self.grid.range.copy_(torch.stack([scene.near.min(), scene.far.max()]))
         self._lattice = self._numbers = None
-        for cascade in range(self.num_cascades):
-            centers, half_diagonal = self.cell_centers(cascade)
+        for cascade in range(self.grid.num_cascades):
+            centers, half_diagonal = self.grid.cell_centers(cascade)
             # In normalised device coordinates cells are not where the cameras see them, but all of them are seen.
             if scene.space != "ndc":
                 possible = possible_cells(scene, centers, half_diagonal)
-                self.possible[cascade] = possible.view(self.possible.shape[1:])
-        if not bool(self.possible.any()):
+                self.grid.possible[cascade] = possible.view(self.grid.possible.shape[1:])
+        if not bool(self.grid.possible.any()):
             lower, upper = ([round(float(x), 3) for x in corner] for corner in scene.aabb)
             raise InputError(
                 f"The box of the scene {scene.name}, from {lower} to {upper}, holds nothing that the training views "
@@ -150,24 +144,27 @@ class OccupancySampler(OccupancyGrid, AnySampler):
                 scene.name,
             )
 
-    def forward(
-        self, rays: RayBundle, density_and_features: DensityAndFeatures, random: RayRandom | None
-    ) -> tuple[PackedSamples, Float[Tensor, "capacity f"] | None]:
-        """Return the occupied intervals of each ray up to where it is opaque, and their features.
+    @property
+    def samples_at_first(self) -> int:
+        """As if every interval across the box held something."""
+        return self.num_steps
 
-        Args:
-            rays: unit directions.
-            density_and_features: the field's, asked without gradients.
-            random: the step's numbers for these rays; None asks for the deterministic lattice of evaluation.
-        """
-        capacity = self.capacity_on(rays.near.device)
-        samples, _ = march(rays, self.start(rays, random), self.lattice, self.grid, capacity=capacity)
-        if capacity is not None or self.opaque_below == 0:
-            return samples, None
-        with torch.no_grad():
-            density, features = density_and_features(positions_of(rays, samples))
-            kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.opaque_below))
-            return samples.at(*kept), None if features is None else features[kept[0]]
+    def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
+        """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
+        capacity, grid = self.capacity_on(rays.near.device), self.grid.occupied()
+        return march(rays, self.start(rays, random), self.lattice, grid, capacity=capacity)[0]
+
+    def walk(self, rays: RayBundle) -> Walk:
+        """Begin to render rays: each march goes on where it stopped."""
+        return _Marches(self, rays)
+
+    def reset(self) -> None:
+        """Take every cell that may hold something for occupied."""
+        self.grid.reset()
+
+    def statistics(self) -> dict[str, float]:
+        """Return the share of cells that are occupied."""
+        return {"train/occupied": float(self.grid.cells.cpu().float().mean())}
 
     def capacity_on(self, device: torch.device) -> int | None:
         """Return the size of the arrays of samples; None where sizes may be read on the host."""
@@ -175,35 +172,30 @@ class OccupancySampler(OccupancyGrid, AnySampler):
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""
-        center, half = center_and_half(self.aabb)
-        half = half * 2.0 ** (self.num_cascades - 1)
+        center, half = center_and_half(self.grid.aabb)
+        half = half * 2.0 ** (self.grid.num_cascades - 1)
         enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
         return March(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 
-    @property
-    def grid(self) -> OccupancyCells:
-        """What is occupied now."""
-        return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
-
-    def density_in_cells(self, density_fn: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+    def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
-        kept = (floor_of_cells(positions, self.grid) >= 0).nonzero()[:, 0]
-        density = torch.zeros_like(positions[:, 0])
+        kept = (floor_of_cells(positions, self.grid.occupied()) >= 0).nonzero()[:, 0]
+        reached = torch.zeros_like(positions[:, 0])
         if kept.numel():
-            density[kept] = density_fn(positions[kept]).float()
-        return density
+            reached[kept] = density(positions[kept]).float()
+        return reached
 
     @property
     def step_size(self) -> float:
         """The shortest interval, in scene units."""
-        return float((self.aabb[1] - self.aabb[0]).norm()) / self.num_steps
+        return float((self.grid.aabb[1] - self.grid.aabb[0]).norm()) / self.num_steps
 
     @property
     def lattice(self) -> Float[Tensor, "edges"]:
         """The distances that intervals begin at, from the scene's near to beyond its far."""
         if self._lattice is None:
-            near, far = self.range.tolist()
+            near, far = self.grid.range.tolist()
             edges, step = [near], self.step_size
             self._require_few((far - near) / step if not self.cone_angle else 0.0)
             while edges[-1] <= far:
@@ -212,7 +204,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
                     self._require_few(max((far - near) / step, len(edges)))
             edges.append(2 * edges[-1] - edges[-2])
             self._lattice = torch.tensor(edges)
-        self._lattice = self._lattice.to(self.aabb.device)
+        self._lattice = self._lattice.to(self.grid.aabb.device)
         return self._lattice
 
     def lattice_over(self, rays: RayBundle) -> Float[Tensor, "edges"]:
@@ -224,7 +216,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         # Contracted scenes, whose intervals grow with the distance, have one near and far for all cameras.
         if rays.near.device.type not in HOSTS or self.cone_angle or not rays.near.numel():
             return self.lattice
-        near, far = self.range.tolist()
+        near, far = self.grid.range.tolist()
         nearest, farthest = float(rays.near.min()), float(rays.far.max())
         if near <= nearest and farthest <= far:
             return self.lattice
@@ -244,29 +236,30 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             )
 
     @torch.no_grad()
-    def update(self, density_fn: DensityFn, step: int, key: int) -> None:
+    def update(self, density: DensityFn, step: int, key: int) -> None:
         """Ask the field about the cells, where it is time; without reading anything on the host.
 
         Args:
-            density_fn: the field's.
+            density: the field's.
             step: steps that this attempt has taken.
             key: of this step's random numbers.
         """
         if step % self.update_every or step == 0:
             return
+        grid = self.grid
         if self._numbers is None:
-            self._numbers = self.possible.flatten().cpu().nonzero()[:, 0]
-        number = self._numbers = self._numbers.to(self.possible.device)
+            self._numbers = grid.possible.flatten().cpu().nonzero()[:, 0]
+        number = self._numbers = self._numbers.to(grid.possible.device)
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
-            self.learn(cells, density_fn(self.positions(cells, part)).float(), self.decay)
+            grid.learn(cells, density(grid.positions(cells, part)).float(), self.decay)
         if step >= self.prune_after:
-            mean = self.density.sum() / self.possible.sum()
-            shortest = (self.aabb[1] - self.aabb[0]).norm().double() / self.num_steps
+            mean = grid.density.sum() / grid.possible.sum()
+            shortest = (grid.aabb[1] - grid.aabb[0]).norm().double() / self.num_steps
             threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
-            self.occupy((self.density > threshold) & self.possible)
+            grid.occupy((grid.density > threshold) & grid.possible)
 
     def _fit_to_space(self) -> None:
         """Make the grid as large as the space wants it; what it held is forgotten."""
@@ -276,7 +269,7 @@ class OccupancySampler(OccupancyGrid, AnySampler):
             cascades = CASCADES_ENDLESS if cascades is None else cascades
             cone_angle = CONE_ENDLESS if cone_angle is None else cone_angle
         self.cone_angle = cone_angle or 0.0
-        self.allocate(resolution, cascades or 1)
+        self.grid.allocate(resolution, cascades or 1)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         # The grid must be as large as the one that is read. A missing switch is complained of below.
@@ -285,3 +278,17 @@ class OccupancySampler(OccupancyGrid, AnySampler):
         self._fit_to_space()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._lattice = self._numbers = None
+
+
+class _Marches(Walk):
+    """Marches of rays through a grid, each with its place."""
+
+    def __init__(self, sampler: OccupancySampler, rays: RayBundle):
+        self.rays, self.state = rays, sampler.start(rays, None)
+        self.lattice, self.cells = sampler.lattice_over(rays), sampler.grid.occupied()
+
+    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+        """March on from where each ray stands."""
+        samples, following = march(self.rays[alive], self.state[alive], self.lattice, self.cells, limit)
+        self.state.next[alive] = following
+        return samples, following < self.lattice.numel() - 2

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, blocks_of
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of
 
 # The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
 # counts as thin, and only solid matter ends a march.
@@ -14,10 +14,7 @@ RISE = 0.3
 
 
 class OccupancyGrid(nn.Module):
-    """Cells in nested boxes, each box twice as large as the one before; cells are numbered box by box, z fastest.
-
-    A sampler is a grid and does not have one, so that checkpoints have the same names as they always had.
-    """
+    """Cells in nested boxes, each box twice as large as the one before; cells are numbered box by box, z fastest."""
 
     aabb: Tensor
     """Lower and upper corner of the first box."""
@@ -62,6 +59,10 @@ class OccupancyGrid(nn.Module):
         sound = 0.0 <= near < far and float(self.cells.max()) <= 1 and bool((self.density >= 0).all())
         if not sound or not torch.equal(self.blocks, blocks_of(self.cells)):
             raise InputError(f"The occupancy grid in the model's state cannot be one. {ANOTHER}")
+
+    def occupied(self) -> OccupancyCells:
+        """Return what a march looks at: which cells are occupied now."""
+        return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
 
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""

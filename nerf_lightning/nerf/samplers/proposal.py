@@ -5,12 +5,12 @@ import torch
 from nerf_lightning.nerf.geometry.contraction import from_normalized_distance, normalized_distance
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.histograms import sample_histogram
-from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
 
-class ProposalSampler(Sampler):
+class ProposalSampler(DenseSampler):
     """Draw the fenceposts of this level from the histogram of the level before, and keep none of that level's own.
 
     The positions carry no gradient: the level before learns from the interlevel loss alone.

@@ -4,13 +4,13 @@ import torch
 
 from nerf_lightning.nerf.geometry.contraction import Contracted, from_normalized_distance, normalized_distance
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
-class StratifiedSampler(Sampler):
+class StratifiedSampler(DenseSampler):
     """Cut each ray into equal intervals, and jitter every inner fencepost of every ray within half an interval.
 
     Each fencepost is uniform in a stratum of its own, so the midpoints at which the field is asked cover the whole

@@ -5,15 +5,14 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.visualization.camera_layout import layout_picture
 
 
 class CameraLayout(Callback):
-    """Draw the cameras once, after the first step: nobody waits for it."""
+    """Draw the cameras once, after the first step, so that the drawing does not delay the start."""
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Draw, if this was the first step of the run."""
         if trainer.global_step == 1:
             for writer in tensorboard_writers(trainer.loggers):

@@ -6,12 +6,12 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.config.key_meanings import meaning_of, names_a_class
 from nerf_lightning.config.overrides import flatten
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 
 CHOICES = ("encoder", "experiment", "field", "model", "scene")
-COMPARED = ("seed", "optimizer", "scheduler", "data", "field", "encoder", "model", "trainer", "scene")
 FINAL_METRICS = ("test/psnr", "test/ssim")
 
 
@@ -31,11 +31,14 @@ def hyper_parameters(config: DictConfig) -> dict[str, Any]:
     """Return the settings by which runs differ, flat, as TensorBoard takes them."""
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     assert isinstance(resolved, DictConfig)
-    leaves = {key: value for key, value in flatten(resolved).items() if key.startswith(COMPARED)}
+    compared = {key: value for key, value in flatten(resolved).items() if _is_compared(key)}
     # TensorBoard sorts by name and shows the first few: what was chosen comes first.
     chosen = {f"choice.{group}": HydraConfig.get().runtime.choices.get(group) for group in CHOICES}
     return {name: str(choice) for name, choice in chosen.items()} | {
-        key: value if isinstance(value, (bool, int, float, str)) else str(value)
-        for key, value in leaves.items()
-        if not key.rpartition(".")[2].startswith("_")
+        key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in compared.items()
     }
+
+
+def _is_compared(key: str) -> bool:
+    meaning = meaning_of(key)
+    return (meaning.identity or meaning.learnt) and not names_a_class(key)

@@ -14,7 +14,9 @@ GIGABYTE = 1e9
 
 
 class Monitor(Watcher):
-    """Log every few steps, straight to the loggers: `LightningModule.log` would cost more than a small step.
+    """Log losses, PSNR (dB), speed, memory (gigabytes) and gradients every few steps.
+
+    They go straight to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
         every_steps: steps between two rows.

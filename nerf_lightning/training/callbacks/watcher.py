@@ -59,7 +59,7 @@ def tensorboard_writers(loggers: Sequence[Logger]) -> list[SummaryWriter]:
 def errors_told_once() -> Iterator[None]:
     """Let TensorBoard's threads print nothing when they cannot write, as where the disk is full.
 
-    They keep the error, and whoever writes next, or flushes, raises it.
+    They keep the error, and raise it at the next write or flush.
     """
     former = threading.excepthook
 

@@ -13,7 +13,7 @@ from torch import distributed
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.format import MOST_THREADS
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.ranks import processes_here
 from nerf_lightning.training.launch import xla
@@ -171,7 +171,7 @@ class TrainerSettings:
         """Most points at once when rendering without gradients."""
         return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
 
-    def prepare(self, model: RadianceModel) -> RadianceModel:
+    def prepare(self, model: Model) -> Model:
         """Put a model on the device, let its fields multiply in this precision, and return it."""
         model.multiply_in(PRODUCTS[self.precision])
         return model.to(self.device)

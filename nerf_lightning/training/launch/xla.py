@@ -14,7 +14,7 @@ from lightning.pytorch.strategies import SingleDeviceXLAStrategy
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
 ACCELERATOR: type[XLAAccelerator] = XLAAccelerator
@@ -55,7 +55,7 @@ def refuse(compiles: bool, launched_by: str) -> None:
         )
 
 
-def require_static_shapes(model: RadianceModel) -> None:
+def require_static_shapes(model: Model) -> None:
     """Refuse models that XLA would compile anew at each step.
 
     Raises:

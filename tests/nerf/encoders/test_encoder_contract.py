@@ -6,6 +6,7 @@ from support.configs import composed, options
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.encoders.base import Encoder
+from nerf_lightning.nerf.types.points import Points
 
 CONSTANT = "spherical_harmonics_1"
 """Says nothing of what it is given, on purpose."""
@@ -64,7 +65,8 @@ def test_a_model_learns_with_it(encoder):
         field = HashField(encoder, FrequencyEncoder(2), width=8)
     else:
         field = NerfMLP(encoder, encoder, depth=2, width=8, skip=None, density_activation="softplus")
-    output = field(torch.rand(5, 4, 3), torch.nn.functional.normalize(torch.rand(5, 1, 3), dim=-1), None)
+    directions = torch.nn.functional.normalize(torch.rand(5, 1, 3), dim=-1)
+    output = field(Points(torch.rand(5, 4, 3), directions))
     (output.rgb.sum() + output.density.sum()).backward()
     grads = [parameter.grad for parameter in field.parameters()]
     assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads)

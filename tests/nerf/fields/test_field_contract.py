@@ -6,6 +6,7 @@ from support.configs import composed, options
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.types.points import Points
 
 
 @pytest.fixture(params=options("field"))
@@ -20,7 +21,7 @@ def points_and_directions(rays=5, samples=4):
 
 def test_density_and_colour_are_in_range(field):
     assert isinstance(field, Field)
-    output = field(*points_and_directions(), None)
+    output = field(Points(*points_and_directions()))
     assert output.density.shape == (5, 4)
     assert output.rgb.shape == (5, 4, 3)
     assert bool((output.density >= 0).all())
@@ -29,12 +30,12 @@ def test_density_and_colour_are_in_range(field):
 
 def test_density_alone_is_the_density_of_the_whole(field):
     positions, directions = points_and_directions()
-    torch.testing.assert_close(field.density(positions), field(positions, directions, None).density)
+    torch.testing.assert_close(field.density(Points(positions))[0], field(Points(positions, directions)).density)
 
 
 def test_density_does_not_depend_on_the_direction_but_colour_does_where_it_is_given(field):
     positions, directions = points_and_directions()
-    there, back = field(positions, directions, None), field(positions, -directions, None)
+    there, back = field(Points(positions, directions)), field(Points(positions, -directions))
     assert torch.equal(there.density, back.density)
     # A constant is all that a single harmonic says of a direction.
     assert torch.equal(there.rgb, back.rgb) == (field.direction_encoder.out_dim == 1)

@@ -8,6 +8,7 @@ from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField, _TruncatedExponential
+from nerf_lightning.nerf.types.points import Points
 
 
 def a_field(**settings):
@@ -20,18 +21,18 @@ def a_field(**settings):
 def test_a_box_is_only_a_change_of_units():
     """The field of a scene that is moved and scaled is the same field, moved and scaled."""
     field, points = a_field(density_bias=-1.0), 2 * torch.rand(40, 3) - 1
-    before = field.density(points)
+    before = field.density(Points(points))[0]
     shift, scale = torch.tensor([3.0, -1.0, 7.0]), torch.tensor([2.0, 0.5, 4.0])
     field.fit_to(replace(ball_scene(), aabb=torch.stack([shift - scale, shift + scale])))
-    torch.testing.assert_close(field.density(points * scale + shift), before, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(field.density(Points(points * scale + shift))[0], before, rtol=1e-3, atol=1e-4)
 
 
 def test_outside_of_the_box_there_is_nothing_unless_space_is_contracted():
     points = torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])
-    assert bool((a_field().density(points) == 0).all())
+    assert bool((a_field().density(Points(points))[0] == 0).all())
     far = a_field(contraction=True)
-    assert bool((far.density(points) > 0).all())
-    assert far.density(points[:1]) != far.density(2 * points[:1])
+    assert bool((far.density(Points(points))[0] > 0).all())
+    assert far.density(Points(points[:1]))[0] != far.density(Points(2 * points[:1]))[0]
 
 
 def test_the_exponential_and_its_gradient_stay_finite():
@@ -48,12 +49,12 @@ def test_the_exponential_and_its_gradient_stay_finite():
 def test_features_that_are_known_give_the_same_result(encoder):
     field = HashField(encoder, SphericalHarmonicsEncoder(2), width=8)
     positions = 2 * torch.rand(30, 3) - 1
-    directions = torch.nn.functional.normalize(torch.randn(30, 1, 3), dim=-1)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
     with torch.no_grad():
-        density, features = field.density_and_features(positions)
-    whole = field(positions[:, None], directions, None)
-    again = field.from_features(positions[:, None], directions, None, features[:, None])
-    torch.testing.assert_close(density, whole.density[:, 0])
+        density, features = field.density(Points(positions))
+    points = Points(positions, directions)
+    whole, again = field(points), field(points, features)
+    torch.testing.assert_close(density, whole.density)
     torch.testing.assert_close(again.rgb, whole.rgb)
     torch.testing.assert_close(again.density, whole.density)
 
@@ -69,7 +70,7 @@ def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothi
         field = a_field()
         torch.nn.init.zeros_(field.position_encoder.table)
         field.fit_to(given)
-        densities.append(float(field.density(torch.zeros(1, 3)).detach()))
+        densities.append(float(field.density(Points(torch.zeros(1, 3)))[0].detach()))
     assert densities[0] == pytest.approx(2.718281828**3, rel=1e-4)
     assert densities[1] == pytest.approx(2.718281828**-1, rel=1e-4)
 
@@ -78,10 +79,10 @@ def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothi
 def test_the_scene_says_whether_there_is_something_outside_of_its_box(space, everywhere):
     field = a_field()
     field.fit_to(replace(ball_scene(), space=space))
-    assert bool((field.density(torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])) > 0).all()) is everywhere
+    assert bool((field.density(Points(torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])))[0] > 0).all()) is everywhere
     stubborn = a_field(contraction=False)
     stubborn.fit_to(replace(ball_scene(), space=space))
-    assert bool((stubborn.density(torch.tensor([[1.2, 0.0, 0.0]])) == 0).all())
+    assert bool((stubborn.density(Points(torch.tensor([[1.2, 0.0, 0.0]])))[0] == 0).all())
 
 
 def test_the_space_travels_in_the_state_dict():
@@ -89,4 +90,4 @@ def test_the_space_travels_in_the_state_dict():
     field.fit_to(replace(ball_scene(), space="contracted"))
     other.load_state_dict(field.state_dict())
     points = 5 * torch.rand(20, 3)
-    assert torch.equal(other.density(points), field.density(points))
+    assert torch.equal(other.density(Points(points))[0], field.density(Points(points))[0])

@@ -8,6 +8,7 @@ from torch import nn
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.types.points import Points
 
 
 def paper_field(**changes):
@@ -37,7 +38,7 @@ def test_a_slow_walk_through_the_figure_gives_the_same():
     density = torch.relu(field.density_head(hidden)[..., 0])
     colour = torch.relu(field.color_hidden[0](torch.cat([field.feature(hidden), d], dim=-1)))
     colour = torch.sigmoid(field.color_head(colour))
-    output = field(positions, directions, None)
+    output = field(Points(positions, directions))
     torch.testing.assert_close(output.density.double(), density, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(output.rgb.double(), colour, rtol=1e-5, atol=1e-6)
 
@@ -48,7 +49,7 @@ def test_batch_norm_is_kerass():
     assert len(norms) == 9
     assert all(norm.momentum == 0.01 and norm.eps == 1e-3 for norm in norms)
     assert field.needs_whole_batch
-    output = field(torch.rand(4, 6, 3), nn.functional.normalize(torch.rand(4, 1, 3), dim=-1), None)
+    output = field(Points(torch.rand(4, 6, 3), nn.functional.normalize(torch.rand(4, 1, 3), dim=-1)))
     assert output.density.shape == (4, 6)
 
 
@@ -62,17 +63,18 @@ def test_xavier_start_has_zero_biases_and_glorots_bound():
 
 def test_softplus_and_bias_start_from_thin_air():
     thin = paper_field(density_activation="softplus", density_bias=-5.0)
-    density = thin.density(torch.rand(100, 3)).detach()
+    density = thin.density(Points(torch.rand(100, 3)))[0].detach()
     assert 0 < float(density.min()) <= float(density.max()) < 0.2
 
 
 def test_density_noise_is_there_in_training_only_and_is_keyed():
     field = paper_field(density_noise=1.0, density_bias=3.0)
     positions, directions = torch.rand(6, 5, 3), nn.functional.normalize(torch.rand(6, 1, 3), dim=-1)
-    quiet = field(positions, directions, None).density
-    noisy = field(positions, directions, batch_random(1, 6)).density
+    quiet = field(Points(positions, directions)).density
+    points = Points(positions, directions, random=batch_random(1, 6).along(5))
+    noisy = field(points).density
     assert not torch.allclose(quiet, noisy)
-    assert torch.equal(noisy, field(positions, directions, batch_random(1, 6)).density)
+    assert torch.equal(noisy, field(points).density)
 
 
 @pytest.mark.parametrize("skip", [0, 8, 20])
@@ -88,15 +90,15 @@ def test_contracted_space_brings_far_points_within_reach_of_the_encoding():
     plain.load_state_dict(field.state_dict())
     field.fit_to(scene)
     inside, outside = 0.5 * torch.rand(20, 3), torch.tensor([[4.0, 0.0, 0.0], [0.0, 0.0, -10.0]])
-    torch.testing.assert_close(field.density(inside), plain.density(inside))
+    torch.testing.assert_close(field.density(Points(inside))[0], plain.density(Points(inside))[0])
     contracted = torch.tensor([[1.75, 0.0, 0.0], [0.0, 0.0, -1.9]])
-    torch.testing.assert_close(field.density(outside), plain.density(contracted))
+    torch.testing.assert_close(field.density(Points(outside))[0], plain.density(Points(contracted))[0])
 
 
 @pytest.mark.parametrize("space", ["bounded", "ndc"])
 def test_elsewhere_positions_enter_as_they_are(space):
     torch.manual_seed(0)
     field, points = tiny_field(density_activation="softplus"), 5 * torch.rand(20, 3)
-    before = field.density(points)
+    before = field.density(Points(points))[0]
     field.fit_to(replace(ball_scene(), space=space, aabb=torch.tensor([[-9.0] * 3, [3.0] * 3])))
-    assert torch.equal(field.density(points), before)
+    assert torch.equal(field.density(Points(points))[0], before)

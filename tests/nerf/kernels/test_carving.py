@@ -16,8 +16,8 @@ from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 def cells(scene, resolution=24):
     sampler = OccupancySampler(resolution=resolution)
-    sampler.aabb.copy_(scene.aabb)
-    return sampler.cell_centers(0)
+    sampler.grid.aabb.copy_(scene.aabb)
+    return sampler.grid.cell_centers(0)
 
 
 def test_what_the_alpha_shows_empty_is_carved_and_what_is_there_is_kept():

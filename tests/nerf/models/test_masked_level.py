@@ -18,7 +18,7 @@ def both(**sampler):
     torch.nn.init.normal_(packed.levels["fine"].field.position_encoder.table, std=1.0)
     for step in (4, 8, 12):
         packed.update(step, step)
-    grid = packed.levels["fine"].sampler
+    grid = packed.levels["fine"].sampler.grid
     grid.occupy(grid.density > grid.density.quantile(0.7))
     state = packed.state_dict()
     masked.fit_to(scene)

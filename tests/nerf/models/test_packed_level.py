@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field
 from support.steps import rays_of
 
@@ -11,6 +12,7 @@ from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.rendering.points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
@@ -21,7 +23,7 @@ def a_level(**settings):
     sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
     level = PackedLevel(sampler, field)
     level.fit_to(ball_scene(num_views=12))
-    level.sampler.occupy(torch.ones_like(level.sampler.possible))
+    level.sampler.grid.occupy(torch.ones_like(level.sampler.grid.possible))
     return level
 
 
@@ -68,6 +70,18 @@ def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
     assert float(here.opacity.max()) > 0.5
     torch.testing.assert_close(there.opacity, here.opacity, atol=0.03, rtol=0)
     torch.testing.assert_close(there.depth - moved, here.depth, atol=0.05, rtol=0)
+
+
+def test_samples_end_where_the_ray_is_opaque():
+    level, rays = a_level(opaque_below=1e-3), some_rays(300)
+    level.field = SolidField(ball(0.5), inside=80.0)
+    samples, features = level.visible_samples(rays, batch_random(1, 300))
+    assert features is None
+    assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
+    density, _ = level.field.density(packed_points(rays, samples, None))
+    optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
+    longest = 80.0 * level.sampler.step_size
+    assert 1.0 < float(optical.max()) <= -torch.tensor(1e-3).log() + longest + 1e-3
 
 
 def test_tiles_change_nothing_but_rounding():

@@ -25,11 +25,11 @@ class Wall(Field):
         self.place_of, self.behind = place, behind
         self.anchor = torch.nn.Parameter(torch.zeros(1))
 
-    def density(self, positions):
-        return 1e5 * (self.behind * (positions[..., 2] - self.place_of) > 0).float()
+    def density(self, points):
+        return 1e5 * (self.behind * (points.positions[..., 2] - self.place_of) > 0).float(), None
 
-    def forward(self, positions, directions, random):
-        return FieldOutput(self.density(positions), torch.full_like(positions, 0.5))
+    def forward(self, points, features=None):
+        return FieldOutput(self.density(points)[0], torch.full_like(points.positions, 0.5))
 
     def reset_parameters(self):
         pass
@@ -84,12 +84,12 @@ def test_elsewhere_depth_is_the_distance_along_the_ray():
 class Ball(Wall):
     """Opaque inside a ball of this radius around (0, 0, -4); its colour is where it is looked at from."""
 
-    def density(self, positions):
-        away = positions - torch.tensor([0.0, 0.0, -4.0])
-        return 1e5 * (away.norm(dim=-1) < self.place_of).float()
+    def density(self, points):
+        away = points.positions - torch.tensor([0.0, 0.0, -4.0])
+        return 1e5 * (away.norm(dim=-1) < self.place_of).float(), None
 
-    def forward(self, positions, directions, random):
-        return FieldOutput(self.density(positions), (0.5 + 0.5 * directions).expand_as(positions))
+    def forward(self, points, features=None):
+        return FieldOutput(self.density(points)[0], (0.5 + 0.5 * points.directions).expand_as(points.positions))
 
 
 def looking_along(pose):
@@ -116,7 +116,9 @@ def test_outside_of_the_box_nothing_is_shown():
 def test_rays_that_miss_the_box_are_not_rendered(monkeypatch):
     model = RadianceModel({"only": DenseLevel(StratifiedSampler(10), Ball(1.0))})
     asked = []
-    monkeypatch.setattr(Ball, "density", lambda self, positions: asked.append(positions) or positions[..., 0])
+    monkeypatch.setattr(
+        Ball, "density", lambda self, points: (asked.append(points.positions) or points.positions[..., 0], None)
+    )
     ball_picture(model, Clip(box=CropBox.from_user((-2.0, -2.0, -4.5), (0.0, 2.0, -3.5), torch.eye(4))))
     assert 0 < sum(part.shape[0] for part in asked) < 60  # of 81
     assert float(torch.cat(asked)[..., 0].max()) <= 0.0

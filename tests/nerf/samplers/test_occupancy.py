@@ -7,7 +7,7 @@ from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.randomness import batch_random, fold
-from nerf_lightning.nerf.rendering.packed import positions_of
+from nerf_lightning.nerf.rendering.points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 
@@ -28,10 +28,6 @@ def ball_density(radius=0.5, density=80.0):
     return lambda positions: density * (positions.norm(dim=-1) < radius).float()
 
 
-def screened(density_fn):
-    return lambda positions: (density_fn(positions), None)
-
-
 def learn(sampler, density_fn, steps=320):
     for step in range(16, steps + 1, 16):
         sampler.update(density_fn, step, fold(0, 0, step))
@@ -40,13 +36,13 @@ def learn(sampler, density_fn, steps=320):
 
 def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
     sampler = learn(a_sampler(), ball_density())
-    centers, _ = sampler.cell_centers(0)
-    occupied = sampler.cells.flatten().bool()
+    centers, _ = sampler.grid.cell_centers(0)
+    occupied = sampler.grid.cells.flatten().bool()
     cell = 2.0 / 16
     assert bool(occupied[centers.norm(dim=-1) < 0.5 - cell].all())
     assert not bool(occupied[centers.norm(dim=-1) > 0.5 + cell].any())
     learn(sampler, ball_density(radius=0.2), 6000)
-    occupied = sampler.cells.flatten().bool()
+    occupied = sampler.grid.cells.flatten().bool()
     assert bool(occupied.any())
     assert not bool(occupied[centers.norm(dim=-1) > 0.2 + cell].any())
 
@@ -54,10 +50,10 @@ def test_the_grid_finds_what_is_there_and_forgets_what_is_not():
 def test_matter_that_grows_later_is_found_again():
     """The fault: a cell that was given up once is never asked again."""
     sampler = learn(a_sampler(), ball_density(radius=0.2))
-    before = int(sampler.cells.sum())
+    before = int(sampler.grid.cells.sum())
     for step in range(400, 700, 16):
         sampler.update(ball_density(radius=0.6), step, fold(0, 0, step))
-    assert int(sampler.cells.sum()) > 5 * before
+    assert int(sampler.grid.cells.sum()) > 5 * before
 
 
 def test_nothing_is_given_up_before_its_time():
@@ -65,32 +61,21 @@ def test_nothing_is_given_up_before_its_time():
     sampler = a_sampler(prune_after=100)
     for step in (16, 32, 96):
         sampler.update(ball_density(density=0.0), step, step)
-    assert bool(sampler.cells.all())
+    assert bool(sampler.grid.cells.all())
     sampler.update(ball_density(), 112, 112)
-    assert not bool(sampler.cells.all())
+    assert not bool(sampler.grid.cells.all())
 
 
 def test_a_density_that_is_the_same_everywhere_prunes_nothing():
     sampler = a_sampler()
     sampler.update(lambda positions: torch.full(positions.shape[:-1], 0.3), 16, 5)
-    assert bool(sampler.cells.all())
+    assert bool(sampler.grid.cells.all())
 
 
 def test_the_update_is_a_function_of_the_step():
-    grids = [learn(a_sampler(), ball_density()).density for _ in range(2)]
+    grids = [learn(a_sampler(), ball_density()).grid.density for _ in range(2)]
     assert torch.equal(*grids)
-    assert not torch.equal(grids[0], learn(a_sampler(), ball_density(), 336).density)
-
-
-def test_samples_end_where_the_ray_is_opaque():
-    sampler, rays = learn(a_sampler(), ball_density()), some_rays(300)
-    samples, features = sampler(rays, screened(ball_density()), batch_random(1, 300))
-    assert features is None
-    assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
-    density = ball_density()(positions_of(rays, samples))
-    optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
-    longest = 80.0 * sampler.step_size
-    assert float(optical.max()) <= -torch.tensor(sampler.opaque_below).log() + longest + 1e-3
+    assert not torch.equal(grids[0], learn(a_sampler(), ball_density(), 336).grid.density)
 
 
 def test_jitter_is_fresh_for_every_ray_and_step_and_absent_at_evaluation():
@@ -121,8 +106,8 @@ def test_state_travels_in_the_state_dict():
     other = OccupancySampler(resolution=16, num_steps=64)
     other.load_state_dict(sampler.state_dict())
     rays = some_rays(20)
-    one, _ = sampler(rays, screened(ball_density()), batch_random(1, 20))
-    two, _ = other(rays, screened(ball_density()), batch_random(1, 20))
+    one = sampler(rays, batch_random(1, 20))
+    two = other(rays, batch_random(1, 20))
     assert torch.equal(one.starts, two.starts)
 
 
@@ -142,7 +127,9 @@ def contracted_ball():
 
 
 def sizes(sampler):
-    return {name: tuple(getattr(sampler, name).shape) for name in ("density", "floor", "possible", "cells", "blocks")}
+    return {
+        name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "floor", "possible", "cells", "blocks")
+    }
 
 
 @pytest.mark.parametrize(
@@ -177,14 +164,14 @@ def test_a_second_scene_makes_the_grid_anew():
     sampler.fit_to(opaque_ball())
     assert sizes(sampler)["cells"] == (1, 16, 16, 16)
     learn(sampler, ball_density())
-    assert 0 < int(sampler.cells.sum()) < 16**3
+    assert 0 < int(sampler.grid.cells.sum()) < 16**3
 
 
 def test_in_normalised_device_coordinates_every_cell_is_possible():
     """Cells are not where the cameras see them: a box behind all cameras must not be carved away."""
     scene = opaque_ball()
     sampler = a_sampler(replace(scene, space="ndc", aabb=scene.aabb + 500.0))
-    assert bool(sampler.possible.all())
+    assert bool(sampler.grid.possible.all())
 
 
 @pytest.mark.parametrize("placed", [None, opaque_ball(), contracted_ball()], ids=["new", "bounded", "contracted"])
@@ -196,11 +183,11 @@ def test_the_grid_takes_the_size_of_the_state_that_is_read(saved, placed):
         other.fit_to(placed)
     other.load_state_dict(one.state_dict())
     assert sizes(other) == sizes(one)
-    assert (other.num_cascades, other.cone_angle) == (one.num_cascades, one.cone_angle)
-    assert torch.equal(other.cells, one.cells)
+    assert (other.grid.num_cascades, other.cone_angle) == (one.grid.num_cascades, one.cone_angle)
+    assert torch.equal(other.grid.cells, one.grid.cells)
     assert torch.equal(other.lattice, one.lattice)
     rays = some_rays(20)
-    (found, _), (expected, _) = (each(rays, screened(ball_density()), None) for each in (other, one))
+    found, expected = (each(rays, None) for each in (other, one))
     assert torch.equal(found.starts, expected.starts)
     learn(other, ball_density())
 
@@ -209,9 +196,9 @@ def test_cascades_cover_what_lies_far_out():
     sampler = a_sampler(contracted_ball())
     rays = some_rays(40)
     rays = replace(rays, near=torch.full((40,), 0.05), far=torch.full((40,), 16.0))
-    samples, _ = sampler(rays, screened(lambda positions: torch.zeros(len(positions))), None)
+    samples = sampler(rays, None)
     assert float(samples.ends.max()) > 14.0
-    assert float(positions_of(rays, samples).abs().max()) > 8.0
+    assert float(packed_points(rays, samples, None).positions.abs().max()) > 8.0
     # Intervals grow with the distance.
     far, near = samples.starts > 10.0, samples.starts < 2.0
     assert float(samples.deltas[far].mean()) > 1.4 * float(samples.deltas[near].min())
@@ -220,8 +207,8 @@ def test_cascades_cover_what_lies_far_out():
 def test_a_learnt_shell_beyond_the_first_box_is_kept_and_the_rest_given_up():
     sampler = a_sampler(contracted_ball())
     learn(sampler, lambda positions: 50.0 * ((positions.norm(dim=-1) - 5.0).abs() < 1.0).float())
-    cascade, x, y, z = sampler.cells.nonzero().unbind(dim=-1)
-    side, half = sampler.resolution, 3**-0.5 * 2.0**cascade
+    cascade, x, y, z = sampler.grid.cells.nonzero().unbind(dim=-1)
+    side, half = sampler.grid.resolution, 3**-0.5 * 2.0**cascade
     center = (2 * (torch.stack([x, y, z], dim=-1) + 0.5) / side - 1) * half[:, None]
     reach = 3**0.5 * half / side
     assert bool(((center.norm(dim=-1) - 5.0).abs() <= 1.0 + reach).all())
@@ -231,9 +218,9 @@ def test_a_learnt_shell_beyond_the_first_box_is_kept_and_the_rest_given_up():
 def test_the_centre_of_a_cell_is_the_middle_of_its_positions():
     """Bit for bit: carving asks about the centres, training about points in the same cells."""
     sampler = OccupancySampler(resolution=12, num_cascades=3)
-    sampler.aabb.copy_(torch.tensor([[-1.1, -0.7, -0.3], [0.9, 1.7, 1.1]]))
+    sampler.grid.aabb.copy_(torch.tensor([[-1.1, -0.7, -0.3], [0.9, 1.7, 1.1]]))
     for cascade in range(3):
         number = torch.arange(12**3) + cascade * 12**3
-        centers, half_diagonal = sampler.cell_centers(cascade)
-        assert torch.equal(centers, sampler.positions(number, torch.full((1, 3), 0.5)))
+        centers, half_diagonal = sampler.grid.cell_centers(cascade)
+        assert torch.equal(centers, sampler.grid.positions(number, torch.full((1, 3), 0.5)))
         assert half_diagonal == pytest.approx(2**cascade * math.hypot(2.0, 2.4, 1.4) / 24)

@@ -1,0 +1,240 @@
+"""What each setting means: one table, asked by whoever treats settings differently.
+
+Is a run of another value another run? Has a finished one of another value something left to do? Does what is learnt
+depend on it? Has it a column in a table of runs? And may a file choose it that comes from anybody, such as the saved
+overrides of a run folder or the scene that a checkpoint recorded? What is not in the table is trusted to nobody but the
+person at the command line, so whoever adds a setting decides here.
+
+A key is listed as it stands in a composed config. `x.*` is each key that stands in the section x, and `x.**` is x and
+whatever lies below it. The most precise entry holds.
+"""
+
+import os
+import re
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import Any
+
+WORD = re.compile(r"\w[\w-]*", re.ASCII)
+
+
+class Trust(Enum):
+    """What is taken of a setting from a file that may come from anybody."""
+
+    PLAIN = auto()
+    """A number, a switch, null or a text that looks nothing up."""
+    WORDS = auto()
+    """As PLAIN, but of texts only single words: a path or an address is none."""
+    NUMBERS = auto()
+    """As PLAIN, without texts."""
+    IF_THERE = auto()
+    """As PLAIN, but a path only of what exists: some scenes put there what they fetch."""
+    ONE_START = auto()
+    """Nothing: it belonged to one start of a run, and the next one has its own."""
+    NOTHING = auto()
+    """Nothing: a file that holds it is refused, or it is passed over where the file need not be believed."""
+
+    def takes(self, value: Any) -> bool:
+        """Tell whether a value that is no list and no section is taken."""
+        if not isinstance(value, str):
+            return self not in (Trust.ONE_START, Trust.NOTHING) and (
+                value is None or isinstance(value, (bool, int, float))
+            )
+        if self is Trust.WORDS:
+            return WORD.fullmatch(value) is not None
+        if self is Trust.IF_THERE and not os.path.exists(os.path.expanduser(value)):
+            return False
+        return self in (Trust.PLAIN, Trust.IF_THERE) and "${" not in value
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What is asked about a setting; as built without arguments, what is held of one that nobody has decided about."""
+
+    identity: bool = True
+    """A run of another value is another run: neither goes on with the other's checkpoints."""
+    outcome: bool = True
+    """What a run leaves depends on it: one that finished with another value has something left to do."""
+    learnt: bool = True
+    """What is learnt depends on it: results of other values are not repetitions of one measurement."""
+    shown: bool = True
+    """It has a column in a table of runs that differ in it."""
+    trust: Trust = Trust.NOTHING
+    """What is taken of it from a run folder, or from a checkpoint."""
+    in_sweep: Trust | None = None
+    """What is taken of it from the record of a sweep; None: as from a run folder."""
+
+
+UNKNOWN = Meaning()
+
+# A part of the mathematics. Nothing that nerf/ builds opens a file, and its constructors refuse what they do not know,
+# so that one row does for whole rooms, and a new encoder needs no line here.
+PART = Meaning(trust=Trust.WORDS)
+# Data, and what else decides what is learnt.
+LEARNT = Meaning(trust=Trust.PLAIN)
+# It tells whose results they are, and stands in a table's own column.
+OWN_COLUMN = Meaning(learnt=False, shown=False, trust=Trust.PLAIN)
+# The file of a capture, which is fetched where it is not there.
+FILE = replace(OWN_COLUMN, trust=Trust.IF_THERE)
+# What is fetched, and from where.
+FETCHED = Meaning()
+# The checkpoint that the first start began from. Jobs of a sweep that have not begun start from there still.
+FIRST_START = Meaning(learnt=False, trust=Trust.ONE_START, in_sweep=Trust.PLAIN)
+# The machine, and how it computes.
+MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
+# How long a run lasts: a longer one goes on with a shorter one's checkpoints.
+LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
+# What looks on while it trains.
+WATCHING = Meaning(identity=False, learnt=False, trust=Trust.PLAIN)
+# What Lightning's Trainer is told beside what settings of ours say.
+FLAG = replace(WATCHING, trust=Trust.WORDS)
+# What follows the training, or changes nothing of it.
+AFTERWARDS = replace(WATCHING, shown=False)
+# The curve of a film's camera; which of its settings are texts stands below.
+CURVE = replace(AFTERWARDS, trust=Trust.WORDS)
+# Where to write, and how to serve and to limit this start; the viewer opens a server for whoever sits there now.
+ONE_START = Meaning(identity=False, outcome=False, learnt=False, shown=False, trust=Trust.ONE_START)
+# Where to write, and how far to trust: the user's alone.
+OF_THE_USER = replace(ONE_START, trust=Trust.NOTHING)
+# How a sweep is cut into jobs and how many there are. Its record may say so; what they run is no number and no word.
+SWEEP_NUMBER = replace(OF_THE_USER, in_sweep=Trust.NUMBERS)
+SWEEP_WORD = replace(OF_THE_USER, in_sweep=Trust.WORDS)
+# Settings of commands that make no run.
+OF_OTHER_COMMANDS = Meaning()
+
+ROWS: tuple[tuple[Meaning, str], ...] = (
+    (PART, "model.** encoder.** direction_encoder.** field.** loss.** optimizer.** scheduler.**"),
+    (
+        LEARNT,
+        """
+        budget.seconds trainer.clip_norm
+        data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
+        data.device_budget data.prefetch
+        scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
+        scene.images scene.masks scene.file scene.frames scene.hold_every scene.train_fraction
+        scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
+        callbacks.collapse_guard.every_steps callbacks.collapse_guard.until_step callbacks.collapse_guard.patience
+        callbacks.collapse_guard.ratio callbacks.collapse_guard.max_restarts
+        """,
+    ),
+    (OWN_COLUMN, "seed model scene scene.name scene.root"),
+    (FILE, "scene.path"),
+    (FETCHED, "scene.download.**"),
+    (FIRST_START, "init_from"),
+    (
+        MACHINE,
+        """
+        trainer.accelerator trainer.devices trainer.launched_by trainer.precision trainer.num_threads
+        trainer.tile_points trainer.compile trainer.deterministic
+        """,
+    ),
+    (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
+    (FLAG, "trainer.lightning.**"),
+    (
+        WATCHING,
+        """
+        trainer.val_every_steps callbacks.monitor.every_steps
+        callbacks.epoch_figures.every_epochs callbacks.epoch_figures.every_steps callbacks.epoch_figures.view
+        callbacks.ray_histograms.every_steps callbacks.ray_histograms.num_rays
+        callbacks.validation_pictures.every_steps callbacks.validation_pictures.view
+        callbacks.progress_bar.refresh_seconds callbacks.progress_bar.line_seconds
+        callbacks.nan_guard.on_nan callbacks.nan_guard.patience callbacks.nan_guard.factor
+        callbacks.nan_guard.max_rollbacks callbacks.nan_guard.every_steps
+        callbacks.checkpoints.every_steps callbacks.checkpoints.monitor
+        """,
+    ),
+    (
+        AFTERWARDS,
+        """
+        scene.verify final.evaluate final.video path.file path.view path.views
+        evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
+        evaluation.lpips_weights evaluation.lpips_net
+        """,
+    ),
+    (CURVE, "path.**"),
+    (ONE_START, "resume paths.** sweep.** viewer.** budgets.**"),
+    (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
+    (SWEEP_NUMBER, "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
+    (SWEEP_WORD, "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction"),
+    (
+        OF_OTHER_COMMANDS,
+        """
+        ckpt what.** labels outputs mosaic format background crop near hold_camera
+        host port open_browser photographs max_height
+        run measured doctor max_megabytes runs scenes models sort published force
+        rounds steps warmup_steps target_psnr kernels render_rays
+        images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads
+        """,
+    ),
+)
+
+# Of settings that a person adds, and of the names of classes: they belong where their room does. Nothing of them is
+# taken from a file.
+THE_REST = {
+    "callbacks": WATCHING,
+    "callbacks.camera_layout": WATCHING,
+    "callbacks.collapse_guard": LEARNT,
+    "evaluation": AFTERWARDS,
+    "final": AFTERWARDS,
+    "trainer": MACHINE,
+}
+
+CHOSEN_GROUPS = (
+    *("callbacks", "data", "encoder", "evaluation", "experiment", "field", "logger", "loss", "model"),
+    *("optimizer", "path", "sampler", "scene", "scheduler", "trainer"),
+)
+"""Groups of conf/ of which a file may choose an option by its name."""
+SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")
+"""And those of which the record of a sweep may."""
+
+PLACES = ("scene.root", "scene.path")
+"""Where a capture lies; a relative one is meant from where the run was started."""
+
+TABLE = {key: meaning for meaning, keys in ROWS for key in keys.split()}
+
+
+def meaning_of(key: str) -> Meaning:
+    """Return what a setting or a section means, by its dotted key in a config.
+
+    >>> meaning_of("optimizer.lr").identity, meaning_of("trainer.max_steps").identity
+    (True, False)
+    >>> meaning_of("scene.near").trust.name, meaning_of("scene.unheard_of").trust.name
+    ('PLAIN', 'NOTHING')
+    """
+    row = row_of(key)
+    rest = (THE_REST[section] for section in _sections(key) if section in THE_REST)
+    found = next(rest, UNKNOWN) if row is None else TABLE[row]
+    is_decided = row is not None and not names_a_class(key)
+    if is_decided or found.trust is Trust.ONE_START:
+        return found
+    return replace(found, trust=Trust.NOTHING, in_sweep=None)
+
+
+def row_of(key: str) -> str | None:
+    """Return the entry of the table that decides about a key, None where none does."""
+    above = key.rpartition(".")[0]
+    names = (key, f"{above}.*", *(f"{section}.**" for section in _sections(key)))
+    return next((name for name in names if name in TABLE), None)
+
+
+def is_removable(section: str) -> bool:
+    """Tell whether a file may take a section or a setting away: all that is known of it must be taken from files."""
+    below = [meaning for key, meaning in TABLE.items() if key.startswith(f"{section}.")]
+    below += [TABLE[row] for row in (row_of(section),) if row is not None]
+    taken = all(each.trust not in (Trust.ONE_START, Trust.NOTHING) for each in below)
+    return taken and bool(below or section in THE_REST)
+
+
+def _sections(key: str) -> list[str]:
+    """Return a key and what it lies in, the smallest first.
+
+    >>> _sections("a.b.c")
+    ['a.b.c', 'a.b', 'a']
+    """
+    words = key.split(".")
+    return [".".join(words[:count]) for count in range(len(words), 0, -1)]
+
+
+def names_a_class(key: str) -> bool:
+    """Tell whether a key is Hydra's own, such as `_target_`."""
+    return any(word.startswith("_") for word in key.split("."))

@@ -1,0 +1,96 @@
+"""The contract of a level: one round of sampling and rendering."""
+
+from abc import abstractmethod
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.samplers.base import Sampler
+from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.scene import Scene
+
+
+class Level(nn.Module):
+    """The contract of a level: one round of sampling and rendering."""
+
+    sampler: Sampler
+    field: Field
+    has_color = True
+    """Whether its rendering is a picture."""
+
+    sampler_kind: type[Sampler] = Sampler
+    """What it can sample with."""
+
+    has_static_shapes: bool = True
+    """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
+
+    def __init__(self, sampler: Sampler, field: Field):
+        super().__init__()
+        if not isinstance(sampler, self.sampler_kind):
+            raise ValueError(
+                f"{type(self).__name__} samples with {self.sampler_kind.__name__} or what follows it, and "
+                f"{type(sampler).__name__} does not: choose another sampler, or a model with another level"
+            )
+        self.sampler = sampler
+        self.field = field
+
+    @abstractmethod
+    def forward(
+        self,
+        rays: RayBundle,
+        background: Float[Tensor, "*rays 3"] | None,
+        history: list[Any],
+        random: RayRandom | None,
+    ) -> Rendering:
+        """Render rays; `history` is what the earlier levels saw, `random` is None outside training."""
+
+    @abstractmethod
+    def points_per_ray(self, before: float, training: bool) -> float:
+        """Return how many points a ray sends through the field at once, given how many the level before had."""
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
+        self.field.fit_to(scene)
+        self.sampler.fit_to(scene)
+
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as rendering finds it."""
+        return self.sampler.reached_density(self.field_density, positions).float()
+
+    def field_density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as the field has it."""
+        return self.field.density(Points(positions))[0]
+
+    def counts(self) -> list[Tensor]:
+        """Return the buffers in which a training step counts, to put them back where a step is repeated."""
+        return []
+
+    def measurements(self) -> list[Tensor]:
+        """Return the buffers that hold means over rays, which the processes of a run must agree on."""
+        return []
+
+    def compile_field(self) -> bool:
+        """Compile the field where its shapes do not depend on the data; tell whether it was."""
+        return False
+
+    def update(self, step: int, key: int) -> None:
+        """Let the sampler learn between steps of training: `step` steps have been taken, `key` is the next one's."""
+        self.sampler.update(self.field_density, step, key)
+
+    def statistics(self) -> dict[str, float]:
+        """Return what is worth watching while training."""
+        return self.sampler.statistics()
+
+    def forget_measurements(self) -> None:
+        """Forget what was counted while rendering."""
+
+    def reset_parameters(self) -> None:
+        """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
+        self.field.reset_parameters()
+        self.sampler.reset()
+        self.forget_measurements()

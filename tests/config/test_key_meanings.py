@@ -1,0 +1,125 @@
+"""One table says what each setting means; what it does not list is taken from nobody but the person who types."""
+
+import inspect
+import re
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+from types import UnionType
+from typing import Union, get_args, get_origin
+
+import pytest
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+from support.configs import composed, loaded, options
+
+from nerf_lightning.cli.main import find_commands
+from nerf_lightning.config.key_meanings import (
+    CHOSEN_GROUPS,
+    ROWS,
+    THE_REST,
+    Trust,
+    meaning_of,
+    names_a_class,
+    row_of,
+)
+from nerf_lightning.config.overrides import flatten
+from nerf_lightning.files.folders import conf_folder
+
+ELSEWHERE = {"sampler": "model.levels.fine.sampler"}
+"""Where the options of a group go that has no section of its own."""
+OF_A_KEY = re.compile(r"[a-z]\w*(\.[a-z]\w*)*(\.\*\*?)?")
+
+
+def groups():
+    return [folder.name for folder in conf_folder().iterdir() if folder.is_dir() and folder.name != "hydra"]
+
+
+@cache
+def keys_of_conf():
+    """Return each key of each command's config, and of each option of each group, with its values."""
+    parts = [composed(command) for command in find_commands()]
+    for group in groups():
+        for option in options(group):
+            content = loaded(group, option)
+            content.pop("defaults", None)
+            is_global = "@package _global_" in (conf_folder() / group / f"{option}.yaml").read_text()
+            section = ELSEWHERE.get(group, group)
+            parts.append(content if is_global else nested(section, content))
+    found = {}
+    for part in filter(None, parts):
+        for key, value in flatten(part).items():
+            found.setdefault(key, []).append(value)
+    return found
+
+
+def nested(section, content):
+    for word in reversed(section.split(".")):
+        content = {word: content}
+    nested_config = OmegaConf.create(content)
+    assert isinstance(nested_config, DictConfig)
+    return nested_config
+
+
+def test_no_entry_stands_twice_and_each_is_a_key():
+    entries = Counter(key for _, keys in ROWS for key in keys.split())
+    assert [key for key, count in entries.items() if count > 1] == []
+    assert [key for key in [*entries, *THE_REST] if not OF_A_KEY.fullmatch(key)] == []
+
+
+def test_every_key_of_every_config_has_a_meaning():
+    """Whoever adds a setting says in config/key_meanings.py what it means, and whether a stranger may choose it."""
+    assert len(keys_of_conf()) > 250
+    assert [key for key in keys_of_conf() if not names_a_class(key) and row_of(key) is None] == []
+
+
+def test_every_entry_is_of_a_key():
+    used = {row_of(key) for key in keys_of_conf()}
+    named = [key for _, keys in ROWS for key in keys.split() if not key.startswith("hydra.")]
+    # What a constructor has and its yaml leaves out, or Lightning's Trainer has.
+    unseen = {"model", "scene", "scene.skip.train", "trainer.lightning.fast_dev_run"} | {
+        key for key in named if key.startswith("callbacks.")
+    }
+    assert set(named) - used - unseen == set()
+
+
+def test_a_room_that_is_trusted_as_a_whole_has_no_texts_but_words():
+    """Else one of its settings may be a path, and deserves a line of its own."""
+    for key, values in keys_of_conf().items():
+        if meaning_of(key).trust is Trust.WORDS:
+            texts = [value for value in values if isinstance(value, str) and not value.startswith("${")]
+            assert [text for text in texts if not Trust.WORDS.takes(text)] == [], key
+    for group in groups():
+        for option in options(group):
+            target = loaded(group, option).get("_target_", "")
+            for name, parameter in inspect.signature(get_object(target)).parameters.items() if target else ():
+                if str in texts_in(parameter.annotation):
+                    assert meaning_of(f"{ELSEWHERE.get(group, group)}.{name}").trust is not Trust.WORDS, (target, name)
+
+
+def texts_in(annotation):
+    """Return the kinds of plain values and of lists of them that an annotation allows."""
+    if get_origin(annotation) in (Union, UnionType, list, Sequence):
+        return [kind for each in get_args(annotation) for kind in texts_in(each)]
+    return [annotation]
+
+
+def test_every_group_is_one_that_a_file_may_choose_from_or_decidedly_none():
+    others = {"hydra", "paths", "budgets", "viewer", "what"}
+    assert {*CHOSEN_GROUPS} | others == {*groups(), "hydra"}
+    for group in others:
+        assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group
+
+
+@pytest.mark.parametrize("key", ["unheard_of", "scene.unheard_of", "trainer.unheard_of", "callbacks.mine.port"])
+def test_of_an_unheard_setting_nothing_is_taken(key):
+    assert row_of(key) is None
+    assert meaning_of(key).trust is Trust.NOTHING
+
+
+@pytest.mark.parametrize(
+    "key", ["model._target_", "scene._target_", "model.levels.fine._args_", "hydra.launcher._target_", "_target_.x"]
+)
+def test_of_the_name_of_a_class_nothing_is_taken(key):
+    assert meaning_of(key).trust is Trust.NOTHING
+    assert meaning_of(key).in_sweep is None

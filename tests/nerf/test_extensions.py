@@ -1,0 +1,82 @@
+"""What somebody may add with one file and one yaml: it trains, renders, and is saved, with nothing else edited."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from support import extensions
+from support.configs import composed
+from support.scenes import ball_scene
+from support.steps import rays_of
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.step import TrainStep
+
+SEARCHED = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
+SMALL_GRID = ["encoder.first.log2_table_size=10", "encoder.second.num_frequencies=3"]
+ADDED = {
+    "an encoder that joins two": ["model=fast_small", "encoder=joined", *SMALL_GRID],
+    "an encoder that joins two, in an MLP": [
+        "model=nerf_tiny", "encoder=joined", "field=hash", *SMALL_GRID, "field.width=16"
+    ],
+    "a packed sampler without a grid": ["model=fast_small", "sampler@model.levels.fine.sampler=box"],
+    "a packed sampler without a grid, over an MLP": [
+        "model=nerf_occupancy", "sampler@model.levels.fine.sampler=box", "field=nerf_mlp_tiny",
+        "encoder=frequency_small",
+    ],
+    "a code for each photograph": ["model=nerf_tiny", "field=nerf_mlp_with_codes"],
+}  # fmt: skip
+
+
+def a_step(overrides) -> TrainStep:
+    config, scene = composed("train", SEARCHED, *overrides), ball_scene(num_views=8, size=16, background="random")
+    model = build(config.model)
+    model.fit_to(scene)
+    return TrainStep(
+        model, rays_of(scene), build(config.loss), lambda groups: torch.optim.Adam(groups, lr=1e-2),
+        ExponentialDecay(decay_rate=1.0), Progress(), 0, "random", 4096, num_steps=100,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("added", ADDED)
+def test_it_learns_renders_and_is_saved(added):
+    scene = ball_scene(num_views=8, size=16, background="random")
+    step = a_step(ADDED[added])
+    loader, optimizer = RayBatches(scene, step.progress, 0, 96), step.new_optimizer()
+    losses = [step(loader.at(0, step.progress.rays_seen), optimizer)["losses"][-1] for _ in range(60)]
+    assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
+    assert step.guard.skipped == 0
+    again = a_step(ADDED[added])
+    again.model.load_state_dict(step.model.state_dict())
+    ours, theirs = (render_picture(each.model.eval(), each.rays, 0, "white", 4096) for each in (step, again))
+    assert torch.equal(ours.rgb, theirs.rgb)
+
+
+def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
+    step = a_step(ADDED["a packed sampler without a grid"])
+    torch.nn.init.normal_(step.model.last.field.position_encoder.table)
+    rays = step.rays(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0).pixels)
+    whole = step.model(rays, torch.ones(64, 3), None)[0]
+    with torch.no_grad():
+        walked = step.model(rays, torch.ones(64, 3), None)[0]
+    torch.testing.assert_close(walked.rgb, whole.rgb.detach(), atol=2e-3, rtol=0)
+    assert "train/occupied" not in step.model.statistics()
+
+
+def test_codes_learn_from_their_own_photographs_and_pictures_know_none():
+    step = a_step(ADDED["a code for each photograph"])
+    loader, optimizer = RayBatches(ball_scene(num_views=8, size=16), step.progress, 0, 96), step.new_optimizer()
+    for _ in range(20):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+    codes = step.model.last.field.codes.detach()
+    trained = list(ball_scene(num_views=8, size=16).splits["train"])
+    assert codes.shape[0] == 8
+    assert float(codes[trained].abs().sum(dim=1).min()) > 0
+    assert float(codes[[view for view in range(8) if view not in trained]].abs().max()) == 0.0
+    before = render_picture(step.model.eval(), step.rays, 0, "white", 4096).rgb
+    torch.nn.init.normal_(codes)
+    assert torch.equal(render_picture(step.model, step.rays, 0, "white", 4096).rgb, before)

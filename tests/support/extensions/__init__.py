@@ -1,0 +1,1 @@
+"""Parts that somebody adds: each one file, and one yaml under conf/."""
