@@ -46,10 +46,10 @@ def chosen(choices: Mapping[str, Any]) -> dict[str, str]:
 @contextmanager
 def _hydra() -> Iterator[None]:
     """Let Hydra compose from our conf/, and leave another application of it, which may have called us, as it was."""
-    holder = GlobalHydra.instance()
-    former, holder.hydra = holder.hydra, None
+    former = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
             yield
     finally:
-        holder.hydra = former
+        GlobalHydra.instance().hydra = former  # Hydra puts a copy of the holder in place

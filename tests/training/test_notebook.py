@@ -1,13 +1,18 @@
 """Lightning's own Trainer trains our module and our data, resumes to the bit, and its checkpoints can be used."""
 
+import csv
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.initialize import initialize_config_dir
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
 from support.running import refused
 
@@ -17,6 +22,7 @@ from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.nan_guard import NanGuard
@@ -112,6 +118,14 @@ def test_weights_follow_from_the_seed_alone(run):
     assert not all(torch.equal(other[name], value) for name, value in first.items())
 
 
+def test_whoever_uses_hydra_keeps_it(run):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        theirs = GlobalHydra.instance().hydra
+        run()
+        assert GlobalHydra.instance().hydra is theirs
+    run()
+
+
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
@@ -159,6 +173,13 @@ def test_an_epoch_is_every_training_ray_once(run, trainer, settings, steps):
 def test_a_run_without_end_is_refused(run, trainer):
     one = run()
     refused(trainer(max_steps=-1, max_epochs=-1).fit, one.system, one.data, parts=("max_steps", "max_epochs"))
+
+
+def test_lightnings_look_before_training_is_no_validation(run, trainer, tmp_path):
+    one, logger = run(), CSVLogger(tmp_path)
+    trainer(max_steps=4, num_sanity_val_steps=1, logger=logger, log_every_n_steps=1).fit(one.system, one.data)
+    rows = list(csv.DictReader((Path(logger.log_dir) / "metrics.csv").read_text().splitlines()))
+    assert [row["step"] for row in rows if row["val/psnr"]] == ["4"]
 
 
 @pytest.mark.parametrize(

@@ -97,8 +97,8 @@ def writer(trainer: Trainer, callback: Callback) -> AtomicCheckpointIO:
     if not isinstance(plugin, AtomicCheckpointIO):
         raise InputError(
             f"The callback {type(callback).__name__} needs the checkpoints that are written beside training: give "
-            "Trainer(plugins=[AtomicCheckpointIO()], enable_checkpointing=False) and the callback Checkpoints "
-            f"(nerf_lightning.training.launch.checkpoint_io), or do without {type(callback).__name__}, and let "
-            "Lightning's ModelCheckpoint write."
+            "Trainer(plugins=[AtomicCheckpointIO()], enable_checkpointing=False), from "
+            "nerf_lightning.training.launch.checkpoint_io, and the callback Checkpoints; or leave "
+            f"{type(callback).__name__} out, and let Lightning's ModelCheckpoint write."
         )
     return plugin
