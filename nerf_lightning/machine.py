@@ -1,9 +1,11 @@
 """What this machine has: memory, with work refused that would not fit, its peak so far, and seconds."""
 
+import re
 import sys
 import time
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -13,20 +15,62 @@ from nerf_lightning.errors import InputError
 
 # Of the memory that is free, so much may be taken.
 SHARE_OF_FREE = 0.8
+# Linux's: where control groups are mounted, and which of them this process is in.
+CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# What a group may take and what it takes (bytes), in versions 2 and 1.
+LIMIT_FILES = {2: ("memory.max", "memory.current"), 1: ("memory.limit_in_bytes", "memory.usage_in_bytes")}
+# Files that the system keeps in memory while there is room: a group's own, and in version 1 with those of groups in it.
+CACHED_FILES = {2: ("inactive_file", "active_file"), 1: ("total_inactive_file", "total_active_file")}
 
 
 def free_memory(device: torch.device | None = None) -> int:
-    """Return how many bytes are free: of a GPU's memory where the device is one, else of the machine's."""
+    """Return how many bytes are free: of a GPU's memory where the device is one, else of the machine's.
+
+    A container, or a job of a cluster, has no more than the limits of its control groups leave.
+    """
     if device is not None and device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    return int(psutil.virtual_memory().available)
+    left = (_left_to_group(folder, version) for folder, version in _control_groups())
+    return max(0, min([int(psutil.virtual_memory().available), *(bytes_ for bytes_ in left if bytes_ is not None)]))
+
+
+def _control_groups() -> Iterator[tuple[Path, int]]:
+    """Yield the groups whose limits hold for this process, each with its version: its own ones and all around them.
+
+    A container may be told the path of its group on the host, where its own files lie at the top: what is not there
+    has no limit, and the top is always among those around.
+    """
+    try:
+        lines = OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        top = CONTROL_GROUPS / "memory" if controllers else CONTROL_GROUPS
+        own = top / path.lstrip("/")
+        for folder in (own, *own.parents):
+            if folder.is_relative_to(top):
+                yield folder, 1 if controllers else 2
+
+
+def _left_to_group(folder: Path, version: int) -> int | None:
+    """Return how many bytes a group may still take, cached files counted as free; None where it has no limit."""
+    try:
+        limit, used = (int((folder / name).read_text()) for name in LIMIT_FILES[version])
+        counts = dict(re.findall(r"^(\w+) (\d+)$", (folder / "memory.stat").read_text(), re.MULTILINE))
+        return limit - used + sum(int(counts.get(name, 0)) for name in CACHED_FILES[version])
+    except (OSError, ValueError):  # absent, or "max"
+        return None
 
 
 def require_memory(what: str, size: int, needed: Callable[[int], float], named: Callable[[int], str]) -> None:
     """Refuse work that takes more memory than can be had; nothing is allocated to find out.
 
     Args:
-        what: is asked for: the setting, and what it makes.
+        what: what is asked for, in words that begin a sentence: the setting, and what it makes.
         size: the whole number that decides how much that takes.
         needed: returns the bytes that a size takes; no larger size takes less.
         named: returns the setting of a size as the user would write it.

@@ -1,7 +1,7 @@
-"""The processes of a run: which one this is, and sums and words across all of them. Alone, all of it is trivial.
+"""The processes of a run: which one this is, and what they sum up, exchange and agree on. A single one does all alone.
 
-Processes are joined by `commands.processes`; here only torch.distributed is asked whether they are. Each rank works on
-its share of the same global batch, and what any of them decides from, all of them know.
+`training.launch.processes` joins them; here only torch.distributed is asked whether it has. Each process (rank) works
+on its share of the same global batch, and whatever one of them decides by, all of them know.
 """
 
 import os

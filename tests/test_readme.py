@@ -1,9 +1,11 @@
-"""The README's Python example runs as it stands, with torch alone."""
+"""The README's Python examples run as they stand: one with torch alone, one with Lightning's Trainer."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+from support.captures import write_npz
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -20,6 +22,28 @@ def test_the_example_runs_without_hydra_and_lightning():
     *said, imported = done.stdout.splitlines()
     assert imported == "[]"
     assert said[-1] == "torch.Size([1024, 3]) torch.Size([1024])"
+
+
+def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
+    (example,) = [block for block in python_blocks() if "build_run" in block]
+    # A small scene and short runs, or it would take minutes.
+    capture = write_npz(tmp_path / "capture.npz")
+    small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
+    for given, instead in (
+        ('"scene=bricks"', small),
+        ("max_steps=500", "max_steps=3"),
+        ("max_steps=1000", "max_steps=5"),
+    ):
+        assert example.count(given) == 1
+        example = example.replace(given, instead)
+    check = "\nprint(run.system.step.progress.step, system.step.progress.step)\n"
+    done = subprocess.run([sys.executable, "-c", example + check], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    *_, shapes, steps = done.stdout.splitlines()
+    assert shapes == "torch.Size([4, 6, 3]) torch.Size([4, 6])"
+    assert steps == "5 0"
+    assert "Warning" not in done.stderr
+    assert list((tmp_path / "outputs" / "notebook").rglob("*.ckpt"))
 
 
 def test_the_eight_lines_of_an_encoder_are_an_encoder(tmp_path):

@@ -145,10 +145,10 @@ def _prepare(config: DictConfig) -> Bench:
     settings.prepare_machine()
     scene = build(config.scene).read()
     progress = Progress()
-    num_steps = max(1, config.warmup_steps)
-    step = build_step(config, settings, scene, progress, num_steps).to(settings.device)
+    step = build_step(config, settings, scene, progress).to(settings.device)
+    step.num_steps = max(1, config.warmup_steps)
     settings.prepare(step.model)
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed)
     data.settle(settings.device)
     if settings.measures_tile:
         settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)

@@ -14,7 +14,7 @@ def min_median_max(values: list[float]) -> dict[str, float]:
 
 
 def print_table(result: dict[str, Any]) -> None:
-    """Print what was measured, a row each."""
+    """Print the result of a benchmark, a row for each quantity."""
     table = Table(title=f"nerf bench: {result['machine']}, tiles of {result['tile_points']} points")
     for column in ("", "median", "min", "max"):
         table.add_column(column, justify="left" if not column else "right")

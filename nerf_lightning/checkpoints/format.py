@@ -1,4 +1,4 @@
-"""What a checkpoint is, key by key: whoever writes one and whoever reads one hold it against this page."""
+"""What a checkpoint is, key by key: what is written and what is read are both checked against this description."""
 
 from typing import get_args
 
@@ -21,7 +21,7 @@ VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"
 
 
 def cameras() -> Record:
-    """Return what the cameras of a scene are."""
+    """Return what the cameras in a checkpoint may be: the fields of `Cameras`, with their shapes and ranges."""
     pixels = allowed().view_pixels
     return Record(
         {
@@ -105,7 +105,7 @@ def checkpoint(resumable: bool) -> Record:
         "epoch": Whole(),
         "pytorch-lightning_version": Text(40, VERSION),
         "loops": Record({key: Plain(most=1000) for key in LOOPS}),
-        "callbacks": Named(name, Plain(), 100),
+        "callbacks": Named(name, Plain(tensors=True), 100),
         "optimizer_states": Many(
             Record({"state": Named(Whole(), kept, 100_000), "param_groups": Many(group, 100, least=1)}), 1, least=1
         ),

@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning import __version__
@@ -25,35 +24,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.schema import Unfit, shown
 from nerf_lightning.files.tensor_files import load_tensors
-from nerf_lightning.nerf.geometry.near_far import near_and_far
-from nerf_lightning.nerf.types.scene import Background, Cameras, Scene, Space
+from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SceneRecord:
-    """What outlives the pictures: enough to render, and to place what is rendered in the user's frame."""
-
-    name: str
-    cameras: Cameras
-    near: Float[Tensor, "views"]
-    far: Float[Tensor, "views"]
-    aabb: Float[Tensor, "2 3"]
-    splits: dict[str, tuple[int, ...]]
-    view_names: tuple[str, ...]
-    background: Background
-    to_user: Float[Tensor, "4 4"]
-    space: Space = "bounded"
-
-    def near_and_far(self, eyes: Float[Tensor, "frames 3"]) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
-        """Return between which distances cameras that stand anywhere see the content (scene units)."""
-        if self.space != "bounded" or self.cameras.ndc is not None:
-            return self.near.min().expand(len(eyes)), self.far.max().expand(len(eyes))
-        return near_and_far(eyes, self.cameras.c2w[:, :, 3], self.aabb.mean(dim=0), self.near, self.far)
 
 
 @dataclass(frozen=True)
@@ -73,6 +49,8 @@ class Checkpoint:
     tile_points: int | None
     good: bool
     """Saved while all was finite, and no step was being left out."""
+    record: dict[str, Any]
+    """What a checkpoint of this one would keep, beside weights."""
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -119,6 +97,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         precision=record["precision"],
         tile_points=record["tile_points"],
         good=record.get("bad_steps", [0, 0])[1] == 0,
+        record=record,
     )
 
 
@@ -133,6 +112,16 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
         InputError: as `read_checkpoint`.
     """
     content = _load(path)
+    require_ours(content, path, resumable)
+    return content
+
+
+def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
+    """Refuse what was loaded from a file and is not as `format.checkpoint` says.
+
+    Raises:
+        InputError: with the first thing that is not.
+    """
     record = content.get(KEY)
     if not isinstance(record, dict) or "state_dict" not in content:
         raise InputError(
@@ -150,7 +139,6 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
         require_possible_scene(record["scene"], str(path))
     except Unfit as problem:
         raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
-    return content
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:

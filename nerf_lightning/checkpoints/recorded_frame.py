@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 
 def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:

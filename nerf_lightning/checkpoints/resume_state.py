@@ -78,7 +78,7 @@ def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:
     """
     try:
         for callback in callbacks:
-            key, description = callback.state_key, getattr(callback, "STATE", Plain())
+            key, description = callback.state_key, getattr(callback, "STATE", Plain(tensors=True))
             assert isinstance(description, Description)
             if key in states:
                 description.require(states[key], f"callbacks.{key}", {})

@@ -26,9 +26,12 @@ def prepared(command: str, arguments: list[str]) -> list[str]:
 
 
 def _train(arguments: list[str]) -> list[str]:
-    """Repeat the overrides that a run was started with where it is resumed by name."""
+    """Repeat the overrides that a run was started with where it is resumed by name; let Lightning's arguments in."""
     _refuse_second_sweep(arguments)
     resumed = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
+    from nerf_lightning.config.overrides import open_sections
+
+    arguments = open_sections(arguments)
     if not resumed or resumed[-1] in ("auto", "null"):
         return arguments
     path = Path(resumed[-1].strip("'\""))

@@ -83,9 +83,10 @@ def _resumed(arguments: list[str], folder: str | None) -> list[str]:
 
 
 def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
+    from nerf_lightning.config.overrides import open_sections
     from nerf_lightning.slurm import slurm_job
 
-    asked = {argument for argument in arguments if not argument.startswith("-")}
+    asked = set(open_sections(argument for argument in arguments if not argument.startswith("-")))
     same = (f for f, record in _sweeps(arguments) if record.slurm_job == slurm_job() and set(record.typed()) == asked)
     return next(same, None)
 

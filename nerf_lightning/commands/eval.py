@@ -14,12 +14,16 @@ from nerf_lightning.training.open_checkpoint import open_checkpoint
 
 
 def run(config: DictConfig) -> float:
-    """Measure and return the PSNR."""
+    """Measure and return the PSNR (dB)."""
     return on_all_processes("eval", config, evaluate)
 
 
 def evaluate(config: DictConfig) -> float:
-    """Measure a checkpoint on a split of a scene; return the PSNR."""
+    """Measure a checkpoint on a split of a scene; return the PSNR (dB).
+
+    Raises:
+        InputError: the checkpoint or the scene cannot be read, or they do not belong together.
+    """
     opened = open_checkpoint(config)
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))

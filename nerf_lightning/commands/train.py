@@ -21,6 +21,7 @@ from nerf_lightning.training.build import Parts, build_parts
 from nerf_lightning.training.callbacks.folder_guard import require_run
 from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.callbacks.watcher import errors_told_once
+from nerf_lightning.training.launch.lightning_flags import PROFILE
 from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.memory_plan import announce_memory
@@ -42,7 +43,7 @@ def train(config: DictConfig) -> float | None:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
-    parts = build_parts(config)
+    parts = build_parts(config, HydraConfig.get().runtime.choices)
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
@@ -97,6 +98,8 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | N
         describe_run(trainer.loggers, config)
     checkpoint = None if former is None else former.checkpoint
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
+    for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
+        log.info("profile: %s", profile)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
         raise SystemExit(128 + parts.signals.received)

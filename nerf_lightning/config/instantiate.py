@@ -29,7 +29,7 @@ def require_fitting_values(node: Any, path: str = "") -> None:
         for key, value in node.items():
             here = f"{path}.{key}" if path else str(key)
             if key in parameters:
-                _require(value, parameters[key].annotation, here)
+                require_fitting(value, parameters[key].annotation, here)
             require_fitting_values(value, here)
 
 
@@ -70,7 +70,12 @@ def _parameters(target: object) -> dict[str, inspect.Parameter]:
     return dict(inspect.signature(get_object(target)).parameters)
 
 
-def _require(value: Any, annotation: Any, path: str) -> None:
+def require_fitting(value: Any, annotation: Any, path: str) -> None:
+    """Hold a value against an annotation, where that is made of plain types and classes of ours.
+
+    Raises:
+        InputError: a number, word or switch where the annotation wants another.
+    """
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     known = [option for option in options if option in PLAIN or get_origin(option) in (Literal, list)]
     ours = [option for option in options if inspect.isclass(option) and option.__module__.startswith(OURS)]

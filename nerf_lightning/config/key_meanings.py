@@ -86,6 +86,8 @@ MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
 LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
 # What looks on while it trains.
 WATCHING = Meaning(identity=False, learnt=False, trust=Trust.PLAIN)
+# What Lightning's Trainer is told beside what settings of ours say.
+FLAG = replace(WATCHING, trust=Trust.WORDS)
 # What follows the training, or changes nothing of it.
 AFTERWARDS = replace(WATCHING, shown=False)
 # The curve of a film's camera; which of its settings are texts stands below.
@@ -126,7 +128,8 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         trainer.tile_points trainer.compile trainer.deterministic
         """,
     ),
-    (LENGTH, "trainer.max_steps trainer.max_epochs"),
+    (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
+    (FLAG, "trainer.lightning.**"),
     (
         WATCHING,
         """

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Iterable
 from typing import Any
 
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -9,6 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 
 # What Hydra takes without quotes wherever it stands.
 PLAIN = re.compile(r"[\w./:@%+-]+", re.ASCII)
+OPEN_SECTIONS = re.compile(r"trainer\.lightning[.=]")
+"""Sections that take keys which our yaml files do not list."""
 
 
 def quoted(value: Any) -> str:
@@ -39,6 +42,15 @@ def to_type(key: str, text: str) -> str:
     if "'" in override and not re.search(r'["$`\\!]', override):
         return f'"{override}"'
     return shlex.quote(override)
+
+
+def open_sections(overrides: Iterable[str]) -> list[str]:
+    """Return overrides that Hydra takes for sections whose keys it does not know, without a + from the user.
+
+    >>> open_sections(["trainer.lightning.profiler=simple", "seed=1"])
+    ['++trainer.lightning.profiler=simple', 'seed=1']
+    """
+    return [f"++{override}" if OPEN_SECTIONS.match(override) else override for override in overrides]
 
 
 def flatten(config: DictConfig) -> dict[str, object]:

@@ -27,7 +27,6 @@ class RayDataModule(LightningDataModule):
         scene: what a reader returned.
         progress: the run's place, shared with the system.
         seed: the run's seed.
-        num_steps: the length of the run.
         batch_rays: rays per training step; the most, with a budget.
         sample_budget: rays per step adapt, in a few fixed sizes, so that a step has about so many samples; None: they
             do not. It needs a model that skips empty space.
@@ -47,7 +46,6 @@ class RayDataModule(LightningDataModule):
         scene: Scene,
         progress: Progress,
         seed: int,
-        num_steps: int,
         batch_rays: int = 1024,
         sample_budget: int | None = None,
         crop_steps: int = 0,
@@ -82,7 +80,7 @@ class RayDataModule(LightningDataModule):
             if not scene.splits.get(split):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays, num_steps)
+        self.batches = RayBatches(scene, progress, seed, batch_rays)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
         self.device_budget, self.prefetch = device_budget, prefetch
@@ -107,7 +105,10 @@ class RayDataModule(LightningDataModule):
         return device.type != "cpu" and num_bytes(self.scene.pixels) <= budget_bytes(self.device_budget, device)
 
     def train_dataloader(self) -> RayBatches:
-        """Return the training batches."""
+        """Return the training batches; an epoch of them shows every ray once, or lasts as long as steps are counted."""
+        trainer = self.trainer
+        counts_steps = trainer is not None and trainer.max_epochs == -1 and trainer.max_steps != -1
+        self.batches.num_steps = trainer.max_steps if counts_steps else self.batches.epoch_steps  # type: ignore[union-attr]
         return self.batches
 
     def val_dataloader(self) -> FixedRays:

@@ -93,24 +93,16 @@ class RayBatches:
         progress: shared with the system, which advances it after each step.
         seed: the run's seed.
         batch_rays: rays per step.
-        num_steps: the length of the run, for those who ask.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        progress: Progress,
-        seed: int,
-        batch_rays: int,
-        num_steps: int,
-    ):
-        self.progress, self.seed = progress, seed
-        self.batch_rays, self.num_steps = batch_rays, num_steps
+    def __init__(self, scene: Scene, progress: Progress, seed: int, batch_rays: int):
+        self.progress, self.seed, self.batch_rays = progress, seed, batch_rays
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device that a background thread makes batches for; None: there is no such thread.
         self.prefetch_for: torch.device | None = None
         self.take_from(scene)
+        self.num_steps = self.epoch_steps
 
     def take_from(self, scene: Scene) -> None:
         """Make batches from this copy of the scene, where its pixels lie: in memory, a mapped file, or on a device."""
@@ -135,7 +127,13 @@ class RayBatches:
         """Return how many rays a run takes from the crop after so many restarts."""
         return self.batch_rays * (self.restart_crop_steps if restarts else self.crop_steps)
 
+    @property
+    def epoch_steps(self) -> int:
+        """Steps that show as many rays as there are."""
+        return -(-len(self.whole) // self.batch_rays)
+
     def __len__(self) -> int:
+        # The batches have no end, but to a trainer an epoch has one: without it a batch would be fetched ahead.
         return self.num_steps
 
     def __iter__(self) -> Iterator[Batch]:

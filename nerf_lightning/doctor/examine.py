@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.doctor import cameras, extent, memory, photographs, poses, views
+from nerf_lightning.doctor import cameras, extent, image_quality, memory, poses, views
 from nerf_lightning.doctor.check import Check, CheckFn, Evidence
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
@@ -19,7 +19,7 @@ CHECKS: tuple[CheckFn, ...] = (
     *poses.CHECKS,
     *extent.CHECKS,
     *views.CHECKS,
-    *photographs.CHECKS,
+    *image_quality.CHECKS,
     *memory.CHECKS,
 )
 

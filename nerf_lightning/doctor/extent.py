@@ -17,7 +17,7 @@ LEAST_PARALLAX = 0.04
 FEWEST = 50
 # Share of the content that may be cut off: a few matches and points are mistakes.
 FEW, MANY = 0.03, 0.15
-# Of the views' pixels, a grid of so many places a side.
+# Of each view, a grid of GRID x GRID pixels is looked at.
 GRID = 12
 INCHES, FEET, CENTIMETRES = 39.37, 3.281, 100.0
 

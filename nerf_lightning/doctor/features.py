@@ -34,7 +34,7 @@ class Corners:
     descriptor: Float[Tensor, "corners dims"]
     """Unit length."""
     rgb: Float[Tensor, "corners 3"]
-    """Colour around the corner."""
+    """Mean colour around the corner, in [0, 1]."""
 
 
 def shrunk_cameras(cameras: Cameras) -> Cameras:

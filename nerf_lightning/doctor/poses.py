@@ -102,7 +102,13 @@ def single_poses(evidence: Evidence) -> Check:
 def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
     """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
 
-    One view at a time, without its matches from then on: its neighbours must not suffer for it.
+    They are found one at a time; the matches of each are left out from then on, so that its neighbours do not suffer
+    for it.
+
+    Args:
+        matches: details that pairs of photographs share.
+        good: the matches that lie where the cameras say.
+        num_views: of the scene.
     """
     shares, largest = shares_of_views(matches, good, num_views)
     # From photographs that share little, most matches are mistakes: they accuse nobody.

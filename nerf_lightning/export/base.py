@@ -3,9 +3,9 @@
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 
 class Export(ABC):

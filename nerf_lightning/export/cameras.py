@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.escaping import for_colmap
 from nerf_lightning.export.base import Export
 from nerf_lightning.files.atomic import whole_file
@@ -15,7 +14,7 @@ from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.types.scene import Cameras, LensModel
+from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 
 CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 Report = Callable[[str, float], None]
 """Takes the name of a stage, and how much of it is done, from 0 to 1."""

@@ -11,7 +11,6 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
@@ -24,6 +23,7 @@ from nerf_lightning.nerf.geometry.cameras import camera_coordinates
 from nerf_lightning.nerf.geometry.frames import directions_to_user, unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]

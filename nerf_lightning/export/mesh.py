@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export, refuse_ndc
@@ -19,6 +18,7 @@ from nerf_lightning.export.surface import SeenFrom, surface_colors, surface_leve
 from nerf_lightning.export.visibility import seen_faces
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
 
 # The density's grid, and as much again for the mesh.
 BYTES_PER_POINT = 8

@@ -9,7 +9,6 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export
@@ -20,7 +19,7 @@ from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 # What all views' points are held in until they are confirmed, and the picture of each; then once more, as one cloud.
@@ -42,7 +41,7 @@ class PointsExport(Export):
         max_views: most training views that are rendered.
         longest: pixels of the longer side of what is rendered, at most.
         min_opacity: share of the light that a pixel must stop.
-        agreement: so many of the nearest 8 other views must see the same surface.
+        agreement: how many of the nearest 8 other views must see the same surface.
         tolerance: share of the distance by which their depths may differ.
     """
 

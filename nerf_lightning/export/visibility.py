@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
@@ -25,7 +24,7 @@ from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_de
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 # Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
 STRAIGHT = 250
@@ -92,14 +91,15 @@ def num_agreeing(
     views: Sequence[int],
     tolerance: float,
 ) -> Int[Tensor, "points"]:
-    """Return how many of the views see each point as their surface, within a share `tolerance` of the distance.
+    """Return how many of the views see each point as their surface.
 
     Args:
         points: in the working frame.
         cameras: of all views.
-        depths: of each view that may be asked; inf where nothing opaque is seen.
-        views: those to ask.
-        tolerance: of the distance.
+        depths: by view, the distance along each pixel's ray to the surface (scene units); inf where nothing opaque is
+            seen.
+        views: those that are asked.
+        tolerance: how far the point may lie from the surface, as a share of its distance.
     """
     count = torch.zeros(len(points), dtype=torch.int64)
     for view in views:

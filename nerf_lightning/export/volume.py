@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import StageProgress
 from nerf_lightning.export.base import Export, refuse_ndc
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
@@ -19,6 +18,7 @@ from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.points import Points
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 # Density, colour, and the density again in the user's units.

@@ -1,4 +1,4 @@
-"""Folders and files that nobody else can have written: what is kept there is believed."""
+"""Folders and files that nobody but the user can have written, so that their content is trusted."""
 
 import os
 import stat

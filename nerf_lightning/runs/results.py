@@ -3,12 +3,14 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
 from nerf_lightning.budgets import allowed
 from nerf_lightning.config.key_meanings import PLACES, meaning_of
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
@@ -39,6 +41,51 @@ class RunResult:
     def folder(self) -> Path:
         """Where the run lies."""
         return self.summary.folder
+
+
+@dataclass(frozen=True)
+class FoundResults:
+    """What lies in some folders."""
+
+    file: str
+    """Of each run: where its numbers stand."""
+    measured: list[RunResult]
+    unmeasured: list[Path]
+    """Runs without a PSNR there."""
+
+
+def find_results(
+    folders: Sequence[Path], measured: Measured, scenes: Sequence[str] | None, models: Sequence[str] | None
+) -> FoundResults:
+    """Return the results of the runs in these folders whose scene and model fit a pattern ("lego*"; None: all).
+
+    Raises:
+        InputError: a folder is not there, there is no run in them, none was measured, or none fits.
+    """
+    read = {run: read_result(run, measured) for run in find_runs(folders)}
+    results = [result for result in read.values() if result is not None]
+    if not results:
+        raise InputError(
+            f"None of the {len(read)} runs has a PSNR in {FILES[measured]}. A run is measured at its end, and "
+            "by nerf eval ckpt=RUN/checkpoints/last.ckpt (then with measured=eval)."
+        )
+    chosen = [result for result in results if _fits(result.scene, scenes) and _fits(result.model, models)]
+    if not chosen:
+        known = (sorted({getattr(result, key) for result in results}) for key in ("scene", "model"))
+        there = " and the models ".join(map(listed, known))
+        asked = f"scenes={_as_given(scenes)} and models={_as_given(models)}"
+        raise InputError(f"No run fits {asked}. There are the scenes {there}.")
+    return FoundResults(FILES[measured], chosen, [run for run, result in read.items() if result is None])
+
+
+def _fits(name: str, patterns: Sequence[str] | None) -> bool:
+    return patterns is None or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _as_given(patterns: Sequence[str] | None) -> str:
+    if patterns is None:
+        return "null"
+    return patterns[0] if len(patterns) == 1 else f"[{','.join(patterns)}]"
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

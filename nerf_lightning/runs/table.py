@@ -1,13 +1,15 @@
 """Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 from nerf_lightning.evaluation.protocol import differences
-from nerf_lightning.runs.results import RunResult
+from nerf_lightning.runs.published import published_for
+from nerf_lightning.runs.results import FoundResults, RunResult
 from nerf_lightning.runs.summary import differing_keys
 from nerf_lightning.runs.table_files import Row
 
@@ -32,6 +34,37 @@ MOST_SETTINGS = 32
 """Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
 
 Group = list[RunResult]
+
+
+def result_table(found: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
+    """Return the rows, and the lines that belong below them.
+
+    Args:
+        found: what was measured.
+        order: one of `ORDERS`.
+        published: add what others have published.
+        force: put results together that were not measured alike.
+
+    Raises:
+        InputError: they were not measured alike, and not `force`.
+    """
+    results = found.measured
+    notes = one_protocol(results, force)
+    groups, left_out = group_seeds(results)
+    rows = group_rows(groups, order)
+    if published:
+        rows = with_published(rows, results)
+    notes += [*noted_settings(groups), *noted_origins(results)]
+    if left_out:
+        names = _names(result.folder for result in left_out)
+        notes.append(f"Left out, since newer runs of the same settings and seed are there: {names}.")
+    if found.unmeasured:
+        notes.append(f"Without a PSNR in {found.file}: {_names(found.unmeasured)}.")
+    return without_empty(rows), notes
+
+
+def _names(folders: Iterable[Path]) -> str:
+    return listed(map(str, folders), cap=5)
 
 
 def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
@@ -100,6 +133,25 @@ def noted_settings(groups: Sequence[Group]) -> list[str]:
 
 def _differing(groups: Sequence[Group]) -> list[str]:
     return differing_keys([group[0].settings for group in groups])
+
+
+def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
+    """Return the rows with what others have published below those of each scene."""
+    reader = {result.scene: str(result.origin.get("scene", "")) for result in results}
+    table: list[Row] = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        table += [row for row in rows if row["scene"] == scene]
+        table += [
+            {
+                "scene": scene,
+                "model": found.method,
+                "PSNR": found.psnr,
+                "time": found.time,
+                "source": f"published, {found.measured}: {found.source}",
+            }
+            for found in published_for(scene, reader[scene])
+        ]
+    return table
 
 
 def without_empty(rows: list[Row]) -> list[Row]:

@@ -25,13 +25,14 @@ COUNTS = ("steps", "parameters", "runs")
 
 
 def print_rows(rows: list[Row], title: str) -> None:
-    """Print the table to the terminal, whole even where the terminal is narrow."""
+    """Print the table to the terminal, whole even where the terminal is narrow, but for the ends of sources."""
     table = Table(title=Text(for_terminal(title)))
     for column in rows[0]:
         is_number = column in (*DECIMALS, *COUNTS)
         table.add_column(Text(for_terminal(column)), justify="right" if is_number else "left", overflow="fold")
     for row in rows:
-        table.add_row(*(Text(for_terminal(text)) for text in _texts(row)))
+        short = row | {"source": (row["source"] or "").partition(",")[0]} if "source" in row else row
+        table.add_row(*(Text(for_terminal(text)) for text in _texts(short)))
     console = StdoutConsole()
     (console if console.is_terminal else StdoutConsole(width=160)).print(table)
 

@@ -1,9 +1,13 @@
 """All checks, found by themselves: every file of `checks/` has a function `checks` that takes the place."""
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from nerf_lightning.console import stderr_console
 from nerf_lightning.selftest.check import Check, Row, carried_out
 from nerf_lightning.selftest.place import Place
 
@@ -26,3 +30,12 @@ def carry_out(checks: Iterable[Check], announce: Callable[[str], None]) -> list[
         announce(check.name)
         rows.append(carried_out(check))
     return rows
+
+
+@contextmanager
+def bar_of_checks(count: int) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar over this many checks; the function that is lent moves it on to the check of a name."""
+    columns = (BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=stderr_console(), transient=True) as bar:
+        task = bar.add_task("", total=count, completed=-1)
+        yield lambda name: bar.update(task, advance=1, description=name)

@@ -45,7 +45,7 @@ class Method:
     loss: Callable[[], Loss]
     optimizer: Callable[[Iterable[Any]], Optimizer]
     layers: int
-    """Products in a row, forward."""
+    """Products of matrices that follow one another in a forward pass: rounding adds up over them."""
     same_as: str | None = None
     """The method that computes the same in another way, whose reference is taken."""
 

@@ -4,9 +4,18 @@ from typing import Any
 
 from rich.table import Table
 
+from nerf_lightning.console import StdoutConsole, say
 from nerf_lightning.selftest.check import Row
 
 COLORS = {"ok": "green", "wrong": "bold red", "not run": "yellow"}
+
+
+def print_rows(rows: list[Row], device: str, seconds: float) -> None:
+    """Print the table, a line for each row that is not ok, and how many there are of each kind."""
+    counts = {outcome: sum(row.outcome == outcome for row in rows) for outcome in COLORS}
+    found = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {device}"))
+    say(*remarks(rows), f"{found}; {seconds:.0f} seconds")
 
 
 def result_table(rows: list[Row], title: str) -> Table:

@@ -12,7 +12,7 @@ from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.sfm.image_pairs import chosen_matching
-from nerf_lightning.sfm.photographs import FoundPhotograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.sfm.reconstruction import SparseModel, reconstruct
 from nerf_lightning.sfm.settings import SfmSettings, stage_costs
 from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sharp_frames
@@ -20,6 +20,29 @@ from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sh
 READING, FRAMES = "reading photographs", "choosing frames"
 READING_COST, FRAME_COST = 0.1, 0.02
 UNFINISHED = ".poses.part"
+
+
+def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
+    """Refuse to write over poses, or over pictures that are not those that the poses are of.
+
+    Args:
+        folder: to write.
+        source: the photographs, or the video.
+        is_video: which of the two.
+
+    Raises:
+        InputError: there are poses in the folder already, or other pictures.
+    """
+    if (folder / "sparse" / "0").exists():
+        raise InputError(
+            f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
+            "with paths.output_dir=DIR."
+        )
+    images = folder / "images"
+    if images.exists() and (is_video or not source.is_dir() or not images.samefile(source)):
+        raise InputError(
+            f"{images} exists already, and is not what images= names. Give an empty folder with paths.output_dir=DIR."
+        )
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import Any
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.sfm.image_pairs import image_pairs, tiles_of
-from nerf_lightning.sfm.photographs import FoundPhotograph, check_one_camera
+from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_one_camera
 from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings
 
 Report = Callable[[str, float], None]

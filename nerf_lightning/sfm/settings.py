@@ -6,7 +6,7 @@ from typing import Literal
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import require_positive
 from nerf_lightning.sfm.image_pairs import Matching, image_pairs
-from nerf_lightning.sfm.photographs import FoundPhotograph
+from nerf_lightning.sfm.photograph_folder import FoundPhotograph
 
 CameraMode = Literal["single", "per_image", "auto"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]

@@ -1,13 +1,16 @@
-"""What a run is made of, from its config: scene, data, system, callbacks, and what follows."""
+"""What a run is made of, from its config: scene, data, system; and for `nerf train` callbacks, and what follows."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import yaml
-from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import Checkpoint, make_record, read_checkpoint
+from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
@@ -26,23 +29,77 @@ from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
+OF_LIGHTNINGS_TRAINER = {
+    "trainer.max_steps": "Trainer(max_steps=...)",
+    "trainer.max_epochs": "Trainer(max_epochs=...)",
+    "trainer.val_every_steps": "Trainer(val_check_interval=...)",
+    "trainer.lightning": "Trainer(...)",
+    "callbacks": "Trainer(callbacks=[...])",
+    "viewer": "Trainer(callbacks=[LiveView(...)])",
+    "budget": "Trainer(callbacks=[TimeBudget(...)])",
+    "logger": "Trainer(logger=...)",
+    "paths": "Trainer(default_root_dir=...)",
+    "resume": "Trainer.fit(..., ckpt_path=...)",
+}
+"""Settings of `nerf train` that are given to Lightning's own Trainer in a notebook."""
+
 
 @dataclass
-class Parts:
-    """Everything that a run is made of, but for its place on the disk."""
+class Run:
+    """What learns, and from what: all that Lightning's Trainer needs."""
 
     settings: TrainerSettings
     scene: Scene
-    num_steps: int
     data: RayDataModule
     system: RadianceFieldSystem
+
+
+@dataclass
+class Parts(Run):
+    """What `nerf train` adds, but for its place on the disk."""
+
+    num_steps: int
     signals: StopSignals
     callbacks: list[Callback]
     finish: Finish
 
 
-def build_parts(config: DictConfig) -> Parts:
-    """Build all that a run is made of, and read its scene; nothing is written.
+def build_run(*overrides: str) -> Run:
+    """Build what `nerf train OVERRIDES` trains, for `Trainer.fit(run.system, run.data)`; nothing is written.
+
+    Its weights are functions of the seed. A run is fitted once; to go on from a checkpoint, another is built.
+
+    Args:
+        *overrides: as on the command line, like "scene=bricks" and "model=nerf_tiny".
+
+    Raises:
+        InputError: anything in the settings or in the capture that makes no run, or a setting of Lightning's Trainer.
+    """
+    _refuse_settings_of_the_trainer(overrides)
+    config, choices = compose_config("train", overrides)
+    allow(Budgets(**config.budgets))
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    run = _run(config, choices, settings, build(config.scene).read())
+    settings.prepare(run.system.model)
+    run.system.record["precision"] = settings.precision
+    return run
+
+
+def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        for setting, instead in OF_LIGHTNINGS_TRAINER.items():
+            if key == setting or key.startswith((f"{setting}.", f"{setting}@")):
+                raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")
+
+
+def build_parts(config: DictConfig, choices: Mapping[str, Any]) -> Parts:
+    """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
+
+    Args:
+        config: of the run.
+        choices: the names picked from each group, which its checkpoints keep.
 
     Raises:
         InputError: anything in the config or in the capture that makes no run.
@@ -52,18 +109,9 @@ def build_parts(config: DictConfig) -> Parts:
     finish = Finish.from_config(config)
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
-    num_rays = sum(int(scene.pixels.width[v] * scene.pixels.height[v]) for v in scene.splits["train"])
-    num_steps = settings.num_steps(num_rays, config.data.batch_rays, config.data.crop_steps)
-    choices = {key: value for key, value in HydraConfig.get().runtime.choices.items() if isinstance(value, str)}
-    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
-    progress = Progress()
-    record = make_record(scene, text, choices)
-    start = None
-    if config.init_from is not None:
-        start = read_checkpoint(required_path("init_from", config.init_from))
-    step = build_step(config, settings, scene, progress, num_steps, start)
-    step.new_optimizer()  # what it refuses is refused before a folder is taken
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, num_steps=num_steps)
+    run = _run(config, choices, settings, scene)
+    num_rays, data = len(run.data.batches.whole), config.data
+    num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
     if "live_view" in config.viewer:
@@ -72,7 +120,20 @@ def build_parts(config: DictConfig) -> Parts:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
     callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
-    return Parts(settings, scene, num_steps, data, RadianceFieldSystem(step, record), signals, callbacks, finish)
+    return Parts(**vars(run), num_steps=num_steps, signals=signals, callbacks=callbacks, finish=finish)
+
+
+def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettings, scene: Scene) -> Run:
+    text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
+    record = make_record(scene, text, chosen(choices))
+    progress = Progress()
+    start = None
+    if config.init_from is not None:
+        start = read_checkpoint(required_path("init_from", config.init_from))
+    step = build_step(config, settings, scene, progress, start)
+    step.new_optimizer()  # what it refuses is refused before a folder is taken
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed)
+    return Run(settings, scene, data, RadianceFieldSystem(step, record))
 
 
 def _chosen_callbacks(config: DictConfig) -> list[Callback]:
@@ -84,12 +145,7 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
 
 
 def build_step(
-    config: DictConfig,
-    settings: TrainerSettings,
-    scene: Scene,
-    progress: Progress,
-    num_steps: int,
-    start: Checkpoint | None = None,
+    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, start: Checkpoint | None = None
 ) -> TrainStep:
     """Build model, loss, optimizer and schedule into the step of training.
 
@@ -114,7 +170,6 @@ def build_step(
         optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,
-        num_steps=num_steps,
         seed=config.seed,
         background=scene.background,
         tile_points=settings.tile_points,

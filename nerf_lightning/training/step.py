@@ -66,13 +66,13 @@ class TrainStep:
         optimizer: takes the parameters.
         schedule: factor on the learning rate as a function of the attempt's step.
         progress: the run's place; it is changed here, and read by the loader.
-        num_steps: the length of the run.
         seed: the run's seed.
         background: what lies behind the training rays.
         tile_points: most points that a tile may send through a field at once; None trains the batch whole.
         clip_norm: gradients are scaled down to this norm; None leaves them.
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
+        num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
 
     Raises:
         InputError: a model that cannot be cut into tiles.
@@ -86,13 +86,13 @@ class TrainStep:
         optimizer: Callable[[Iterable[Any]], Optimizer],
         schedule: Schedule,
         progress: Progress,
-        num_steps: int,
         seed: int,
         background: Background,
         tile_points: int | None = None,
         clip_norm: int | float | None = None,
         sample_budget: int | None = None,
         start_weights: dict[str, Tensor] | None = None,
+        num_steps: int | None = None,
     ):
         self.model, self.rays, self.loss = model, rays, loss
         self.build_optimizer, self.schedule = optimizer, schedule
@@ -289,6 +289,9 @@ class TrainStep:
     def _update(self, optimizer: Any) -> None:
         if self.clip_norm is not None:
             torch.nn.utils.clip_grad_norm_(self._parameters(), self.clip_norm)
+        if self.num_steps is None:
+            raise InputError("The length of the run is not known, which the learning rate follows: give num_steps=....")
+        factor = self.schedule(self.progress.step, self.num_steps)
         for group in optimizer.param_groups:
-            group["lr"] = self.schedule(self.progress.step, self.num_steps) * group.setdefault("base_lr", group["lr"])
+            group["lr"] = factor * group.setdefault("base_lr", group["lr"])
         optimizer.step()

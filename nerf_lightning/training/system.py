@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch.optim import Optimizer
 
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.format import KEY, LOOPS, record
+from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_state import require_callbacks, require_loops, require_resumable
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
@@ -17,6 +19,8 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.launch.devices import use_threads
+from nerf_lightning.training.launch.fitting import length_of_run
+from nerf_lightning.training.open_checkpoint import rendering_step
 from nerf_lightning.training.step import TrainStep
 
 
@@ -39,6 +43,16 @@ class RadianceFieldSystem(LightningModule):
         self.model, self.rays = step.model, step.rays
         self.val_errors = RayErrors()
 
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, map_location: Any = None) -> Any:  # type: ignore[override]
+        """Return a system that renders and validates, of a file that may come from anybody; to train it has nothing.
+
+        Raises:
+            InputError: it cannot be read, or asks for what is no part of a model of ours.
+        """
+        checkpoint = read_checkpoint(checkpoint_path)
+        return cls(rendering_step(checkpoint), checkpoint.record).to(map_location or "cpu").eval()
+
     def configure_optimizers(self) -> Optimizer:
         """Return the step's optimizer.
 
@@ -46,6 +60,14 @@ class RadianceFieldSystem(LightningModule):
             InputError: a setting of the optimizer that it refuses.
         """
         return self.step.new_optimizer()
+
+    def on_fit_start(self) -> None:
+        """Take the length of the run from the trainer, before any callback reads it or changes it.
+
+        Raises:
+            InputError: it has none, or the trainer cannot fit this system.
+        """
+        self.step.num_steps = length_of_run(self.trainer, self.step.progress)
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
         """Take one step, and return what it saw."""
@@ -64,7 +86,7 @@ class RadianceFieldSystem(LightningModule):
         """Log the PSNR of the fixed rays; straight to the loggers, since Lightning would count the step before."""
         values = self.val_errors.summary()
         self.log("val/psnr", values["val/psnr"], logger=False, sync_dist=True)
-        for logger in self.trainer.loggers:
+        for logger in [] if self.trainer.sanity_checking else self.trainer.loggers:
             logger.log_metrics(values, self.trainer.global_step)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -90,13 +112,12 @@ class RadianceFieldSystem(LightningModule):
         record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the state again: place and thread count decide the last bits of every sum.
-
-        So does the tile, which whoever builds the system chooses (`TrainerSettings.keep_tile`).
+        """Take up the state again: place, threads, and the tile (`TrainerSettings.keep_tile`) decide a sum's last bits.
 
         Raises:
             InputError: the checkpoint is not one of this run; nothing was taken from it.
         """
+        require_ours(checkpoint, Path(self.trainer.ckpt_path or LAST), resumable=True)
         trainer, step, state = self.trainer, self.step, checkpoint[KEY]
         require_resumable(checkpoint, step.model, step.build_optimizer, step.progress, self.configure_optimizers())
         require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]

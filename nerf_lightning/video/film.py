@@ -12,11 +12,10 @@ from rich.progress import track
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.console import stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.ranks import processes_here
 from nerf_lightning.video.encoding import require_ffmpeg
 from nerf_lightning.video.frames import FilmFrames, Range

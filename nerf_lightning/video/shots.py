@@ -7,18 +7,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most, coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
+from nerf_lightning.nerf.geometry.near_far import near_and_far_from
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
-from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, frame_of
 from nerf_lightning.video.settings import Corner
 
@@ -120,7 +120,7 @@ def make_shots(
         if near is not None or crop is not None:
             box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
             clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
-        near_end, far_end = scene.near_and_far(held.c2w[:, :, 3])
+        near_end, far_end = near_and_far_from(held.c2w[:, :, 3], scene)
         _check_outside(held, clip)
         _check_near(scene, clip, far_end)
         shots.append(

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.geometry.near_far import near_and_far_from
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,4 +56,4 @@ def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Came
     cameras = pinhole_cameras(look.c2w[None], focal_from_fov(height, look.fov), width, height)
     if record.cameras.ndc is not None:
         cameras = replace(cameras, ndc=record.cameras.ndc[:1])
-    return cameras, *record.near_and_far(look.c2w[None, :, 3])
+    return cameras, *near_and_far_from(look.c2w[None, :, 3], record)

@@ -12,10 +12,10 @@ from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.viewer.camera_state import CameraState, pose_of
 from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import View
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 # Coarse pictures are sent often, fine ones once.
 COARSE_QUALITY, FINE_QUALITY = 75, 92
@@ -98,8 +98,8 @@ class ViewerClient:
     def present(self) -> None:
         """Send the newest view again, as another channel or with the comparison cut elsewhere.
 
-        A slider asks for it more often than it can be done: who finds it being done leaves the next turn to whoever
-        does it.
+        A slider asks for it more often than it can be done: a thread that finds another one at it returns, and the
+        other one sends once more.
         """
         self._wants_present = True
         while self._wants_present and self._presenting.acquire(blocking=False):

@@ -1,4 +1,4 @@
-"""What went wrong for those who look on: a line in the log, each thing once, and not many in all."""
+"""What went wrong for the clients of the viewer: one line in the log for each error, and a bounded number of lines."""
 
 import functools
 import logging
@@ -12,7 +12,7 @@ from nerf_lightning.viewer.plain_text import one_line
 class Complaints:
     """Log errors that end one drawing, one click or one connection, and nothing else.
 
-    Whoever looks on chooses what goes wrong and how often: nobody shall fill a log or a terminal.
+    A client can make things go wrong as often as it likes, and must not fill a log or a terminal by that.
 
     Args:
         log: where the lines go.

@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
@@ -204,7 +204,7 @@ def ends_within(ends: tuple[float, ...], least: float, most: float) -> tuple[flo
 
 
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
-    """Return the corners of the box along the user's axes that holds the scene's box."""
+    """Return the lower and the upper corner of the box along the user's axes that holds the scene's (user's units)."""
     corners = torch.cartesian_prod(*record.aabb.unbind(dim=1)).double()
     places = corners @ record.to_user[:3, :3].double().mT + record.to_user[:3, 3]
     return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

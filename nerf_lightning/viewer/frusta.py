@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
@@ -17,10 +18,10 @@ SCALE = 0.03
 
 
 class Frusta:
-    """Draw into one person's scene.
+    """Draw the photographs' cameras, keyframes and the crop box into what one person sees.
 
     Args:
-        session: theirs.
+        session: of that person.
         on_click: called with the view whose camera was clicked.
     """
 
@@ -41,7 +42,7 @@ class Frusta:
         self.cameras.visible = visible
 
     def hide_for_photograph(self, hidden: bool) -> None:
-        """Hide everything: who looks through a photograph's camera compares pixels."""
+        """Hide everything while a photograph is compared with its render, pixel by pixel."""
         self.root.visible = not hidden
 
     def draw_box(self, box: CropBox | None) -> None:
@@ -57,8 +58,8 @@ class Frusta:
             size = tuple(box.size.tolist())
             self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
 
-    def add_keyframe(self, number: int, c2w: Tensor, fov: float, aspect: float) -> Any:
-        """Draw a keyframe's camera; return its handle."""
+    def add_keyframe(self, number: int, c2w: Float[Tensor, "3 4"], fov: float, aspect: float) -> Any:
+        """Draw a keyframe's camera (`fov` from top to bottom in radians, width over height); return viser's handle."""
         return self._frustum(f"{KEYFRAMES}/{number}", c2w, fov, aspect, ORANGE, None)
 
     def _add_camera(self, view: int) -> None:
@@ -72,7 +73,13 @@ class Frusta:
         handle.on_click(self.session.queue.complaints.harmless(lambda _: self.on_click(view)))
 
     def _frustum(
-        self, name: str, c2w: Tensor, fov: float, aspect: float, color: tuple[int, int, int], image: np.ndarray | None
+        self,
+        name: str,
+        c2w: Float[Tensor, "3 4"],
+        fov: float,
+        aspect: float,
+        color: tuple[int, int, int],
+        image: UInt8[np.ndarray, "height width 3"] | None,
     ) -> Any:
         return self.scene.add_camera_frustum(
             name,

@@ -3,26 +3,26 @@
 import math
 
 MOST_CLIENTS = 8
-"""So many people are drawn for at once: each costs a picture in memory and a share of the time."""
+"""How many people are drawn for at once: each costs a picture in memory and a share of the time."""
 MOST_CONNECTIONS = 2 * MOST_CLIENTS
-"""Open websockets; who is one too many for a picture is told so through one of these."""
+"""Open websockets: more than people who are drawn for, since the others are told through theirs that it is full."""
 MOST_SOCKETS = 64
 """TCP connections of any kind, half-open ones too: far below the file descriptors that a process has."""
 MOST_MESSAGES_PER_SECOND = 200
 """Messages of one client beyond this are dropped unread; the page itself sends 20 to 50."""
 MOST_BYTES_PER_SECOND, MOST_BYTES_AT_ONCE = 100 * 1024, 1024 * 1024
-"""Who sends more is hung up on; the page sends some 15 kB a second."""
+"""The connection of a client that sends more is closed; the page sends some 15 kB a second."""
 MOST_MESSAGE_BYTES = 64 * 1024
 """A larger message closes its connection; the page's own have some hundred bytes."""
 SEND_SECONDS = 20.0
-"""Who has not taken a picture after this time (seconds) is let go: what waits for them stays in memory."""
+"""A client that has not taken a picture after this time (seconds) is disconnected: what it is sent lies in memory."""
 
 MOST_SIDE = 4096
 """A window counts as no wider and no higher than this (pixels)."""
 MOST_PIXELS = 3840 * 2160
 """A window counts as no larger than this (pixels), at its own shape."""
 MOST_SQUARES = 4
-"""A picture has no more pixels than so many squares of max_height; a wider window than 4:1 gets a less fine one."""
+"""A picture has at most this many times max_height x max_height pixels; windows wider than 4:1 get a coarser one."""
 LEAST_FOV, MOST_FOV = math.radians(0.1), math.radians(170.0)
 """Vertical field of view (radians)."""
 MOST_COORDINATE = 1e6

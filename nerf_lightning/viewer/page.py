@@ -1,30 +1,35 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
+import logging
 import threading
 import warnings
+import webbrowser
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import torch
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import Controls
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.shown_photographs import Photographs
 
-# People begin so many times as far from the middle as the first photograph: behind the cameras, not among them.
+# The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
 FULL = (
     f"{limits.MOST_CLIENTS} people look on already, and more are not drawn for: close a page, then load this one again."
 )
+
+log = logging.getLogger(__name__)
 
 
 def require_viser() -> Any:
@@ -75,7 +80,7 @@ class Page:
         self.most_height = most_height
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb)
-        # A page that is closed amid a picture is nothing to speak of.
+        # Pages are closed while a picture is on its way to them; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.admission = Admission(host, hosts)
         guard = Guard(self.admission, queue.complaints)
@@ -146,6 +151,22 @@ def address_of(host: str, port: int) -> str:
     """
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def open_in_browser(address: str) -> None:
+    """Open a page in the user's browser, or say why not."""
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        log.warning(
+            "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "
+            "ssh -L %s:%s THIS_MACHINE.",
+            address,
+            urlsplit(address).port,
+            urlsplit(address).netloc,
+        )
 
 
 class _quietly:

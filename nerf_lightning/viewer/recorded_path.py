@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.checkpoints.reading import SceneRecord
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.keyframes import Keyframe, Point, write_keyframes
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.client import ViewerClient
@@ -114,7 +114,7 @@ def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]
     block fails.
 
     Raises:
-        OSError: so many there are already, and whoever clicks on would fill the disk; or it cannot be made.
+        OSError: there are `most` such files already (more clicks would fill the disk), or it cannot be made.
     """
     path = _made(folder, stem, ending, most)
     try:

@@ -1,12 +1,16 @@
-"""Who is served next: every slice of rendering goes to one of the people who look on."""
+"""Whose picture is rendered next: the clients of the viewer take turns, a slice of rendering each."""
 
 import logging
+import signal
 import threading
 import time
+from types import FrameType
 
 from nerf_lightning.viewer.complaints import Complaints
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.renderer import SlicedRenderer
+
+IDLE_SECONDS = 0.2
 
 log = logging.getLogger(__name__)
 
@@ -26,35 +30,35 @@ class RenderQueue:
         self._wish = threading.Event()
 
     def add(self, client: int, refinement: ProgressiveRendering) -> None:
-        """Serve somebody."""
+        """Render for a client from now on."""
         with self._lock:
             self._refinements[client] = refinement
         self.wake()
 
     def remove(self, client: int) -> None:
-        """Forget somebody who has left."""
+        """Stop rendering for a client that has left."""
         with self._lock:
             self._refinements.pop(client, None)
 
     def wake(self) -> None:
-        """Say that somebody has a wish."""
+        """Say that a client wants another picture."""
         self._wish.set()
 
     def wait(self, seconds: float) -> None:
-        """Sleep until somebody has a wish, or this time has passed."""
+        """Sleep until a client wants another picture, or this time has passed."""
         self._wish.wait(seconds)
 
     def refresh(self) -> None:
-        """Let everybody see the model as it is now."""
+        """Render all pictures again: the model has changed."""
         with self._lock:
             for refinement in self._refinements.values():
                 refinement.refresh()
 
     def work(self) -> bool:
-        """Render one slice for somebody; return False where nobody has a wish that is not fulfilled.
+        """Render one slice for one client; return False where all have the picture that they want.
 
-        Who moves comes first; among equals, who was served longest ago. What cannot be drawn is dropped: it ends
-        neither the page of the others nor a training.
+        Clients whose camera moves come first; among equals, the one that has waited longest. A picture that cannot be
+        rendered is dropped: it ends neither the other clients' pages nor a training.
         """
         self._wish.clear()
         for refinement in self._in_order():
@@ -68,11 +72,29 @@ class RenderQueue:
                 return True
         return False
 
+    def work_until(self, stopped: list[int]) -> None:
+        """Render for everybody, slice by slice, until there is something in the list."""
+        while not stopped:
+            if not self.work():
+                self.wait(IDLE_SECONDS)
+
     @property
     def is_empty(self) -> bool:
-        """Whether nobody looks on."""
+        """Whether there is no client."""
         return not self._refinements
 
     def _in_order(self) -> list[ProgressiveRendering]:
         with self._lock:
             return sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))
+
+
+def received_stop_signals() -> list[int]:
+    """Return a list that SIGINT and SIGTERM are put into from now on; the slice that is being rendered ends first."""
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
+    return received

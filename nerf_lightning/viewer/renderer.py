@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
@@ -16,7 +15,7 @@ from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_rays
-from nerf_lightning.nerf.types.scene import Background, Cameras
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
 
 # How long a slice takes, about: a person may change the wish between two.
@@ -24,6 +23,7 @@ SLICE_SECONDS = 0.08
 # A picture is never smaller than this (pixels high).
 LEAST_HEIGHT = 32
 FIRST_RAYS = 512
+WARM_UP_HEIGHT = 64
 # How much a new measurement of the speed counts.
 FRESH = 0.4
 
@@ -69,6 +69,13 @@ class SlicedRenderer:
         """Return how high a picture can be so that several come in a second."""
         rays = (self.rays_per_second or FIRST_RAYS) * self.share * self.moving_seconds
         return max(LEAST_HEIGHT, int((rays * look.height / look.width) ** 0.5))
+
+    def warm_up(self) -> None:
+        """Render a small picture from the first photograph's place: kernels are loaded, the speed is known."""
+        look = CameraState(self.scene.cameras.c2w[0], 1.0, 4 * WARM_UP_HEIGHT // 3, WARM_UP_HEIGHT)
+        for _ in range(2):
+            for _ in self.slices(look, WARM_UP_HEIGHT):
+                pass
 
     def slices(self, look: CameraState, height: int) -> Generator[None, None, View]:
         """Render a look at about this height (pixels): yields after each slice, and returns the view."""

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.visualization.figures import new_figure, picture_of
 
 if TYPE_CHECKING:
@@ -37,14 +37,14 @@ def draw_layout(above: "Axes", side: "Axes", scene: Scene, content: Float[Tensor
     _draw_cameras(side, scene, content, (2, 1) if flat else (0, 2), "from the side")
 
 
-def coverage_picture(scene: Scene, width: int = 900, height: int = 460) -> UInt8[Tensor, "height width 3"]:
+def coverage_picture(scene: SceneRecord, width: int = 900, height: int = 460) -> UInt8[Tensor, "height width 3"]:
     """Return the coverage map alone; it needs the cameras and no photograph."""
     figure = new_figure(width, height)
     draw_coverage(figure.subplots(), scene)
     return picture_of(figure)
 
 
-def draw_coverage(axes: "Axes", scene: Scene) -> None:
+def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
     """Draw from which directions the scene was seen, and where photographs are missing."""
     from matplotlib.colors import ListedColormap
 
@@ -146,7 +146,7 @@ def _frustum(scene: Scene, view: int, length: float) -> Float[np.ndarray, "lines
     return torch.cat(edges).numpy()
 
 
-def _draw_directions(axes: "Axes", scene: Scene) -> None:
+def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
     # Forward-facing: what matters is between which places the cameras stood.
     x, y, _ = scene.cameras.c2w[:, :, 3].unbind(dim=-1)
     for split, views in _splits(scene).items():
@@ -163,8 +163,8 @@ def _draw_directions(axes: "Axes", scene: Scene) -> None:
     axes.spines[:].set_color("0.8")
 
 
-def _splits(scene: Scene) -> dict[str, list[int]]:
-    held = sorted(set(scene.splits["val"]) | set(scene.splits["test"]))
+def _splits(scene: SceneRecord) -> dict[str, list[int]]:
+    held = sorted(set(scene.splits.get("val", ())) | set(scene.splits.get("test", ())))
     return {"train": list(scene.splits["train"]), "held out": held}
 
 

@@ -34,7 +34,7 @@ from nerf_lightning.export.cameras import CamerasExport, colmap_files
 from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.report.page import Report, page
-from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.training.evaluate_and_film import metric_lines
 from nerf_lightning.visualization.figures import new_figure, picture_of
 from nerf_lightning.visualization.pictures import with_caption

@@ -24,7 +24,7 @@ from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.embedding import embedded_file, embedded_video
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.sweep_job import read_records
-from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.sfm.video_frames import require_video
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs are posix's")

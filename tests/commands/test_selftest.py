@@ -7,13 +7,14 @@ from support.self_tested import Finished
 
 from nerf_lightning.commands import selftest
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
+from nerf_lightning.selftest import place
 from nerf_lightning.selftest.checks import kernels
 
 
 @pytest.fixture
 def kernels_alone(monkeypatch):
     """Without the trainings and the command line, which take most of the time."""
-    monkeypatch.setattr(selftest, "Runs", lambda folder, overrides: Finished(folder))
+    monkeypatch.setattr(place, "Runs", lambda folder, overrides: Finished(folder))
     monkeypatch.setattr(selftest, "find_checks", kernels.checks)
 
 
@@ -53,7 +54,7 @@ def test_a_kernel_that_raises_is_wrong_and_the_rest_goes_on(nerf, kernels_alone,
 
 
 def test_other_devices_are_refused_in_one_paragraph(nerf, monkeypatch):
-    monkeypatch.setattr(selftest, "TRAINERS", {})
+    monkeypatch.setattr(place, "TRAINERS", {})
     result = nerf("selftest", "trainer=cpu")
     assert result.code == 2
     assert "nerf selftest knows CPUs and NVIDIA GPUs" in result.err

@@ -53,8 +53,8 @@ def test_going_on_with_nothing_is_refused(tmp_path):
 def test_a_requeued_slurm_job_finds_its_own_sweep(tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_JOB_ID", "7")
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    asked = [f"paths.root_dir={tmp_path}", "seed=0,1"]
-    leave_sweep(tmp_path / "sweeps" / "mine", *asked, slurm_job="7")
+    asked = [f"paths.root_dir={tmp_path}", "seed=0,1", "trainer.lightning.limit_val_batches=2"]
+    leave_sweep(tmp_path / "sweeps" / "mine", *asked[:2], f"++{asked[2]}", slurm_job="7")
     leave_sweep(tmp_path / "sweeps" / "other_job", *asked, slurm_job="8")
     leave_sweep(tmp_path / "sweeps" / "other_sweep", asked[0], "seed=2,3", slurm_job="7")
     assert f"hydra.sweep.dir='{tmp_path}/sweeps/mine'" in sweep_arguments(["-m", *asked])

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from support.measured_runs import leave_measured_run
 
-from nerf_lightning.commands.table import folder_for
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.runs.output_folder import folder_around
 
 
 def test_the_table_lies_in_the_folder_that_was_named(nerf, tmp_path):
@@ -36,14 +36,14 @@ def test_the_table_of_several_folders_lies_beside_them_or_here(nerf, tmp_path, m
 
 def test_a_way_around_names_the_same_folder():
     runs = Path("runs").absolute()
-    assert folder_for([Path("runs/a"), Path("runs/a/../b")]) == runs
-    assert folder_for([Path("runs/a"), runs / "b"]) == runs
-    assert folder_for([Path("runs/../runs")]) == runs
+    assert folder_around([Path("runs/a"), Path("runs/a/../b")]) == runs
+    assert folder_around([Path("runs/a"), runs / "b"]) == runs
+    assert folder_around([Path("runs/../runs")]) == runs
 
 
 def test_no_table_lies_in_the_root():
-    assert folder_for([Path("/data"), Path("/runs")]) == Path()
-    assert folder_for([Path("/data/a"), Path("/home/b")]) == Path()
+    assert folder_around([Path("/data"), Path("/runs")]) == Path()
+    assert folder_around([Path("/data/a"), Path("/home/b")]) == Path()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")

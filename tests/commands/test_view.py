@@ -190,7 +190,7 @@ def test_photographs_that_nobody_knows_are_not_guessed(of_unknown_scene, caplog)
 
 
 def test_without_a_browser_it_is_said_how_to_see_the_page(monkeypatch, caplog):
-    monkeypatch.setattr(view.webbrowser, "open", lambda address: False)
-    view.open_browser("http://127.0.0.1:8080/?token=x")
+    monkeypatch.setattr(page_module.webbrowser, "open", lambda address: False)
+    page_module.open_in_browser("http://127.0.0.1:8080/?token=x")
     assert "There is no browser here to open. Open http://127.0.0.1:8080/?token=x in one yourself" in caplog.text
     assert "ssh -L 8080:127.0.0.1:8080 THIS" in caplog.text

@@ -6,7 +6,7 @@ from nerf_lightning.nerf.types.progress import Progress
 
 
 def batches(scene, batch_rays=32, crop_steps=0, seed=0, crop_fraction=0.5):
-    loader = RayBatches(scene, Progress(), seed, batch_rays, num_steps=100)
+    loader = RayBatches(scene, Progress(), seed, batch_rays)
     loader.crop_to(crop_fraction, crop_steps, restart_steps=5)
     return loader
 
@@ -85,7 +85,7 @@ def test_the_loader_follows_the_runs_progress():
     assert torch.equal(next(stream).rgba, first.rgba)  # nothing was trained on: the same batch again
     loader.progress.advance(32)
     assert torch.equal(next(stream).rgba, loader.at(0, 32).rgba)
-    assert len(loader) == 100
+    assert len(loader) == 14  # 3 views of 12 x 12 pixels, 32 at a time
 
 
 def test_validation_rays_are_fixed_and_keep_their_tail():
@@ -114,11 +114,11 @@ def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog)
     from nerf_lightning.data.datamodule import RayDataModule
 
     scene = ball_scene(background="random")
-    RayDataModule(scene, Progress(), seed=0, num_steps=1)
+    RayDataModule(scene, Progress(), seed=0)
     assert caplog.text == ""
     rgba = scene.pixels.rgba.clone()
     rgba[:, 3] = 255
     opaque = replace(scene.pixels, rgba=rgba, has_transparency=False)
-    RayDataModule(replace(scene, pixels=opaque), Progress(), seed=0, num_steps=1)
+    RayDataModule(replace(scene, pixels=opaque), Progress(), seed=0)
     assert "pictures of ball have no transparent pixels" in caplog.text
     assert "scene.background=black" in caplog.text

@@ -107,7 +107,7 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     model = chosen.model()
     model.fit_to(scene)
     step = TrainStep(
-        model, rays_of(scene), chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 48, 0, "random", 8192, 1.0
+        model, rays_of(scene), chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 0, "random", 8192, 1.0
     )
     system = RadianceFieldSystem(step, {})
     settings.prepare(model)
@@ -117,7 +117,7 @@ def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, reside
     budget = "auto" if resident else 0
     with warnings.catch_warnings(record=True) as watch.caught:
         warnings.simplefilter("always")
-        trainer.fit(system, RayDataModule(scene, progress, 0, 48, batch_rays=96, val_rays=96, device_budget=budget))
+        trainer.fit(system, RayDataModule(scene, progress, 0, batch_rays=96, val_rays=96, device_budget=budget))
     assert len(watch.waits) == 48
     # A grid is updated at the beginning of the step that makes these counts one more.
     named = {1, 2, *(step + 1 for step in range(0, 48, 8)), *range(0, 49, 16), *range(0, 49, 25), 48}

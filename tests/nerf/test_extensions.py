@@ -38,7 +38,7 @@ def a_step(overrides) -> TrainStep:
     model.fit_to(scene)
     return TrainStep(
         model, rays_of(scene), build(config.loss), lambda groups: torch.optim.Adam(groups, lr=1e-2),
-        ExponentialDecay(decay_rate=1.0), Progress(), 100, 0, "random", 4096,
+        ExponentialDecay(decay_rate=1.0), Progress(), 0, "random", 4096, num_steps=100,
     )  # fmt: skip
 
 
@@ -46,7 +46,7 @@ def a_step(overrides) -> TrainStep:
 def test_it_learns_renders_and_is_saved(added):
     scene = ball_scene(num_views=8, size=16, background="random")
     step = a_step(ADDED[added])
-    loader, optimizer = RayBatches(scene, step.progress, 0, 96, 100), step.new_optimizer()
+    loader, optimizer = RayBatches(scene, step.progress, 0, 96), step.new_optimizer()
     losses = [step(loader.at(0, step.progress.rays_seen), optimizer)["losses"][-1] for _ in range(60)]
     assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
     assert step.guard.skipped == 0
@@ -59,7 +59,7 @@ def test_it_learns_renders_and_is_saved(added):
 def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
     step = a_step(ADDED["a packed sampler without a grid"])
     torch.nn.init.normal_(step.model.last.field.position_encoder.table)
-    rays = step.rays(RayBatches(ball_scene(), step.progress, 0, 64, 10).at(0, 0).pixels)
+    rays = step.rays(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0).pixels)
     whole = step.model(rays, torch.ones(64, 3), None)[0]
     with torch.no_grad():
         walked = step.model(rays, torch.ones(64, 3), None)[0]
@@ -69,7 +69,7 @@ def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
 
 def test_codes_learn_from_their_own_photographs_and_pictures_know_none():
     step = a_step(ADDED["a code for each photograph"])
-    loader, optimizer = RayBatches(ball_scene(num_views=8, size=16), step.progress, 0, 96, 100), step.new_optimizer()
+    loader, optimizer = RayBatches(ball_scene(num_views=8, size=16), step.progress, 0, 96), step.new_optimizer()
     for _ in range(20):
         step(loader.at(0, step.progress.rays_seen), optimizer)
     codes = step.model.last.field.codes.detach()

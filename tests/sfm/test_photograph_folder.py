@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.sfm.photographs import check_one_camera, find_photographs, put_upright
+from nerf_lightning.sfm.photograph_folder import check_one_camera, find_photographs, put_upright
 
 MODEL, FOCAL_LENGTH, ORIENTATION, EXIF = 0x0110, 0x920A, 0x0112, 0x8769
 

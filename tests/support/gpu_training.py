@@ -45,13 +45,14 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
     config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     scene, progress = ball_scene(), Progress()
-    training = build_step(config, settings, scene, progress, 1000).to(device)
+    training = build_step(config, settings, scene, progress).to(device)
+    training.num_steps = 1000
     for level in training.model.modules():
         if isinstance(level, PackedLevel):
             level.sampler.opaque_below = CUT
     training.model.multiply_in(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
-    return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, RAYS, 1000))
+    return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, RAYS))
 
 
 def default_callbacks(*changes: str):

@@ -7,15 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.initialize import initialize_config_dir
 from support.altered import Altered
-from support.configs import composed
 from support.running import FAST, start
 
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.training.build import build_parts
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.system import RadianceFieldSystem
@@ -38,11 +33,9 @@ class Resumed:
         return str(self.file)
 
     def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            HydraConfig.instance().set_config(compose("train", return_hydra_config=True))
         settings = ("scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25")
-        parts = build_parts(composed("train", *settings))
+        config, choices = compose_config("train", settings)
+        parts = build_parts(config, choices)
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"

@@ -14,9 +14,9 @@ from support.viser_client import ViserClient
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.viewer.page import Page
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 HEIGHT = 24
 

@@ -46,7 +46,7 @@ def make_step(tile_points, model=None, background="white", clip_norm=None, seed=
 
 def gradients(step, scene, steps=1):
     """The gradients and the losses of the last of some steps."""
-    loader, optimizer = RayBatches(scene, step.progress, 0, 64, 10), step.new_optimizer()
+    loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
     for _ in range(steps):
         seen = step(loader.at(0, step.progress.rays_seen), optimizer)
     return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen["losses"]

@@ -52,10 +52,10 @@ def most(work):
 
 def built():
     progress = Progress()
-    step = build_step(config, settings, scene, progress, 10)
+    step = build_step(config, settings, scene, progress)
     settings.prepare(step.model)
-    step.tile_points = TILE
-    return step, build(config.data)(scene=scene, progress=progress, seed=0, num_steps=10)
+    step.tile_points, step.num_steps = TILE, 10
+    return step, build(config.data)(scene=scene, progress=progress, seed=0)
 
 
 def warm(step, batches):
@@ -70,7 +70,6 @@ def warm(step, batches):
 
 
 def train():
-    optimizer = step.new_optimizer()
     for _ in range(2):
         batches.progress.batch_rays = batches.progress.largest_batch
         step(batches.at(0, batches.progress.rays_seen), optimizer)
@@ -89,7 +88,7 @@ settings.prepare_machine()
 scene = ball_scene(num_views=6, size=320, background="random")
 settings.tile_points = TILE
 step, data = built()
-batches = data.batches
+batches, optimizer = data.batches, step.new_optimizer()
 warm(step, batches)
 measured = most(lambda: (train(), evaluate()))
 plan = memory_plan(settings, *built())

@@ -31,9 +31,9 @@ def test_clipping_scales_the_whole_gradient():
 def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they_are_clipped():
     clipped, whole = make_step(100, clip_norm=1e-3), make_step(100)
     scene = ball_scene()
-    batch = RayBatches(scene, clipped.progress, 0, 64, 10).at(0, 0)
+    batch = RayBatches(scene, clipped.progress, 0, 64).at(0, 0)
     seen = clipped(batch, clipped.new_optimizer(), measure_gradients=True)
-    RayBatches(scene, whole.progress, 0, 64, 10)
+    RayBatches(scene, whole.progress, 0, 64)
     assert whole(batch, whole.new_optimizer())["gradient_norms"] == {}
     for name, level in whole.model.levels.items():
         expected = torch.cat([parameter.grad.flatten() for parameter in level.parameters()]).norm()
@@ -53,7 +53,7 @@ def test_a_step_whose_gradients_are_not_finite_is_left_out_and_counted():
     optimizer.step = lambda: steps.append(step.progress.step)
     color = step.model.levels["fine"].field.color_head.weight
     good, broken = color.detach().clone(), torch.full_like(color, float("nan"))
-    loader = RayBatches(ball_scene(), step.progress, 0, 64, 10)
+    loader = RayBatches(ball_scene(), step.progress, 0, 64)
     for weights in (good, broken, broken, good):
         with torch.no_grad():
             color.copy_(weights)
@@ -100,7 +100,7 @@ def test_the_learning_rate_follows_the_schedule():
     step = make_step(None)
     step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1, warmup_steps=2)
     rates = []
-    loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 16, 10), step.new_optimizer()
+    loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 16), step.new_optimizer()
     for _ in range(4):
         step(loader.at(0, 0), optimizer)
         rates.append(optimizer.param_groups[0]["lr"])

@@ -7,8 +7,8 @@ from support.scenes import ball_scene
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
 from nerf_lightning.viewer.channels import CHANNELS, picture_of
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.renderer import View
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from nerf_lightning.viewer import controls, limits
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.controls import Controls
 from nerf_lightning.viewer.frusta import quaternion_of
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 HEIGHT = 12
 

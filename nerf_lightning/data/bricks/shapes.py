@@ -45,7 +45,11 @@ def _nonzero(values: Numbers) -> Numbers:
 
 
 def slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interval:
-    """Return where a line is within `half` of 0 along one axis."""
+    """Return between which distances a line is within `half` of 0 along one axis (Kay and Kajiya, SIGGRAPH 1986).
+
+    Distances are in lengths of `direction`. Where the line runs along the slab, they are huge: both of one sign outside
+    of it, of two signs inside.
+    """
     inverse = 1 / _nonzero(direction)
     middle, reach = -origin * inverse, half * np.abs(inverse)
     return middle - reach, middle + reach

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, require_different
+from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import downscaled_size
-from nerf_lightning.data.pixels.photographs import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.poses import is_rigid

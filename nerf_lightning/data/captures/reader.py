@@ -13,8 +13,8 @@ from nerf_lightning.data.captures.checks import check_step, known_background
 from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
+from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
-from nerf_lightning.data.pixels.photographs import read_photographs
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed

@@ -13,7 +13,7 @@ from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
-from nerf_lightning.data.pixels.photographs import Photograph
+from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.files.numpy_files import HEADER_BYTES, array_header

@@ -13,8 +13,8 @@ from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.checks import contents, pose_from_matrix
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
-from nerf_lightning.data.pixels.photographs import Photograph
 from nerf_lightning.data.readers.transforms_intrinsics import focal_of, lens_of, number_of, size_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed, require_printable

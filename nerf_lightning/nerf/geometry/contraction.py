@@ -73,7 +73,7 @@ TINY = 1e-6
 
 
 def normalized_distance(distances: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """Map distances to [0, 1): t / 2 up to 1, then 1 - 1 / (2 t).
+    """Map distances to [0, 1]: t / 2 up to 1, then 1 - 1 / (2 t), which is half the norm of `contract` (Eq. 10).
 
     >>> normalized_distance(torch.tensor([0.0, 0.5, 1.0, 2.0, torch.inf])).tolist()
     [0.0, 0.25, 0.5, 0.75, 1.0]

@@ -3,8 +3,19 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.types.scene import SceneRecord
+
 # A camera among the content begins to see at this share of the photographs' distance.
 LEAST_NEAR = 0.01
+
+
+def near_and_far_from(
+    eyes: Float[Tensor, "frames 3"], scene: SceneRecord
+) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames"]]:
+    """Return between which distances cameras that stand at `eyes` see the content of a scene (scene units)."""
+    if scene.space != "bounded" or scene.cameras.ndc is not None:
+        return scene.near.min().expand(len(eyes)), scene.far.max().expand(len(eyes))
+    return near_and_far(eyes, scene.cameras.c2w[:, :, 3], scene.aabb.mean(dim=0), scene.near, scene.far)
 
 
 def near_and_far(

@@ -17,6 +17,9 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 class ProposalLoss(Loss):
     """Mean squared error of the last level, the interlevel loss of each proposal, and a distortion loss.
 
+    Eq. 13 and 15 of arXiv 2111.12077; colour is compared by the squared error of arXiv 2003.08934 (Eq. 6) instead of
+    the Charbonnier loss.
+
     Args:
         interlevel: factor on the interlevel losses; the proposals learn from nothing else, so it hardly matters.
         distortion: factor on the distortion loss; larger values remove fog and floaters, too large ones detail.
@@ -29,7 +32,7 @@ class ProposalLoss(Loss):
         self.interlevel, self.distortion = interlevel, distortion
 
     def forward(self, renderings: list[DenseRendering], target: Target) -> list[Float[Tensor, ""]]:
-        """Return one number per level."""
+        """Return the weighted mean over the rays for each level: interlevel losses, then colour with distortion."""
         last, weight = renderings[-1], target.weight
         losses = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
         color = ((last.rgb - target.rgb).square() * weight[..., None]).mean()

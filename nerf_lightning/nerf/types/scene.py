@@ -10,7 +10,8 @@ from torch import Tensor
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Background = Literal["white", "black", "random", "none"]
-"""What lies behind the scene; `none` closes the ray: its last interval takes all the light that is left."""
+"""What lies behind the scene. `none`: nothing. The last interval of a dense level takes all the light that is left;
+levels behind an occupancy grid have no such interval, and leave it black."""
 
 LensModel = Literal["pinhole", "radial_tangential", "fisheye"]
 """How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`."""
@@ -85,12 +86,11 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What a reader returns: pictures with cameras, and where to look for content."""
+class SceneRecord:
+    """What outlives the pictures: enough to render, and to place what is rendered in the user's frame."""
 
     name: str
     cameras: Cameras
-    pixels: PixelStore
     near: Float[Tensor, "views"]
     """Distance along the ray at which content may begin, per view, in scene units."""
     far: Float[Tensor, "views"]
@@ -98,16 +98,23 @@ class Scene:
     aabb: Float[Tensor, "2 3"]
     """Lower and upper corner of a world box that contains the content."""
     splits: dict[str, tuple[int, ...]]
-    """Views of `train`, `val` and `test`."""
+    """Views of `train`, `val` and `test`; the last two may be absent from a checkpoint."""
     view_names: tuple[str, ...]
     background: Background
     to_user: Float[Tensor, "4 4"]
     """Similarity that takes scene coordinates to the user's own frame."""
+    space: Space = "bounded"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(SceneRecord):
+    """What a reader returns: pictures with cameras, and where to look for content."""
+
+    pixels: PixelStore
     protocol: dict[str, str]
     """How the pixels were made (downscale filter and the like), stamped on every number measured on them."""
     truth: Truth | None
     """Exact depth and normals, for scenes that know them."""
-    space: Space = "bounded"
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
     """Sparse points of a reconstruction, in scene units; there may be none."""
     left_out: tuple[str, ...] = ()

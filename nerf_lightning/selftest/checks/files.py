@@ -7,21 +7,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord, read_checkpoint
+from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.nerf.geometry.near_far import near_and_far_from
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.selftest.check import Check
 from nerf_lightning.selftest.place import Place
 from nerf_lightning.selftest.runs import FILM_VIEWS, STEPS, STOP
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene
 from nerf_lightning.sfm.video_frames import count_frames
 from nerf_lightning.video.paths.base import frame_of
-from nerf_lightning.video.paths.photographs import Photographs
+from nerf_lightning.video.paths.photograph_path import PhotographPath
 
 ONE_STEP = 0.03
 """The learning rate: about what a step moves a weight by."""
@@ -122,9 +123,9 @@ def _film(place: Place) -> float:
     if len(files) != len(FILM_VIEWS):
         raise ValueError(f"{len(files)} frames were written, and {len(FILM_VIEWS)} were asked for")
     model, scene = _loaded(place)
-    path = Photographs(num_frames=len(FILM_VIEWS), views=list(FILM_VIEWS))
+    path = PhotographPath(num_frames=len(FILM_VIEWS), views=list(FILM_VIEWS))
     cameras = path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
-    near, far = scene.near_and_far(cameras.c2w[:, :, 3])
+    near, far = near_and_far_from(cameras.c2w[:, :, 3], scene)
     differences = []
     for frame, file in enumerate(files):
         seen = (255.0 * _picture(model, scene, cameras, frame, near, far).rgb.clamp(0, 1)).round()

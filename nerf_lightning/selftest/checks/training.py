@@ -53,7 +53,7 @@ class Training:
         ).to(device)
         model.multiply_in(products)
         here = scene if device.type == "cpu" else on_device(scene, device)
-        self.loader = RayBatches(here, progress, SEED, BATCH_RAYS, STEPS)
+        self.loader = RayBatches(here, progress, SEED, BATCH_RAYS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
         self.optimizer = self.step.new_optimizer()
 
@@ -154,9 +154,7 @@ def _resident(place: Place) -> Check:
         if not place.is_cuda:
             raise CannotRun("pixels move to GPUs, and the device here is none")
         scene = ball_scene()
-        loaders = [
-            RayBatches(each, Progress(), SEED, BATCH_RAYS, STEPS) for each in (on_device(scene, place.device), scene)
-        ]
+        loaders = [RayBatches(each, Progress(), SEED, BATCH_RAYS) for each in (on_device(scene, place.device), scene)]
         there, here = (loader.at(0, 1000) for loader in loaders)
         if not all(torch.equal(value.cpu(), vars(here.pixels)[name]) for name, value in vars(there.pixels).items()):
             raise ValueError("other pixels are chosen")

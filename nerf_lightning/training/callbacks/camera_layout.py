@@ -10,7 +10,7 @@ from nerf_lightning.visualization.camera_layout import layout_picture
 
 
 class CameraLayout(Callback):
-    """Draw the cameras once, after the first step: nobody waits for it."""
+    """Draw the cameras once, after the first step, so that the drawing does not delay the start."""
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Draw, if this was the first step of the run."""

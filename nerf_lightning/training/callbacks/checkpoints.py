@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import BEST, LAST
-from nerf_lightning.errors import require_positive
+from nerf_lightning.errors import InputError, require_positive
 from nerf_lightning.files.schema import Maybe, Number, Record
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
@@ -33,13 +33,21 @@ class Checkpoints(Callback):
         self.every_steps, self.monitor = every_steps, monitor
         self.best: float | None = None
 
+    def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
+        """See that the trainer has who writes them.
+
+        Raises:
+            InputError: it has not.
+        """
+        writer(trainer, self)
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Write `last.ckpt` when it is time.
 
         Raises:
             InputError: an earlier one could not be written.
         """
-        writer(trainer).raise_failure()
+        writer(trainer, self).raise_failure()
         if trainer.global_step % self.every_steps == 0 and pl_module.step.is_sound():
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
@@ -59,7 +67,7 @@ class Checkpoints(Callback):
             InputError: the weights are not finite, or a checkpoint could not be written.
         """
         trainer.save_checkpoint(self.folder(trainer) / LAST)
-        writer(trainer).wait()
+        writer(trainer, self).wait()
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the best across a resume."""
@@ -75,8 +83,22 @@ class Checkpoints(Callback):
         return Path(trainer.default_root_dir) / "checkpoints"
 
 
-def writer(trainer: Trainer) -> AtomicCheckpointIO:
-    """Return who writes the checkpoints."""
+def writer(trainer: Trainer, callback: Callback) -> AtomicCheckpointIO:
+    """Return who writes the checkpoints.
+
+    Args:
+        trainer: of the run.
+        callback: asks for it, for the message.
+
+    Raises:
+        InputError: another plugin does, as in a trainer that was not made by `nerf train`.
+    """
     plugin = trainer.strategy.checkpoint_io
-    assert isinstance(plugin, AtomicCheckpointIO), "TrainerSettings.build gives the trainer this plugin"
+    if not isinstance(plugin, AtomicCheckpointIO):
+        raise InputError(
+            f"The callback {type(callback).__name__} needs the checkpoints that are written beside training: give "
+            "Trainer(plugins=[AtomicCheckpointIO()], enable_checkpointing=False), from "
+            "nerf_lightning.training.launch.checkpoint_io, and the callback Checkpoints; or leave "
+            f"{type(callback).__name__} out, and let Lightning's ModelCheckpoint write."
+        )
     return plugin

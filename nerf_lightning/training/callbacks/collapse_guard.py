@@ -29,6 +29,9 @@ class CollapseGuard(Callback):
         patience: looks in a row that must fail.
         ratio: smallest share of the targets' spread that counts as alive.
         max_restarts: how often it restarts at most.
+
+    Raises:
+        InputError: `every_steps` or `patience` is below 1.
     """
 
     STATE = Record({"failed": Whole()})

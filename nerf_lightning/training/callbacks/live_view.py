@@ -13,22 +13,22 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, require_viser
-from nerf_lightning.viewer.photographs import Photographs
 from nerf_lightning.viewer.ports import require_address
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.shown_photographs import Photographs
 
 # Steps take their time, so a picture may as well.
 MOVING_SECONDS = 0.5
-# Time for pictures that nobody wanted is not saved up.
+# How much unused time for pictures is saved up at most (seconds).
 MOST_CREDIT = 0.1
 
 
 class LiveView(Callback):
     """Render between steps, in the training's own thread, for whoever has the page open.
 
-    Training waits for nobody: pictures get a share of the time and are sent by viser's thread. Nothing that training
-    reads is changed.
+    Training does not wait for the page: pictures get a share of the time, and viser's thread sends them. Nothing that
+    training reads is changed.
 
     Args:
         host: the address to listen on; 127.0.0.1 is heard by this machine alone.

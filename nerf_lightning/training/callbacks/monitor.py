@@ -14,7 +14,9 @@ GIGABYTE = 1e9
 
 
 class Monitor(Watcher):
-    """Log every few steps, straight to the loggers: `LightningModule.log` would cost more than a small step.
+    """Log losses, PSNR (dB), speed, memory (gigabytes) and gradients every few steps.
+
+    They go straight to the loggers: `LightningModule.log` would cost more than a small step.
 
     Args:
         every_steps: steps between two rows.
@@ -33,7 +35,9 @@ class Monitor(Watcher):
     def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
         """Tell whether the step that begins gets a row, and so has to measure the norms of its gradients."""
         # XLA would compile the steps that get a row and those that do not as two programs.
-        return system.device.type == "xla" or self.is_time(trainer.global_step + 1, trainer.max_steps)
+        return system.device.type == "xla" or self.is_time(
+            trainer.global_step + 1, int(trainer.estimated_stepping_batches)
+        )
 
     def watch(self, trainer: Any, system: Any, outputs: Any) -> None:
         """Log a row."""

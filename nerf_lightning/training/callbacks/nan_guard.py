@@ -48,6 +48,14 @@ class NanGuard(Callback):
         self.on_nan, self.patience, self.every_steps = on_nan, patience, every_steps
         self.factor, self.max_rollbacks = factor, max_rollbacks
 
+    def setup(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
+        """See that there will be checkpoints to go back to, or to name.
+
+        Raises:
+            InputError: others are written than those.
+        """
+        writer(trainer, self)
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Look whether the run still learns.
 
@@ -68,7 +76,7 @@ class NanGuard(Callback):
         self._act(trainer, pl_module, cause)
 
     def _act(self, trainer: Trainer, system: Any, cause: str) -> None:
-        good, progress = ranks.from_first(lambda: _last_good(trainer)), system.step.progress
+        good, progress = ranks.from_first(lambda: self._last_good(trainer)), system.step.progress
         if self.on_nan == "stop" or progress.rollbacks >= self.max_rollbacks:
             raise InputError(f"{cause}, so nothing is learnt any more and the run stops. {self._advice(trainer, good)}")
         self._roll_back(trainer, system, good)
@@ -113,7 +121,6 @@ class NanGuard(Callback):
         weights = f"a new run from its weights (init_from={good})"
         return f"The last good checkpoint is {good}. {lower} {weights} with {settings}."
 
-
-def _last_good(trainer: Trainer) -> Path | None:
-    writer(trainer).wait()
-    return last_good_checkpoint(Checkpoints.folder(trainer))
+    def _last_good(self, trainer: Trainer) -> Path | None:
+        writer(trainer, self).wait()
+        return last_good_checkpoint(Checkpoints.folder(trainer))

@@ -53,7 +53,7 @@ class TrainingProgress(ProgressBar):
             console=console,
             expand=True,
         )
-        self.task = self.bar.add_task("", total=trainer.max_steps, completed=trainer.global_step)
+        self.task = self.bar.add_task("", total=pl_module.step.num_steps, completed=trainer.global_step)
         self.bar.start()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:

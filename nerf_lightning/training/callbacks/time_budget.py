@@ -73,4 +73,6 @@ class TimeBudget(Callback):
 
     def _fit_schedule(self, trainer: Trainer, training: Any) -> None:
         step = training.progress.step
-        training.num_steps = min(trainer.max_steps, max(step + 1, int(step * self.seconds / self.used)))
+        training.num_steps = min(
+            int(trainer.estimated_stepping_batches), max(step + 1, int(step * self.seconds / self.used))
+        )

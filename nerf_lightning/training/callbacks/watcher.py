@@ -31,7 +31,7 @@ class Watcher(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """Look when it is time."""
-        if self.is_time(trainer.global_step, trainer.max_steps):
+        if self.is_time(trainer.global_step, int(trainer.estimated_stepping_batches)):
             self.watch(trainer, pl_module, outputs)
 
     def is_time(self, step: int, last_step: int) -> bool:
@@ -59,7 +59,7 @@ def tensorboard_writers(loggers: Sequence[Logger]) -> list[SummaryWriter]:
 def errors_told_once() -> Iterator[None]:
     """Let TensorBoard's threads print nothing when they cannot write, as where the disk is full.
 
-    They keep the error, and whoever writes next, or flushes, raises it.
+    They keep the error, and raise it at the next write or flush.
     """
     former = threading.excepthook
 

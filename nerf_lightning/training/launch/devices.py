@@ -178,6 +178,7 @@ def _keep_large_blocks() -> None:
 def _quiet_libraries() -> None:
     # Advice about data loader workers and the like, which does not apply: our loader is not a DataLoader.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # their tables
     ignored: list[dict[str, Any]] = [
         {"message": ".*does not have many workers.*"},
         {"message": ".*LeafSpec.*", "category": FutureWarning},

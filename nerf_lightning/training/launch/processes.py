@@ -99,7 +99,7 @@ def joined(device_type: str) -> Iterator[None]:
         yield
     except InputError:
         if not ranks.is_first():
-            # The first one says the same, and ends the others; who is alone with it speaks.
+            # The first process reports the same error and ends the others; one that fails alone does so after this.
             time.sleep(PATIENCE_SECONDS)
         raise
     finally:

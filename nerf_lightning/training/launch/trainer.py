@@ -27,6 +27,7 @@ from nerf_lightning.training.launch.devices import (
     prepare_machine,
     working_device,
 )
+from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
 from nerf_lightning.training.launch.strategy import Launcher, OneSumPerStep, cluster_environment
 
 PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
@@ -60,6 +61,8 @@ class TrainerSettings:
         devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
             TPU the cores, of one process.
         launched_by: who starts the processes: nerf itself, torchrun, or Slurm's srun; then `devices` is theirs to say.
+        lightning: other arguments of Lightning's Trainer, such as profiler; those that a setting of ours says are
+            refused.
     """
 
     def __init__(
@@ -76,6 +79,7 @@ class TrainerSettings:
         deterministic: bool = False,
         devices: int | Literal["auto"] = 1,
         launched_by: Launcher = "nerf",
+        lightning: dict[str, Any] | None = None,
     ):
         for name, value in (("max_steps", max_steps), ("val_every_steps", val_every_steps)):
             if value < 1:
@@ -89,6 +93,7 @@ class TrainerSettings:
         if isinstance(tile_points, int) and tile_points < 1:
             raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
         self.max_steps, self.max_epochs = max_steps, max_epochs
+        self.lightning = passed_through(lightning)
         self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
@@ -104,9 +109,10 @@ class TrainerSettings:
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
+        most = min(self.max_steps, int(self.lightning.get("fast_dev_run", False)) or self.max_steps)
         if self.max_epochs is None:
-            return self.max_steps
-        return min(self.max_steps, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
+            return most
+        return min(most, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
 
     def prepare_machine(self) -> None:
         """Set threads and the allocator, once per process."""
@@ -126,11 +132,9 @@ class TrainerSettings:
             logger=list(loggers) or False,
             val_check_interval=min(self.val_every_steps, num_steps),
             check_val_every_n_epoch=None,
-            num_sanity_val_steps=0,
             enable_checkpointing=False,
-            enable_model_summary=False,
             enable_progress_bar=any(type(callback).__name__ == "TrainingProgress" for callback in callbacks),
-            log_every_n_steps=1,
+            **written_to(folder, self.lightning),
         )
 
     def _placement(self) -> dict[str, Any]:

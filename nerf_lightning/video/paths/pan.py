@@ -11,7 +11,7 @@ from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
-from nerf_lightning.video.paths.photographs import find_views
+from nerf_lightning.video.paths.photograph_path import find_views
 
 
 @final

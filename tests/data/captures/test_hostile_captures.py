@@ -24,7 +24,7 @@ from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
-from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.photograph_folder import find_photographs
 
 HEADERS = {
     "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-9, -17)}",

@@ -17,7 +17,7 @@ GIGABYTE = 1e9
 TRAIN = """
 import statistics, sys, threading, time
 
-import nerf_lightning.data.pixels.photographs as photographs
+from nerf_lightning.data.pixels import decoding
 from nerf_lightning.data.pixels.mapped_store import FORMAT, Header
 from nerf_lightning.data.ray_batches import RayBatches
 
@@ -50,7 +50,7 @@ def timed(*arguments):
     return batch
 
 
-photographs._write = write_nothing
+decoding._write = write_nothing
 RayBatches.at = timed
 most, done = [0], threading.Event()
 watcher = threading.Thread(target=watch)

@@ -55,7 +55,7 @@ def test_without_masks_loss_and_gradients_are_those_of_a_plain_mean_to_the_bit(t
 
 def test_the_loss_is_the_mean_over_unmasked_pixels():
     step, scene = make_step(None), masked(ball_scene(), lambda number: number % 3 > 0)
-    batch = RayBatches(scene, Progress(), 0, 64, 10).at(0, 0)
+    batch = RayBatches(scene, Progress(), 0, 64).at(0, 0)
     kept = batch.weight > 0
     assert 0 < int(kept.sum()) < 64
     seen = step.gradients(batch)

@@ -19,7 +19,7 @@ from nerf_lightning.data.bricks.cache import Rendered, cached
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.errors import InputError
-from nerf_lightning.sfm.photographs import find_photographs
+from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.sfm.video_frames import count_frames
 
 MEGABYTE = 2**20

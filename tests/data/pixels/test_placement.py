@@ -22,7 +22,7 @@ CPU = torch.device("cpu")
 
 
 def loader(scene, ahead=False):
-    batches = RayBatches(scene, Progress(), seed=3, batch_rays=50, num_steps=100)
+    batches = RayBatches(scene, Progress(), seed=3, batch_rays=50)
     batches.crop_to(0.5, steps=2, restart_steps=3)
     batches.prefetch_for = CPU if ahead else None
     return batches
@@ -120,13 +120,13 @@ def test_the_budget_decides(monkeypatch):
     assert budget_bytes("auto", torch.device("xla", 0)) == 0
 
     scene = ball_scene()  # 6 views of 12 x 12 pixels: 3456 bytes
-    data = RayDataModule(scene, Progress(), seed=0, num_steps=1)
+    data = RayDataModule(scene, Progress(), seed=0)
     assert data.fits(torch.device("cuda"))
     assert not data.fits(CPU)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000, 80_000))
     assert not data.fits(torch.device("cuda"))
     with pytest.raises(InputError, match="device_budget=-1"):
-        RayDataModule(scene, Progress(), seed=0, num_steps=1, device_budget=-1)
+        RayDataModule(scene, Progress(), seed=0, device_budget=-1)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_the_budget_decides(monkeypatch):
     ],
 )
 def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, available, expected):
-    data = RayDataModule(ball_scene(), Progress(), seed=0, num_steps=1, device_budget=0, prefetch=prefetch)
+    data = RayDataModule(ball_scene(), Progress(), seed=0, device_budget=0, prefetch=prefetch)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": available}))
     data.settle(torch.device(kind))
     assert data.batches.prefetch_for == (None if expected is None else torch.device(expected))
@@ -150,14 +150,14 @@ def test_batches_are_made_ahead_where_it_helps(monkeypatch, prefetch, kind, avai
 def test_pixels_that_fit_move_once(monkeypatch):
     moves = []
     scene = ball_scene()
-    data = RayDataModule(scene, Progress(), seed=0, num_steps=1, device_budget=1)
+    data = RayDataModule(scene, Progress(), seed=0, device_budget=1)
     monkeypatch.setattr(datamodule, "on_device", lambda *arguments: moves.append(arguments) or on_device(scene, CPU))
     for _ in range(2):
         data.settle(torch.device("cuda"))
     assert len(moves) == 1
     assert data.batches.prefetch_for is None
     assert data.batches.scene is not scene
-    assert equal(data.batches.at(0, 0), RayDataModule(scene, Progress(), seed=0, num_steps=1).batches.at(0, 0))
+    assert equal(data.batches.at(0, 0), RayDataModule(scene, Progress(), seed=0).batches.at(0, 0))
 
 
 def test_a_mapped_store_is_sent_by_name(tmp_path):

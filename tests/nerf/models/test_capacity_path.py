@@ -43,12 +43,14 @@ def a_step(name: str, scene, progress: Progress, loss=None) -> TrainStep:
     # torch's fused Adam does not know the device.
     plain = method.optimizer if "hash" in name else lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loss = loss or method.loss()
-    return TrainStep(model, rays_of(scene), loss, plain, ExponentialDecay(), progress, 100, 0, "random", None, 1.0)
+    return TrainStep(
+        model, rays_of(scene), loss, plain, ExponentialDecay(), progress, 0, "random", None, 1.0, num_steps=100
+    )
 
 
 def sent_within_a_step(name, monkeypatch, loss=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-    loader, step = RayBatches(scene, progress, 0, 64, 100), a_step(name, scene, progress, loss)
+    loader, step = RayBatches(scene, progress, 0, 64), a_step(name, scene, progress, loss)
     # What is read once in a run (switches, lattices) or at each update of the grid is read on the host.
     step(loader.at(0, 0), step.new_optimizer())
     optimizer = step.to(torch.device("meta")).new_optimizer()
@@ -103,7 +105,7 @@ def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():
     losses, dropped = [], []
     for name in ("packed hash grid", "packed hash grid, fixed capacity"):
         scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
-        step, loader = a_step(name, scene, progress), RayBatches(scene, progress, 0, 64, 100)
+        step, loader = a_step(name, scene, progress), RayBatches(scene, progress, 0, 64)
         optimizer = step.new_optimizer()
         for _ in range(20):
             seen = step(loader.at(0, progress.rays_seen), optimizer)
@@ -117,7 +119,7 @@ def test_without_room_samples_are_dropped_and_counted():
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     step = a_step("packed hash grid, fixed capacity", scene, progress)
     step.model.last.sampler.capacity = 500
-    loader, optimizer = RayBatches(scene, progress, 0, 64, 100), step.new_optimizer()
+    loader, optimizer = RayBatches(scene, progress, 0, 64), step.new_optimizer()
     for _ in range(3):
         step(loader.at(0, progress.rays_seen), optimizer)
     assert step.model.statistics()["train/dropped_samples"] > 500

@@ -80,7 +80,7 @@ def test_it_learns(model, field, position, direction):
         tile_points=4096,
     )
     optimizer = step.new_optimizer()
-    loader = RayBatches(scene, progress, 0, 64, 60)
+    loader = RayBatches(scene, progress, 0, 64)
     losses = []
     for _ in range(30):
         losses.append(float(step(loader.at(0, progress.rays_seen), optimizer)["losses"][-1]))
@@ -102,7 +102,7 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
         sample_budget=1000,
     )  # fmt: skip
     optimizer = step.new_optimizer()
-    loader = RayBatches(scene, progress, 0, 512, 60)
+    loader = RayBatches(scene, progress, 0, 512)
     sizes = []
     for _ in range(40):
         sizes.append(progress.batch_rays)

@@ -32,11 +32,11 @@ def trained(name, scene):
     model.fit_to(scene)
     progress = Progress()
     step = TrainStep(
-        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, STEPS, 2, "random",
-        TILE_POINTS,
+        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, "random",
+        TILE_POINTS, num_steps=STEPS,
     )  # fmt: skip
     model.multiply_in("bfloat16")
-    batches, optimizer = RayBatches(scene, progress, 0, RAYS.get(name, MOST_RAYS), STEPS), step.new_optimizer()
+    batches, optimizer = RayBatches(scene, progress, 0, RAYS.get(name, MOST_RAYS)), step.new_optimizer()
     for _ in range(STEPS):
         step(batches.at(0, progress.rays_seen), optimizer)
     return model.eval()

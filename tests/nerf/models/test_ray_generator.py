@@ -51,7 +51,7 @@ def test_cameras_can_learn_in_tiles_and_whole():
         step.rays = LearntShifts(scene.cameras, scene.near, scene.far)
         step.build_optimizer = lambda groups: torch.optim.SGD(groups, lr=1.0)
         optimizer = step.new_optimizer()
-        step(RayBatches(scene, step.progress, 0, 64, 10).at(0, 0), optimizer)
+        step(RayBatches(scene, step.progress, 0, 64).at(0, 0), optimizer)
         shifts.append(step.rays.shift.detach())
     assert float(shifts[0][list(scene.splits["train"])].abs().min()) > 0
     torch.testing.assert_close(shifts[0], shifts[1], rtol=1e-3, atol=1e-7)
@@ -67,7 +67,7 @@ def test_a_training_step_says_which_photograph_it_explains_and_validation_does_n
 
     model.forward = forward
     step = make_step(None, model)
-    batch = RayBatches(ball_scene(), step.progress, 0, 64, 10).at(0, 0)
+    batch = RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
     step(batch, step.new_optimizer())
     assert torch.equal(seen[0], batch.pixels.view)
     step.validate(batch, RayErrors())

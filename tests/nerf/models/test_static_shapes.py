@@ -33,7 +33,7 @@ class Operations(TorchDispatchMode):
 def operations_of_steps(name, steps, model=None, loss=None):
     scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
     step = static_system(name, scene, progress, 100, model, loss).step
-    loader = RayBatches(scene, progress, 0, 64, 100)
+    loader = RayBatches(scene, progress, 0, 64)
     # What is read once in a run (switches, the grid's content) is read on the host.
     step.model.update(4, 0)
     step.model(step.rays(loader.at(0, 0).pixels), torch.zeros(64, 3), None)

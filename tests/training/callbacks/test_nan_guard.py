@@ -45,13 +45,12 @@ def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_step
         optimizer=optimizer or partial(torch.optim.Adam, lr=0.01),
         schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
         progress=progress,
-        num_steps=max_steps,
         seed=0,
         background="white",
     )
     system = RadianceFieldSystem(step_of_training, record)
     loss.step, loss.until, loss.limit, loss.holder = step, until, limit, (system,)
-    data = RayDataModule(scene, progress, 0, max_steps, batch_rays=16, crop_steps=3, val_rays=16)
+    data = RayDataModule(scene, progress, 0, batch_rays=16, crop_steps=3, val_rays=16)
     folder.mkdir(exist_ok=True)
     trainer = Trainer(
         default_root_dir=folder, max_steps=max_steps, max_epochs=-1, accelerator="cpu", logger=False,

@@ -17,7 +17,7 @@ def a_system(name):
     progress, scene = Progress(), ball_scene(num_views=6)
     model = fast_model(PackedLevel) if name == "fast_dense" else tiny_model()
     system = static_system(name, scene, progress, 10, model=model)
-    return system.step, RayBatches(scene, progress, 0, 64, 10).at(0, 0)
+    return system.step, RayBatches(scene, progress, 0, 64).at(0, 0)
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])

@@ -11,7 +11,7 @@ from nerf_lightning.training.callbacks.time_budget import TimeBudget
 
 
 def trainer():
-    return create_autospec(Trainer, instance=True, max_steps=200_000)
+    return create_autospec(Trainer, instance=True, estimated_stepping_batches=200_000)
 
 
 def a_system(step):

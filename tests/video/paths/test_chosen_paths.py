@@ -17,7 +17,7 @@ from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 from nerf_lightning.video.paths.look_at import LookAt
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.paths.pan import Pan
-from nerf_lightning.video.paths.photographs import Photographs
+from nerf_lightning.video.paths.photograph_path import PhotographPath
 from nerf_lightning.video.paths.spiral import Spiral
 
 MIDDLE = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
@@ -64,8 +64,8 @@ def every_path(tmp_path):
         LookAt(5, start=[6.0, 1.0, 2.0], end=[7.0, 8.0, 9.0]),
         Pan(5, position=[6.0, 1.0, 2.0]),
         Pan(5, view="IMG_03*"),
-        Photographs(5, views=[0, "IMG_05.jpg", 3]),
-        Photographs(5, views=[0, 2, 3], closed=True),
+        PhotographPath(5, views=[0, "IMG_05.jpg", 3]),
+        PhotographPath(5, views=[0, 2, 3], closed=True),
         KeyframePath(keys(tmp_path), 5),
     ]
 
@@ -176,7 +176,7 @@ def test_a_tilted_pan_looks_higher():
 
 def test_a_path_passes_the_photographs_as_they_were_taken():
     chosen = frame().poses[[0, 3, 4]]
-    cameras = Photographs(2001, views=[0, "IMG_03*", 4]).cameras(frame())
+    cameras = PhotographPath(2001, views=[0, "IMG_03*", 4]).cameras(frame())
     for pose in chosen:
         apart = (cameras.c2w - pose).abs().amax(dim=(-2, -1))
         assert float(apart.min()) < 5e-3
@@ -184,7 +184,7 @@ def test_a_path_passes_the_photographs_as_they_were_taken():
 
 
 def test_a_closed_path_is_smooth_where_it_closes():
-    eyes = Photographs(400, closed=True).cameras(frame()).c2w[:, :, 3]
+    eyes = PhotographPath(400, closed=True).cameras(frame()).c2w[:, :, 3]
     velocity = eyes.roll(-1, dims=0) - eyes
     change = (velocity.roll(-1, dims=0) - velocity).norm(dim=-1)
     assert float(change[-2:].max()) <= float(change[:-2].max()) * 1.01
@@ -194,21 +194,24 @@ def test_a_closed_path_is_smooth_where_it_closes():
 def test_a_far_photograph_takes_longer_to_reach():
     eyes = MIDDLE + torch.tensor([[0.0, 9.0, 0.0], [1.0, 9.0, 0.0], [11.0, 9.0, 0.0]], dtype=torch.float64)
     along_x = look_at(eyes, eyes - torch.tensor([0.0, 1.0, 0.0]).double(), UP)
-    x = Photographs(111).cameras(replace(frame(), poses=along_x)).c2w[:, 0, 3]
+    x = PhotographPath(111).cameras(replace(frame(), poses=along_x)).c2w[:, 0, 3]
     torch.testing.assert_close(x.diff(), torch.full((110,), 0.1, dtype=torch.float64))
 
 
 def test_fov_is_a_setting_of_every_path():
-    cameras = Photographs(3, fov=90.0, width=60).cameras(frame())
+    cameras = PhotographPath(3, fov=90.0, width=60).cameras(frame())
     assert cameras.focal[0].tolist() == pytest.approx([30.0, 30.0])
 
 
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        (Photographs(views=["IMG_99.jpg", 1]), r"no photograph IMG_99.jpg. It has 8, numbered from 0, with names like"),
-        (Photographs(views=[0, 8]), "no photograph 8. It has 8"),
-        (Photographs(views=[3]), r"names 1 photograph\(s\), and a path needs two"),
+        (
+            PhotographPath(views=["IMG_99.jpg", 1]),
+            r"no photograph IMG_99.jpg. It has 8, numbered from 0, with names like",
+        ),
+        (PhotographPath(views=[0, 8]), "no photograph 8. It has 8"),
+        (PhotographPath(views=[3]), r"names 1 photograph\(s\), and a path needs two"),
         (Pan(view="IMG_7"), "path.view: the capture has no photograph IMG_7"),
         (LookAt(target=[1.0, 2.0]), "path.target is .1.0, 2.0., but must be three finite numbers"),
         (LookAt(start=[1.0, 2.0, 9.0], end=[3.0, 2.0, 9.0]), "frame 0 of the path looks along its own up axis"),

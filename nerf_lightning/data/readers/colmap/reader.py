@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
-from nerf_lightning.data.pixels.photographs import Photograph
+from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.colmap.model import find_model, model_files, read_model
 from nerf_lightning.data.readers.colmap.records import ColmapCamera, ColmapImage
 from nerf_lightning.errors import InputError

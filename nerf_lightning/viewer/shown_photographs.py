@@ -6,9 +6,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.scene import Background, Scene
+from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 THUMBNAIL = 96

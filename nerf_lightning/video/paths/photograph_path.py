@@ -14,7 +14,7 @@ from nerf_lightning.video.paths.spline import even_speed, frame_times, poses_alo
 
 @final
 @dataclass
-class Photographs(CameraPath):
+class PhotographPath(CameraPath):
     """Go from photograph to photograph, where and as they were taken, at about one speed.
 
     Args:

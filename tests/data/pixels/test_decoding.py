@@ -12,10 +12,10 @@ from PIL import Image
 from support.captures import picture
 from support.running import start_code
 
+from nerf_lightning.data.pixels import decoding as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
-from nerf_lightning.data.pixels import photographs as module
+from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
 from nerf_lightning.data.pixels.images import area_downscale, crop_to_multiple, read_rgba
-from nerf_lightning.data.pixels.photographs import Photograph, read_photographs
 from nerf_lightning.errors import InputError
 
 SIZES = [(9, 7), (8, 8), (6, 10)]
@@ -217,7 +217,7 @@ import sys
 import time
 from pathlib import Path
 
-from nerf_lightning.data.pixels import photographs as module
+from nerf_lightning.data.pixels import decoding as module
 
 count = 0
 plain = module.read_rgba

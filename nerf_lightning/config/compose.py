@@ -1,0 +1,55 @@
+"""The config of a command, composed without a command line, as for a notebook."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.initialize import initialize_config_dir
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from nerf_lightning.config.instantiate import require_sections
+from nerf_lightning.config.messages import paragraph
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
+
+
+def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """Return the config that `nerf COMMAND OVERRIDES` would have, and the names picked from each group.
+
+    Raises:
+        InputError: an override that cannot be read, or names what is not there.
+    """
+    try:
+        with _hydra():
+            config = compose(command, overrides=list(overrides), return_hydra_config=True)
+        choices = chosen(config.hydra.runtime.choices)
+        with open_dict(config):
+            del config["hydra"]
+        primary = OmegaConf.load(conf_folder() / f"{command}.yaml")
+        assert isinstance(primary, DictConfig)
+        require_sections(config, primary)
+    except Exception as error:
+        message = paragraph(error, command, conf_folder())
+        if message is None:
+            raise
+        raise InputError(message) from error
+    return config, choices
+
+
+def chosen(choices: Mapping[str, Any]) -> dict[str, str]:
+    """Return the names picked from each group, without those of which none was."""
+    return {key: value for key, value in choices.items() if isinstance(value, str)}
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Let Hydra compose from our conf/, and leave another application of it, which may have called us, as it was."""
+    former = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = former  # Hydra puts a copy of the holder in place

@@ -1,0 +1,48 @@
+"""What a person is told of poses that were found."""
+
+from pathlib import Path
+
+from nerf_lightning.escaping import listed
+from nerf_lightning.sfm.reconstruction import SparseModel
+
+# Of the photographs: where fewer were registered, there is advice.
+ENOUGH = 0.8
+
+
+def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Path, seconds: float) -> list[str]:
+    """Return what was found, line by line, with advice where it is little.
+
+    Args:
+        model: the cameras.
+        matching: how photographs were paired.
+        is_video: whether they are frames of a video.
+        folder: where the capture was written.
+        seconds: how long it took.
+    """
+    found, total = len(model.registered), len(model.registered) + len(model.left_out)
+    what = "frames" if is_video else "photographs"
+    cameras = "one camera" if model.num_cameras == 1 else f"{model.num_cameras} cameras"
+    lines = [
+        f"registered          {found} of {total} {what} ({cameras}, {matching} matching)",
+        f"reprojection error  {model.reprojection_error:.2f} px",
+        f"points              {model.num_points}",
+        f"time                {seconds:.0f} s",
+        f"written to          {folder}",
+    ]
+    if model.left_out:
+        lines.append(f"left out            {listed(model.left_out)}")
+    if found < ENOUGH * total:
+        lines.append(_advice(matching, is_video))
+    return lines
+
+
+def _advice(matching: str, is_video: bool) -> str:
+    words = ["few were registered:"]
+    if is_video:
+        words.append("film slowly, walking rather than turning; a smaller every= takes more frames of this video.")
+    else:
+        words.append("take more photographs between those left out and the others (overlapping by two thirds),")
+        words.append("sharp ones, with one zoom and from places some steps apart.")
+    if matching == "sequential":
+        words.append("matching=exhaustive compares every photograph with every other.")
+    return " ".join([*words, "num_features=8192 finds more details."])

@@ -1,0 +1,112 @@
+"""What a person adds to a run on the command line: flags of Lightning's, and callbacks of their own."""
+
+import json
+
+import pytest
+import yaml
+from support.running import FAST, refused, said
+
+from nerf_lightning.runs.saved_overrides import former_overrides
+
+MINE = '''
+from pathlib import Path
+
+from lightning.pytorch.callbacks import Callback
+
+
+class Counter(Callback):
+    """Count steps into a file."""
+
+    def __init__(self, path, start=0):
+        self.path, self.steps = Path(path), start
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.steps += 1
+        assert outputs["losses"].shape == (2,)
+
+    def on_train_end(self, trainer, pl_module):
+        self.path.write_text(str(self.steps))
+
+    def state_dict(self):
+        return {"steps": self.steps}
+
+    def load_state_dict(self, state_dict):
+        self.steps = state_dict["steps"]
+
+
+class NoCallback:
+    pass
+'''
+QUICK = ("final.evaluate=false", "final.video=false", "callbacks.validation_pictures.every_steps=1000")
+
+
+@pytest.fixture
+def train(nerf, capture, tmp_path):
+    def call(*arguments):
+        folder = f"paths.output_dir={tmp_path}/run"
+        return nerf("train", "scene=npz", f"scene.path={capture}", *FAST, *QUICK, folder, *arguments)
+
+    return call
+
+
+@pytest.fixture
+def my_package(tmp_path, monkeypatch):
+    (tmp_path / "my_package.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def test_a_callback_of_ones_own_is_named_on_the_command_line_and_goes_on(train, my_package, tmp_path, monkeypatch):
+    mine = ("+callbacks.mine._target_=my_package.Counter", f"+callbacks.mine.path={tmp_path}/count")
+    result = train(*mine, "+callbacks.mine.start=100")
+    assert result.code == 0, result.err
+    assert (tmp_path / "count").read_text() == "104"
+    monkeypatch.syspath_prepend(tmp_path)
+    result = train(*mine, "trainer.max_steps=6", "resume=auto")
+    assert result.code == 0, result.err
+    assert (tmp_path / "count").read_text() == "106"
+
+
+def test_a_class_that_is_no_callback_or_not_there_is_told(train, my_package, tmp_path, monkeypatch):
+    said(train("+callbacks.mine._target_=my_package.NoCallback"), "callbacks.mine", "is no callback")
+    monkeypatch.syspath_prepend(tmp_path)
+    said(train("+callbacks.mine._target_=my_package.Missing"), "callbacks.mine", "Missing")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "+callbacks.mine._target_=os.system",
+        "+callbacks.mine={_target_: os.system}",
+        "++trainer.lightning.profiler={_target_: os.system}",
+        "callbacks.monitor._target_=os.system",
+    ],
+)
+def test_a_strangers_run_folder_names_no_callback(tmp_path, line):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([line]))
+    refused(former_overrides, tmp_path, [f"resume={tmp_path}"], parts=("which is not repeated from a file",))
+
+
+def test_flags_of_lightnings_need_no_plus(train, tmp_path):
+    result = train("trainer.lightning.profiler=simple", "trainer.lightning.limit_val_batches=1")
+    assert result.code == 0, result.err
+    table = tmp_path / "run" / "fit-profile.txt"
+    assert f"profile: {table}" in result.err
+    assert "run_training_batch" in table.read_text()
+    result = train("resume=auto", "trainer.max_steps=5")  # the same run, looked at in another way
+    assert result.code == 0, result.err
+
+
+def test_a_fast_development_run_takes_one_step(train, tmp_path):
+    result = train("trainer.lightning.fast_dev_run=true", "trainer.max_steps=2000")
+    assert result.code == 0, result.err
+    assert "1 steps of 64 rays" in result.err
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["finished_at_step"] == 1
+
+
+def test_a_flag_that_is_ours_or_nobodys_is_refused_before_a_folder_is_made(train, tmp_path):
+    said(train("trainer.lightning.max_steps=5"), "trainer.lightning.max_steps=5", "trainer.max_steps")
+    said(train("trainer.lightning.profilr=simple"), "profilr", "profiler")
+    said(train("trainer.lightning.profiler=nonsense"), "trainer.lightning", "nonsense")
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,355 @@
+"""Lightning's own Trainer trains our module and our data, resumes to the bit, and its checkpoints can be used."""
+
+import csv
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.initialize import initialize_config_dir
+from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+from support.captures import write_npz
+from support.running import refused
+
+import nerf_lightning
+from nerf_lightning import RadianceFieldSystem, RayDataModule, build_run
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import load_model
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
+from nerf_lightning.training.callbacks.nan_guard import NanGuard
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
+
+pytestmark = [
+    # Lightning's advice to whoever trains twice below one folder, or saves within an epoch.
+    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists"),
+    pytest.mark.filterwarnings("ignore:Using ModelCheckpoint with manual optimization"),
+]
+RAYS_OF_AN_EPOCH = 8 * 24  # eight of the ten pictures of 6 x 4 pixels train
+STEPS_OF_AN_EPOCH = 6  # of 32 rays each
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return write_npz(tmp_path / "capture.npz")
+
+
+@pytest.fixture
+def run(capture):
+    def make(*overrides):
+        return build_run(
+            "scene=npz", f"scene.path={capture}", "model=nerf_tiny", "trainer=cpu", "trainer.precision=32-true",
+            "data.batch_rays=32", "data.crop_steps=0", "data.val_rays=32", *overrides,
+        )  # fmt: skip
+
+    return make
+
+
+@pytest.fixture
+def trainer(tmp_path):
+    def make(**settings):
+        quiet = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False}
+        return Trainer(**({"accelerator": "cpu", "default_root_dir": tmp_path / "root"} | quiet | settings))
+
+    return make
+
+
+def kept(trainer):
+    """Where Lightning's own ModelCheckpoint has left its file."""
+    return trainer.checkpoint_callback.best_model_path
+
+
+def assert_equal(ours, theirs):
+    ours, theirs = ours.system, theirs.system
+    for name, value in theirs.state_dict().items():
+        assert torch.equal(ours.state_dict()[name], value), name
+    ours, theirs = ours.optimizers().optimizer.state_dict(), theirs.optimizers().optimizer.state_dict()
+    assert ours["param_groups"] == theirs["param_groups"]
+    for number, moments in theirs["state"].items():
+        for name, value in moments.items():
+            assert torch.equal(torch.as_tensor(ours["state"][number][name]), torch.as_tensor(value)), name
+
+
+class Lengths(Callback):
+    """Remember the learning rates, which say how long the run is taken to be."""
+
+    def __init__(self):
+        self.rates = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.rates.append(pl_module.optimizers().param_groups[0]["lr"])
+
+
+def test_what_the_package_offers_is_loaded_when_it_is_asked_for():
+    code = "import sys, nerf_lightning; print([m for m in ('torch', 'lightning', 'hydra') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert {"RadianceFieldSystem", "RayDataModule", "build_run", "__version__"} <= set(dir(nerf_lightning))
+    assert RayDataModule.__name__ == "RayDataModule"
+    with pytest.raises(AttributeError, match="no attribute 'build_runs'"):
+        _ = nerf_lightning.build_runs
+
+
+def test_a_run_has_the_settings_of_nerf_train(run, capture):
+    made = run("optimizer.lr=0.002", "seed=3")
+    assert made.system.configure_optimizers().param_groups[0]["lr"] == 0.002
+    assert made.system.step.seed == 3
+    assert made.data.scene.view_names == made.scene.view_names
+    assert made.system.record["choices"]["model"] == "nerf_tiny"
+    assert "batch_rays: 32" in made.system.record["config"]
+
+
+def test_weights_follow_from_the_seed_alone(run):
+    def weights(*overrides):
+        torch.rand(7)  # whatever else has drawn numbers
+        return run(*overrides).system.state_dict()
+
+    first, again, other = weights("seed=1"), weights("seed=1"), weights("seed=2")
+    assert all(torch.equal(again[name], value) for name, value in first.items())
+    assert not all(torch.equal(other[name], value) for name, value in first.items())
+
+
+def test_whoever_uses_hydra_keeps_it(run):
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        theirs = GlobalHydra.instance().hydra
+        run()
+        assert GlobalHydra.instance().hydra is theirs
+    run()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["optimizer.lrr=1"], ("optimizer.lr",)),
+        (["optimizer.lr=much"], ("The optimizer refuses its settings",)),
+        (["model=nerff"], ("nerff",)),
+        (["optimizer=3"], ("A group was given",)),
+        (["trainer.max_steps=7"], ("trainer.max_steps=7", "Trainer(max_steps=...)")),
+        (["callbacks.monitor.every_steps=7"], ("callbacks.monitor.every_steps=7", "Trainer(callbacks=[...])")),
+        (["+trainer.lightning.profiler=simple"], ("trainer.lightning.profiler", "Lightning's Trainer")),
+        (["resume=auto"], ("resume=auto", "ckpt_path")),
+    ],
+)
+def test_what_makes_no_run_is_told_in_words(run, overrides, parts):
+    refused(run, *overrides, parts=parts)
+
+
+def test_a_number_of_steps_is_the_length_of_the_run(run, trainer):
+    one, lengths = run(), Lengths()
+    fit = trainer(max_steps=10, callbacks=[lengths])
+    fit.fit(one.system, one.data)
+    assert (fit.global_step, one.system.step.progress.step, one.system.step.num_steps) == (10, 10, 10)
+    assert lengths.rates == pytest.approx([5e-4 * 0.1 ** (step / 10) for step in range(10)])
+    assert fit.callback_metrics["val/psnr"] > 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "steps"),
+    [
+        ({"max_epochs": 2}, 2 * STEPS_OF_AN_EPOCH),
+        ({"max_epochs": 2, "max_steps": 9}, 9),
+        ({"max_epochs": 3, "limit_train_batches": 4}, 12),
+        ({"fast_dev_run": True}, 1),
+        ({"fast_dev_run": 3}, 3),
+    ],
+)
+def test_an_epoch_is_every_training_ray_once(run, trainer, settings, steps):
+    one = run()
+    assert len(one.data.batches.whole) == RAYS_OF_AN_EPOCH
+    fit = trainer(**settings)
+    fit.fit(one.system, one.data)
+    assert (one.system.step.progress.step, one.system.step.num_steps) == (steps, steps)
+
+
+def test_a_run_without_end_is_refused(run, trainer):
+    one = run()
+    refused(trainer(max_steps=-1, max_epochs=-1).fit, one.system, one.data, parts=("max_steps", "max_epochs"))
+
+
+def test_lightnings_look_before_training_is_no_validation(run, trainer, tmp_path):
+    one, logger = run(), CSVLogger(tmp_path)
+    trainer(max_steps=4, num_sanity_val_steps=1, logger=logger, log_every_n_steps=1).fit(one.system, one.data)
+    rows = list(csv.DictReader((Path(logger.log_dir) / "metrics.csv").read_text().splitlines()))
+    assert [row["step"] for row in rows if row["val/psnr"]] == ["4"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        ({"precision": "bf16-mixed"}, ("precision=bf16-mixed", "trainer.precision=bf16-mixed")),
+        ({"precision": "64-true"}, ("precision=64-true", "32-true, tf32, bf16-mixed")),
+        ({"overfit_batches": 1}, ("overfit_batches=1", "scene.frames")),
+    ],
+)
+def test_what_would_be_computed_otherwise_than_it_says_is_refused(run, trainer, settings, parts):
+    one = run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        refused(trainer(max_steps=2, **settings).fit, one.system, one.data, parts=parts)
+
+
+def test_several_devices_need_a_strategy_that_adds_gradients_once(run, trainer, monkeypatch):
+    """Lightning's own adds them up in each tile's backward, and takes their mean."""
+    one, fit = run(), trainer(max_steps=2)
+    monkeypatch.setattr(Trainer, "world_size", 2)
+    parts = ("several devices", "trainer=ddp", "strategy=OneSumPerStep()")
+    refused(fit.fit, one.system, one.data, parts=parts)
+
+
+def test_lightnings_defaults_are_enough(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one = run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Lightning's advice
+        Trainer(max_steps=3).fit(one.system, one.data)
+    assert one.system.step.progress.step == 3
+
+
+def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer):
+    whole = run("scheduler=constant")
+    trainer(max_steps=12).fit(whole.system, whole.data)
+    begun, rest = run("scheduler=constant"), run("scheduler=constant")
+    first = trainer(max_steps=5)
+    first.fit(begun.system, begun.data)
+    assert kept(first).endswith("step=5.ckpt")
+    trainer(max_steps=12).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert rest.system.step.progress.step == 12
+    assert_equal(rest, whole)
+
+
+def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
+    def saves():
+        return ModelCheckpoint(every_n_train_steps=10, save_top_k=-1)
+
+    whole, rest = run(), run()
+    first = trainer(max_epochs=2, callbacks=[saves()])
+    first.fit(whole.system, whole.data)
+    found = kept(first)
+    assert found.endswith("step=10.ckpt")
+    trainer(max_epochs=2, callbacks=[saves()]).fit(rest.system, rest.data, ckpt_path=found)
+    assert rest.system.step.progress.step == 12
+    assert_equal(rest, whole)
+
+
+def test_the_fast_path_goes_on_too(run, trainer):
+    from support.running import FAST_PATH
+
+    fast = (*FAST_PATH, "scheduler=constant")
+    whole, begun, rest = run(*fast), run(*fast), run(*fast)
+    trainer(max_steps=40).fit(whole.system, whole.data)
+    first = trainer(max_steps=20)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=40).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert_equal(rest, whole)
+
+
+def test_a_checkpoint_of_another_run_is_refused(run, trainer):
+    one, other = run(), run("field=nerf_mlp_small")
+    first = trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    goes_on = trainer(max_steps=4)
+    with pytest.raises(InputError, match="Training cannot go on: state_dict"):
+        goes_on.fit(other.system, other.data, ckpt_path=kept(first))
+
+
+def test_what_is_no_checkpoint_of_ours_is_refused(run, trainer, tmp_path):
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    content = torch.load(kept(first), weights_only=True)
+    del content["nerf_lightning"]
+    torch.save(content, tmp_path / "other.ckpt")
+    again = run()
+    with pytest.raises(InputError, match="not a checkpoint of nerf_lightning"):
+        trainer(max_steps=4).fit(again.system, again.data, ckpt_path=tmp_path / "other.ckpt")
+
+
+def test_a_second_fit_does_not_begin_in_the_midst(run, trainer):
+    one = run()
+    trainer(max_steps=2).fit(one.system, one.data)
+    parts = ("2 steps", "ckpt_path", "build_run")
+    refused(trainer(max_steps=4).fit, one.system, one.data, parts=parts)
+
+
+def test_the_parts_of_two_runs_are_not_mixed(run, trainer):
+    refused(trainer(max_steps=2).fit, run().system, run().data, parts=("same run",))
+
+
+def test_a_checkpoint_of_lightnings_is_one_of_ours(run, trainer):
+    """What eval, render and the others read."""
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    checkpoint = read_checkpoint(kept(first))
+    assert checkpoint.step == 2
+    assert checkpoint.precision == "32-true"
+    model = load_model(checkpoint).state_dict()
+    assert all(torch.equal(model[name], value) for name, value in one.system.model.state_dict().items())
+
+
+def test_a_system_is_loaded_from_a_checkpoint_alone(run, trainer):
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
+    for system in (one.system, loaded):
+        system.eval()
+
+    def picture(system):
+        return render_picture(system.model, system.rays, 0, "white", tile_points=8192).rgb
+
+    assert torch.equal(picture(loaded), picture(one.system))
+    trainer(max_steps=2).validate(loaded, one.data)
+
+
+def test_a_loaded_system_cannot_train_and_says_what_can(run, trainer):
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
+    other = run()
+    parts = ("loaded from a checkpoint", "build_run", "ckpt_path")
+    refused(trainer(max_steps=2).fit, loaded, other.data, parts=parts)
+
+
+def test_a_stranger_names_no_class(run, trainer, tmp_path):
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    content = torch.load(kept(first), weights_only=True)
+    content["nerf_lightning"]["config"] = "model: {_target_: os.system, command: touch here}"
+    torch.save(content, tmp_path / "stranger.ckpt")
+    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "stranger.ckpt", parts=("os.system",))
+    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "missing.ckpt", parts=("no checkpoint at",))
+
+
+def test_the_callbacks_of_nerf_train_work_there_too(run, trainer, capture, tmp_path):
+    from support.configs import composed
+    from support.running import FAST
+
+    chosen = composed("train", "scene=npz", f"scene.path={capture}", *FAST).callbacks
+    watching = [
+        callback for callback in build(chosen).values() if not isinstance(callback, (Checkpoints, NanGuard))
+    ]  # fmt: skip
+    one = run()
+    fit = trainer(max_epochs=2, callbacks=[*watching, TimeBudget(60.0)], enable_progress_bar=True)
+    fit.fit(one.system, one.data)
+    assert one.system.step.progress.step == 2 * STEPS_OF_AN_EPOCH
+    assert (tmp_path / "root" / "images" / "validation" / "step_0000012.png").is_file()  # after the last step
+
+
+@pytest.mark.parametrize("callback", [Checkpoints, NanGuard])
+def test_a_callback_that_needs_our_writer_says_so(run, trainer, callback, tmp_path):
+    one = run()
+    parts = (callback.__name__, "plugins=[AtomicCheckpointIO()]", "ModelCheckpoint")
+    refused(trainer(max_steps=2, callbacks=[callback()]).fit, one.system, one.data, parts=parts)
+    (tmp_path / "root").mkdir(exist_ok=True)
+    again = run()
+    settings = {"plugins": [AtomicCheckpointIO()], "enable_checkpointing": False}
+    with_writer = [callback()] if callback is Checkpoints else [callback(), Checkpoints()]
+    trainer(max_steps=2, callbacks=with_writer, **settings).fit(again.system, again.data)
+    assert read_checkpoint(tmp_path / "root" / "checkpoints" / "last.ckpt").step == 2
