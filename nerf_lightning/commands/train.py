@@ -13,9 +13,13 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import to_type
+from nerf_lightning.console import say
 from nerf_lightning.errors import InputError
+from nerf_lightning.report.page import write_page
+from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
 from nerf_lightning.runs.log_file import log_file
+from nerf_lightning.runs.results import FILES
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.build import Parts, build_parts
 from nerf_lightning.training.callbacks.folder_guard import require_run
@@ -26,6 +30,9 @@ from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.memory_plan import announce_memory
 from nerf_lightning.training.tile_size import measured_tile
+
+MOST_VIDEO_BYTES = 20_000_000
+"""Of a film in the page that follows a training."""
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +50,9 @@ def train(config: DictConfig) -> float | None:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
-    parts = build_parts(config, HydraConfig.get().runtime.choices)
+    hydra = HydraConfig.get()
+    parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
+    config = parts.config
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
@@ -110,7 +119,16 @@ def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
     psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder)
     for logger in trainer.loggers:
         logger.finalize("success")
+    if parts.config.final.report and ranks.is_first():
+        _write_report(parts, folder)
     return psnr
+
+
+def _write_report(parts: Parts, folder: Path) -> None:
+    checks, target = parts.checks, folder / "report.html"
+    examine = None if checks is None else lambda: checks
+    write_page(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
+    say(f"report       {target}")
 
 
 def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:

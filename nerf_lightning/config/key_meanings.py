@@ -146,7 +146,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (
         AFTERWARDS,
         """
-        scene.verify final.evaluate final.video path.file path.view path.views
+        scene.verify doctor final.evaluate final.video final.report path.file path.view path.views
         evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
         evaluation.lpips_weights evaluation.lpips_net
         """,
@@ -161,7 +161,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         ckpt what.** labels outputs mosaic format background crop near hold_camera
         host port open_browser photographs max_height
-        run measured doctor max_megabytes runs scenes models sort published force
+        run measured max_megabytes runs scenes models sort published force
         rounds steps warmup_steps target_psnr kernels render_rays
         images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads
         """,

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.escaping import for_html
+from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.report.curves import Drawing
 from nerf_lightning.report.embedding import Embedded
 
@@ -58,6 +59,12 @@ class Report:
     """Protocol, origin, environment."""
     overrides: str = ""
     config: str = ""
+
+
+def write_page(report: Report, target: Path) -> None:
+    """Write the report as one file of HTML."""
+    with whole_file(target) as part:
+        part.write_text(page(report), encoding="utf-8")
 
 
 def page(report: Report) -> str:

@@ -4,9 +4,9 @@ import hashlib
 import json
 import logging
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from nerf_lightning import ranks
 from nerf_lightning.data.readers.auto import AutoReader
@@ -16,7 +16,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
 from nerf_lightning.sfm.find_poses import from_photographs, from_video
-from nerf_lightning.sfm.photographs import SUFFIXES
+from nerf_lightning.sfm.photograph_folder import SUFFIXES
 from nerf_lightning.sfm.reconstruction import require_pycolmap
 from nerf_lightning.sfm.settings import SfmSettings
 
@@ -35,6 +35,7 @@ class PhotosReader(AutoReader):
     root: str | None = None  # type: ignore[assignment]
     name: str = "photos"
     video: str | None = None
+    downscale: int | Literal["auto"] = "auto"
 
     def reader(self) -> Reader:
         """Find the cameras, unless they are known, and return the reader of what was found.
@@ -51,12 +52,7 @@ class PhotosReader(AutoReader):
             return super().reader()
         found = ranks.from_first(self._cameras)
         log.info("cameras: kept in %s (scene.cache_dir=DIR keeps them elsewhere)", found)
-        chosen = {
-            field.name: getattr(self, field.name)
-            for field in fields(AutoReader)
-            if field.name not in ("root", "masks") and getattr(self, field.name) != field.default
-        }
-        return ColmapReader(root=str(found), **chosen | {"name": self.name})
+        return ColmapReader(**self._chosen() | {"root": str(found), "name": self.name})
 
     def _cameras(self) -> Path:
         """Return the folder of a capture, which is made where it is not there yet."""

@@ -8,17 +8,21 @@ import yaml
 from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning import ranks
 from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import Checkpoint, make_record, read_checkpoint
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.gate import require_sound
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.auto_settings import settled
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
@@ -58,6 +62,10 @@ class Run:
 class Parts(Run):
     """What `nerf train` adds, but for its place on the disk."""
 
+    config: DictConfig
+    """Nothing in it is left open."""
+    checks: list[Check] | None
+    """What the doctor says of the scene, where it was asked."""
     num_steps: int
     signals: StopSignals
     callbacks: list[Callback]
@@ -80,7 +88,9 @@ def build_run(*overrides: str) -> Run:
     allow(Budgets(**config.budgets))
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    run = _run(config, choices, settings, build(config.scene).read())
+    scene: Scene = build(config.scene).read()
+    config, choices = settled(config, choices, overrides, scene)
+    run = _run(config, choices, settings, scene)
     settings.prepare(run.system.model)
     run.system.record["precision"] = settings.precision
     return run
@@ -94,12 +104,13 @@ def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
                 raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")
 
 
-def build_parts(config: DictConfig, choices: Mapping[str, Any]) -> Parts:
+def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str]) -> Parts:
     """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
 
     Args:
         config: of the run.
         choices: the names picked from each group, which its checkpoints keep.
+        overrides: what the config was composed with.
 
     Raises:
         InputError: anything in the config or in the capture that makes no run.
@@ -109,6 +120,8 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any]) -> Parts:
     finish = Finish.from_config(config)
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
+    config, choices = settled(config, choices, overrides, scene)
+    checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     run = _run(config, choices, settings, scene)
     num_rays, data = len(run.data.batches.whole), config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
@@ -120,7 +133,15 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any]) -> Parts:
         callbacks.append(TimeBudget(float(config.budget.seconds)))
     # Checkpoints come last, so that they save what the others left.
     callbacks.sort(key=lambda callback: isinstance(callback, Checkpoints))
-    return Parts(**vars(run), num_steps=num_steps, signals=signals, callbacks=callbacks, finish=finish)
+    return Parts(
+        **vars(run),
+        config=config,
+        checks=checks,
+        num_steps=num_steps,
+        signals=signals,
+        callbacks=callbacks,
+        finish=finish,
+    )
 
 
 def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettings, scene: Scene) -> Run:

@@ -2,13 +2,14 @@
 
 import inspect
 import logging
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.reader import CaptureReader
+from nerf_lightning.data.pixels.images import image_size
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap.reader import ColmapReader
@@ -30,6 +31,9 @@ FORMATS: tuple[tuple[str, str, type[Reader]], ...] = (
     ("poses_bounds.npy", "llff", LlffReader),
 )
 
+MOST_PIXELS = 640
+"""Of the longer side of photographs whose size the user leaves open."""
+
 log = logging.getLogger(__name__)
 
 
@@ -38,8 +42,13 @@ class AutoReader(CaptureReader):
     """Read a folder as the format that its files tell.
 
     Settings that are left as they are have the values that the format's own reader has.
+
+    Args:
+        downscale: whole factor by which the photographs shrink; auto: so that their longer side has at most 640 pixels,
+            of which a few minutes on a CPU see enough.
     """
 
+    downscale: int | Literal["auto"] = 1  # type: ignore[assignment]
     name: str = "auto"
     background: str | None = None  # type: ignore[assignment]
 
@@ -49,7 +58,7 @@ class AutoReader(CaptureReader):
         Raises:
             InputError: no known format, a setting that the format does not have, or anything wrong with the files.
         """
-        return self.reader().read()
+        return self._handy(self.reader()).read()
 
     def capture(self) -> Capture:
         """Return what the format says, where it is one of photographs with their poses."""
@@ -79,12 +88,22 @@ class AutoReader(CaptureReader):
         """Return which format's file is in a folder, how scene= names it, and its reader; None for no known one."""
         return next((found for found in FORMATS if (folder / found[0]).is_file()), None)
 
+    def _handy(self, reader: Reader) -> Reader:
+        """Let the reader shrink photographs, where their size is left open."""
+        if self.downscale != "auto" or not isinstance(reader, CaptureReader):
+            return reader
+        longest = max(max(image_size(view.photograph.path)) for view in reader.capture().views)
+        factor = -(-longest // MOST_PIXELS)
+        log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
+        return replace(reader, downscale=factor)
+
+    def _chosen(self) -> dict[str, Any]:
+        """Return the settings that say something."""
+        values = {field.name: (getattr(self, field.name), field.default) for field in fields(AutoReader)}
+        return {name: value for name, (value, default) in values.items() if value not in (default, "auto")}
+
     def _settings(self, scene: str, kind: type[Reader]) -> dict[str, Any]:
-        chosen = {
-            field.name: getattr(self, field.name)
-            for field in fields(AutoReader)
-            if field.name in ("root", "name") or getattr(self, field.name) != field.default
-        }
+        chosen = self._chosen() | {"root": self.root, "name": self.name}
         refused = sorted(chosen.keys() - inspect.signature(kind).parameters.keys())
         if refused:
             raise InputError(f"scene.{refused[0]}: scene={scene}, which {self.root} is, has no such setting. Leave it.")

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nerf_lightning.console import spoken
+from nerf_lightning.console import DAY, spoken
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ class TrainingProgress(ProgressBar):
         super().__init__()
         self.refresh_seconds, self.line_seconds = refresh_seconds, line_seconds
         self.bar: Progress | None = None
-        self.silent = False
+        self.silent = self.warned = False
         self.task = TaskID(0)
         self.started, self.first_step, self.shown, self.rays_seen = 0.0, 0, 0.0, 0
 
@@ -65,6 +65,7 @@ class TrainingProgress(ProgressBar):
         # Negative after a restart, which counts anew.
         rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
+        self._warn_of_days((pl_module.step.num_steps - step) / per_second)
         loss = outputs["losses"].cpu()
         text = (
             f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "
@@ -75,6 +76,15 @@ class TrainingProgress(ProgressBar):
         else:
             left = (pl_module.step.num_steps - step) / per_second
             log.info("step %d/%d  %s  about %s left", step, pl_module.step.num_steps, text, spoken(left))
+
+    def _warn_of_days(self, left: float) -> None:
+        if left > DAY and not self.warned:
+            self.warned = True
+            log.warning(
+                "At this speed the training takes another %s. model=auto (fast, or fast_proposal for photographs) "
+                "learns the same scene in minutes, and budget.seconds=300 ends it in five.",
+                spoken(left),
+            )
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Leave the finished bar on the screen."""

@@ -1,0 +1,66 @@
+"""What `nerf train` chooses for a scene where the user leaves it open: model, time, what comes before and after.
+
+Each choice is said in one line, with the setting that makes another.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig
+
+from nerf_lightning.config.compose import chosen, compose_config
+from nerf_lightning.console import spoken
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import Scene
+
+AUTO = "auto"
+IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
+PHOTOS_SECONDS = 300
+"""Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
+
+log = logging.getLogger(__name__)
+
+
+def settled(
+    config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene
+) -> tuple[DictConfig, dict[str, str]]:
+    """Return the config in which nothing is left open, and the names picked from each group.
+
+    Args:
+        config: as composed.
+        choices: the names picked from each group.
+        overrides: what it was composed with.
+        scene: what the model is to learn.
+
+    Raises:
+        InputError: a setting that is neither a value nor auto.
+    """
+    if choices.get("model") == AUTO:
+        name, reason = model_for(scene)
+        log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
+        fitted, picked = compose_config("train", [*overrides, f"model={name}"])
+        fitted.paths = config.paths
+        config, choices = fitted, picked
+    of_photos = choices.get("scene") == "photos"
+    _settle(config, "doctor", of_photos)
+    _settle(config.final, "report", of_photos)
+    if config.budget.seconds == AUTO:
+        config.budget.seconds = PHOTOS_SECONDS if of_photos else None
+        if of_photos:
+            log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
+    return config, chosen(choices)
+
+
+def model_for(scene: Scene) -> tuple[str, str]:
+    """Return the model that suits a scene, and why."""
+    if scene.space == "bounded":
+        return IN_A_BOX, "the scene stands in a box"
+    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
+
+
+def _settle(section: DictConfig, key: str, value: bool) -> None:
+    if section[key] == AUTO:
+        section[key] = value
+    elif not isinstance(section[key], bool):
+        raise InputError(f"{key}={section[key]} does not fit: it must be true, false (on, off) or auto.")
