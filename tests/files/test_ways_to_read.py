@@ -10,6 +10,7 @@ READS = {"read_text", "read_bytes", "open", "imread", "imiter", "fromfile", "mem
 LOADERS = {"np", "torch", "OmegaConf"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
+    "config/compose.py": ["load"],
     "training/callbacks/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["load", "read_text", "print", "print", "print"],
     "console.py": ["print"],
