@@ -10,7 +10,7 @@ from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.rendering.points import packed_points
+from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

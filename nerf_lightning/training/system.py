@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
-from nerf_lightning.checkpoints.resume_state import require_callbacks, require_loops, require_resumable
+from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.types.progress import Progress

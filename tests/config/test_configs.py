@@ -28,7 +28,9 @@ BUILT = {
 
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g in BUILT for o in options(g)])
 def test_every_component_builds(group, option, tmp_path):
-    config = composed("train", f"{group}={option}")[BUILT[group]]
+    # An MLP needs the encoder of its model.
+    model = ["model=nerf"] if option.startswith("nerf_mlp") else []
+    config = composed("train", *model, f"{group}={option}")[BUILT[group]]
     if OmegaConf.is_missing(config, "file"):
         write_keyframes(tmp_path / "keys.yaml", [Keyframe((x, 0.0, 0.0), look_at=(0.0, 1.0, 0.0)) for x in (0.0, 1.0)])
         config.file = str(tmp_path / "keys.yaml")

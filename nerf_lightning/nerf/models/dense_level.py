@@ -5,8 +5,8 @@ from torch import Tensor
 
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.points import points_along
 from nerf_lightning.nerf.rendering.quadrature import composite
+from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle

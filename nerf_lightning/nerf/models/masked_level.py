@@ -7,8 +7,8 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.march.reference import occupied_intervals
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.points import points_along
 from nerf_lightning.nerf.rendering.quadrature import composite
+from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, Rendering

@@ -12,7 +12,7 @@ from nerf_lightning.nerf.kernels.packed.integrate import num_visible
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
-from nerf_lightning.nerf.rendering.points import packed_points
+from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.base import PackedSampler, Sampler
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering, Rendering

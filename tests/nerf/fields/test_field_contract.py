@@ -11,7 +11,8 @@ from nerf_lightning.nerf.types.points import Points
 
 @pytest.fixture(params=options("field"))
 def field(request):
-    return build(composed("train", f"field={request.param}").field)
+    model = "nerf" if request.param.startswith("nerf_mlp") else "fast"
+    return build(composed("train", f"model={model}", f"field={request.param}").field)
 
 
 def points_and_directions(rays=5, samples=4):

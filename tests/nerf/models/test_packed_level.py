@@ -12,7 +12,7 @@ from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.points import packed_points
+from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
