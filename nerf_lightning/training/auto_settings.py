@@ -60,7 +60,7 @@ def model_for(scene: Scene) -> tuple[str, str]:
 
 
 def _settle(section: DictConfig, key: str, value: bool) -> None:
-    if section[key] == AUTO:
-        section[key] = value
-    elif not isinstance(section[key], bool):
-        raise InputError(f"{key}={section[key]} does not fit: it must be true, false (on, off) or auto.")
+    meant = {AUTO: value, "on": True, "off": False, True: True, False: False}
+    if section[key] not in meant:
+        raise InputError(f"{key}={section[key]} does not fit: it must be on, off or auto.")
+    section[key] = meant[section[key]]
