@@ -52,10 +52,10 @@ def train(config: DictConfig) -> float | None:
     # Whatever is wrong with the input shows here, before a folder is taken.
     hydra = HydraConfig.get()
     parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
-    config = parts.config
+    asked, config = config, parts.config
     held: list[RunFolder] = []
     try:
-        path, former = ranks.from_first(lambda: _take_folder(config, parts.num_steps, held))
+        path, former = ranks.from_first(lambda: _take_folder(config, asked, parts.num_steps, held))
         with errors_told_once(), log_file(path) if ranks.is_first() else nullcontext():
             trainer = _fit(config, parts, path, former)
             for folder in held:
@@ -77,9 +77,11 @@ def train(config: DictConfig) -> float | None:
             folder.release()
 
 
-def _take_folder(config: DictConfig, num_steps: int, held: list[RunFolder]) -> tuple[Path, ResumePoint | None]:
+def _take_folder(
+    config: DictConfig, asked: DictConfig, num_steps: int, held: list[RunFolder]
+) -> tuple[Path, ResumePoint | None]:
     """Let one process choose and hold the folder for all; return it, and where training goes on."""
-    folder = open_run(config, num_steps, job_folder())
+    folder = open_run(config, num_steps, job_folder(), asked)
     held.append(folder)
     write_config(folder.path, config, HydraConfig.get())
     return folder.path, folder.resume_point()

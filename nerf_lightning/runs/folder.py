@@ -105,13 +105,15 @@ class RunFolder:
         return seconds
 
 
-def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> RunFolder:
+def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked: DictConfig | None = None) -> RunFolder:
     """Choose the run's folder, refuse it or take hold of it, and write down the config.
 
     Args:
         config: the run's config.
         num_steps: its length; a run that finished earlier counts as unfinished.
         job_folder: the folder that a sweep gives this job, or None for a single run.
+        asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand;
+            None: nothing was.
 
     Raises:
         InputError: the folder is in use, is occupied by another run, or cannot be written.
@@ -138,7 +140,10 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None) -> Run
     }
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
     write_json(
-        folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings_digest(config)} | kept | job
+        folder / "run.json",
+        {"fingerprint": fingerprint(identity), "settings": settings_digest(config if asked is None else asked)}
+        | kept
+        | job,
     )
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")

@@ -153,8 +153,8 @@ def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dic
     name = str(protocol.get("scene", "")) or "not said"
     if name != str(origin.get("scene", overrides.get("scene"))):
         return name
-    root, file = (Path(overrides.get(key, "").strip("'\"")) for key in PLACES)
-    return root.name or file.stem or name
+    root, *files = (Path(overrides.get(key, "").strip("'\"")) for key in PLACES)
+    return root.name or next((file.stem for file in files if file.stem), name)
 
 
 def _choices(folder: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 Each choice is said in one line, with the setting that makes another.
 """
 
+import copy
 import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -36,6 +37,7 @@ def settled(
     Raises:
         InputError: a setting that is neither a value nor auto.
     """
+    config = copy.deepcopy(config)
     if choices.get("model") == AUTO:
         name, reason = model_for(scene)
         log.info("model: %s, since %s (model=NAME chooses another)", name, reason)

@@ -82,7 +82,7 @@ def test_a_missing_value_is_named_with_the_cure(nerf):
 
 
 def test_a_value_of_the_wrong_kind_is_named(nerf):
-    result = nerf("train", "field.skip=20")
+    result = nerf("train", "model=nerf", "field.skip=20")
     assert result.code == 2
     assert "skip=20 names no layer" in result.err
     assert "Traceback" not in result.err
