@@ -19,6 +19,7 @@ from nerf_lightning.sfm.find_poses import from_photographs, from_video
 from nerf_lightning.sfm.photograph_folder import SUFFIXES
 from nerf_lightning.sfm.reconstruction import require_pycolmap
 from nerf_lightning.sfm.settings import SfmSettings
+from nerf_lightning.sfm.summary import remarks
 
 log = logging.getLogger(__name__)
 
@@ -65,11 +66,13 @@ class PhotosReader(AutoReader):
         make_own_folder(cache)
         log.info("cameras: nobody knows them yet, so they are found first (nerf poses does this alone, with settings)")
         if self.video is not None:
-            model, _ = from_video(source, None, folder, settings)
+            model, matching = from_video(source, None, folder, settings)
         else:
-            model, _ = from_photographs(source, folder, settings, self.allow_outside)
+            model, matching = from_photographs(source, folder, settings, self.allow_outside)
         found, total = len(model.registered), len(model.registered) + len(model.left_out)
         log.info("cameras: found those of %d of %d, to %.2f pixels", found, total, model.reprojection_error)
+        for remark in remarks(model, matching, self.video is not None):
+            log.warning("cameras: %s", remark)
         return folder
 
     def _source(self) -> Path:

@@ -31,6 +31,8 @@ class SparseModel:
 
     registered: tuple[str, ...]
     left_out: tuple[str, ...]
+    apart: tuple[str, ...]
+    """Of those left out: registered with each other, and not with the rest, as photographs of another place are."""
     num_points: int
     num_cameras: int
     reprojection_error: float
@@ -83,19 +85,21 @@ def reconstruct(
         colmap.set_random_seed(settings.seed)
         _find_features(colmap, database, folder, groups, settings, report)
         _match(colmap, database, names, work / "pairs.txt", settings, report)
-        model = _largest_model(colmap, database, folder, work / "models", settings, report)
-        if model is None:
+        models = _models(colmap, database, folder, work / "models", settings, report)
+        if not models:
             raise InputError(_nothing_found(len(names)))
         sparse.mkdir(parents=True)
-        model.write_binary(sparse)
-    return _in_short(model, names)
+        models[0].write_binary(sparse)
+    return _in_short(models, names)
 
 
-def _in_short(model: Any, names: list[str]) -> SparseModel:
-    registered = {model.image(number).name for number in model.reg_image_ids()}
+def _in_short(models: list[Any], names: list[str]) -> SparseModel:
+    model = models[0]
+    registered, *others = ({each.image(number).name for number in each.reg_image_ids()} for each in models)
     return SparseModel(
         registered=tuple(name for name in names if name in registered),
         left_out=tuple(name for name in names if name not in registered),
+        apart=tuple(name for name in names if name not in registered and any(name in other for other in others)),
         num_points=model.num_points3D(),
         num_cameras=model.num_cameras(),
         reprojection_error=model.compute_mean_reprojection_error(),
@@ -199,9 +203,10 @@ def _opened(colmap: Any, database: Path) -> Iterator[Any]:
         content.close()
 
 
-def _largest_model(
+def _models(
     colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
-) -> Any | None:
+) -> list[Any]:
+    """Return what was reconstructed, the largest first: photographs of several places make several models."""
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = settings.threads, settings.seed
     options.min_model_size = FEWEST_REGISTERED
@@ -218,7 +223,7 @@ def _largest_model(
     found = colmap.incremental_mapping(
         database, folder, models, options, initial_image_pair_callback=advance, next_image_callback=advance
     )
-    return max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    return sorted(found.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _nothing_found(count: int) -> str:

@@ -31,7 +31,18 @@ def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Pat
     ]
     if model.left_out:
         lines.append(f"left out            {listed(model.left_out)}")
-    if found < ENOUGH * total:
+    return [*lines, *remarks(model, matching, is_video)]
+
+
+def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
+    """Return what to do differently, where there is something."""
+    lines = []
+    if model.apart:
+        lines.append(
+            f"{listed(model.apart, 4)} fit together and not to the rest: if they show another place, they belong in a "
+            "capture of their own; if not, photographs between the two are missing."
+        )
+    if len(model.registered) < ENOUGH * (len(model.registered) + len(model.left_out)):
         lines.append(_advice(matching, is_video))
     return lines
 

@@ -11,6 +11,7 @@ from support.posed_captures import Known, write_colmap
 from nerf_lightning.errors import InputError
 from nerf_lightning.sfm import reader
 from nerf_lightning.sfm.reader import PhotosReader
+from nerf_lightning.sfm.reconstruction import SparseModel
 
 
 @pytest.fixture
@@ -27,14 +28,13 @@ def found(tmp_path, monkeypatch):
     """The calls of structure from motion, which gives what is known."""
     calls = []
 
-    class Model:
-        registered, left_out, reprojection_error = ("a", "b", "c"), (), 0.5
+    model = SparseModel(("a", "b", "c"), ("d", "e"), ("d",), num_points=9, num_cameras=1, reprojection_error=0.5)
 
     def from_photographs(source, folder, settings, allow_outside):
         calls.append(source)
         shutil.copytree(tmp_path / "known" / "sparse", folder / "sparse")
         shutil.copytree(source, folder / "images")
-        return Model(), "exhaustive"
+        return model, "exhaustive"
 
     monkeypatch.setattr(reader, "from_photographs", from_photographs)
     monkeypatch.setattr(reader, "require_pycolmap", lambda: None)
@@ -47,7 +47,9 @@ def test_cameras_are_found_once_and_again_where_a_photograph_has_changed(photogr
     first, second = PhotosReader(**settings).read(), PhotosReader(**settings).read()
     assert first.view_names == second.view_names
     assert found == [photographs]
-    assert "cameras: found those of 3 of 3, to 0.50 pixels" in caplog.text
+    assert "cameras: found those of 3 of 5, to 0.50 pixels" in caplog.text
+    assert "cameras: d fit together and not to the rest: if they show another place" in caplog.text
+    assert "few were registered: take more photographs" in caplog.text
     changed = sorted(photographs.iterdir())[0]
     Image.fromarray(np.zeros(np.asarray(Image.open(changed)).shape, np.uint8)).save(changed)
     PhotosReader(**settings).read()
