@@ -41,4 +41,4 @@ def test_a_wheel_installed_elsewhere_gives_a_working_nerf(tmp_path):
     elsewhere = {"cwd": tmp_path, "PYTHONPATH": str(tmp_path / "site")}
     where = python("-c", "import nerf_lightning.files.folders as c; print(c.conf_folder())", **elsewhere)
     assert where.strip() == str(tmp_path / "site" / "nerf_lightning" / "conf")
-    assert "num_frequencies: 10" in python("-m", "nerf_lightning", "train", "--cfg", "job", **elsewhere)
+    assert "num_frequencies: 10" in python("-m", "nerf_lightning", "train", "model=nerf", "--cfg", "job", **elsewhere)
