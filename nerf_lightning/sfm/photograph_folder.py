@@ -51,13 +51,13 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             that cannot be read or is tiny.
     """
     try:
-        files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
+        files = visible_files(folder)
     except OSError as error:
         raise InputError(
             f"images={folder} is not a folder that can be read ({error.strerror or error}). "
             "Give the folder in which the photographs lie."
         ) from error
-    pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
+    pictures = pictures_among(files)
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
     require_within("views", len(pictures), f"images={folder}", "photographs")
@@ -68,6 +68,16 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
         )
     return [_photograph(path) for path in pictures]
+
+
+def visible_files(folder: Path) -> list[Path]:
+    """Return the files that lie in a folder, sorted by name."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
+
+
+def pictures_among(files: list[Path]) -> list[Path]:
+    """Return those whose names say that they are photographs."""
+    return [path for path in files if path.suffix.lower() in SUFFIXES]
 
 
 def put_upright(photograph: FoundPhotograph, folder: Path) -> None:

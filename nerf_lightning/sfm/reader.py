@@ -3,12 +3,12 @@
 import hashlib
 import json
 import logging
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from nerf_lightning import ranks
+from nerf_lightning.data.pixels.decoding import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.colmap.reader import ColmapReader
@@ -16,7 +16,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
 from nerf_lightning.sfm.find_poses import from_photographs, from_video
-from nerf_lightning.sfm.photograph_folder import SUFFIXES
+from nerf_lightning.sfm.photograph_folder import pictures_among, visible_files
 from nerf_lightning.sfm.reconstruction import require_pycolmap
 from nerf_lightning.sfm.settings import SfmSettings
 from nerf_lightning.sfm.summary import remarks
@@ -84,20 +84,14 @@ class PhotosReader(AutoReader):
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    return pictures_among(visible_files(folder))
 
 
 def _key(source: Path, settings: SfmSettings) -> str:
     """Return what found cameras are kept under: the photographs' names, sizes and times of change, and the settings."""
     try:
-        files = [source] if source.is_file() else _pictures(source)
-        states = [(path.name, *_state(path)) for path in files]
+        files = _pictures(source) if source.is_dir() else [source]
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror}. Check scene.root or scene.video.") from error
-    content: list[Any] = [str(source.resolve()), states, asdict(settings)]
+    content = [[identity_of(path) for path in files], asdict(settings)]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _state(path: Path) -> tuple[int, int]:
-    state = os.stat(path)
-    return state.st_size, state.st_mtime_ns

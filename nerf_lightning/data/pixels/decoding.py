@@ -81,15 +81,19 @@ def read_photographs(
 def _key(photographs: Sequence[Photograph], downscale: int) -> str:
     """Return what the kept pixels are found by."""
     files = [
-        [None if path is None else _identity(path) for path in (photograph.path, photograph.mask)]
+        [None if path is None else identity_of(path) for path in (photograph.path, photograph.mask)]
         for photograph in photographs
     ]
     settings = {"format": FORMAT, "downscale": downscale, "files": files}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def _identity(path: Path) -> tuple[str, int, int]:
-    """Return name, size and time of change."""
+def identity_of(path: Path) -> tuple[str, int, int]:
+    """Return name, size and time of change, by which a file is taken for the one that it was.
+
+    Raises:
+        InputError: it cannot be looked at.
+    """
     try:
         state = path.stat()
     except OSError as error:

@@ -61,7 +61,7 @@ def render_picture(
     shape = rays.near.shape
     rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
     if rays_of.cameras.ndc is not None:
-        whole = view_rays(rays_of, view)[0].far
+        whole = rays.far if clip is None else view_rays(rays_of, view)[0].far
         depth = world_distance(straight, depth / whole)
     return Picture(rgb, depth, opacity, *first)
 
