@@ -215,7 +215,7 @@ def made_ahead(make: Callable[[int, int, int], Batch], current: Callable[[], Pla
     follow is a function of the place alone, with or without this thread.
 
     Args:
-        make: takes a place; called in both threads, perhaps at once. It must not enter numba's thread pool.
+        make: takes a place; called in both threads, perhaps at once.
         current: the run's place.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:

@@ -8,8 +8,6 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.nerf.kernels import backends
-
 FLAGS = re.compile(r"\b(sse4_2|avx|avx2|fma|avx512\w*|avx_\w+|amx\w*|asimd\w*|bf16|i8mm|sve\w*)\b")
 
 
@@ -33,13 +31,7 @@ def _cpu_flags() -> str:
 
 
 def _threads() -> dict[str, Any]:
-    found: dict[str, Any] = {"torch": torch.get_num_threads(), "of the machine": os.cpu_count()}
-    if backends.twin("adam.cpu") is not None:
-        import numba
-
-        found["numba"] = int(numba.get_num_threads())
-        found["numba's layer"] = str(numba.config.THREADING_LAYER)  # type: ignore[attr-defined]
-    return found
+    return {"torch": torch.get_num_threads(), "of the machine": os.cpu_count()}
 
 
 def _gpu(device: torch.device) -> dict[str, Any]:

@@ -45,8 +45,8 @@ def remarks(rows: list[Row]) -> list[str]:
 def machine_lines(machine: dict[str, Any]) -> list[str]:
     """Return a line for each thing that is known of the machine.
 
-    >>> machine_lines({"torch": "2.13", "threads": {"torch": 2, "numba": 2}, "gpus": ["A", "B"]})
-    ['torch: 2.13', 'threads: torch 2, numba 2', 'gpus: A, B']
+    >>> machine_lines({"torch": "2.13", "threads": {"torch": 2, "of the machine": 4}, "gpus": ["A", "B"]})
+    ['torch: 2.13', 'threads: torch 2, of the machine 4', 'gpus: A, B']
     """
     lines = []
     for name, value in machine.items():

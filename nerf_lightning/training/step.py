@@ -29,13 +29,12 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
+from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
 
 log = logging.getLogger(__name__)
-
-Backward = Callable[[Tensor], None]
 
 
 def _backward(loss: Tensor) -> None:
@@ -257,19 +256,25 @@ class TrainStep:
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
         target = Target(blend(batch.rgba, behind), weight, batch.pixels)
-        losses, foreground = [], []
-        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
+
+        def lose(tile: slice) -> TileLoss:
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
             renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
-            part = torch.stack(list(self.loss(renderings, target[tile])))
-            part = part * ((tile.stop - tile.start) / share.num_rays)
-            backward(part.sum())
-            losses.append(part.detach())
-            foreground.append(renderings[-1].foreground.detach())
-        seen = {"foreground": torch.cat(foreground), "target": target.rgb, "weight": batch.weight}
-        return {"losses": torch.stack(losses).sum(0)} | seen
+            levels = torch.stack(list(self.loss(renderings, target[tile])))
+            return TileLoss(levels * ((tile.stop - tile.start) / share.num_rays), renderings[-1].foreground)
+
+        tile_rays = self._tile_rays(num_rays, training=True)
+        threads = torch.get_num_threads() if device.type == "cpu" and tile_rays < num_rays else 1
+        if threads > 1:
+            parts = list(tiles(num_rays, tile_rays, multiple=threads))
+            lost = side_by_side(lose, parts, backward, self._parameters())
+        else:
+            lost = in_turn(lose, list(tiles(num_rays, tile_rays)), backward)
+        foreground = torch.cat([each.foreground for each in lost])
+        seen = {"foreground": foreground, "target": target.rgb, "weight": batch.weight}
+        return {"losses": torch.stack([each.levels for each in lost]).sum(0)} | seen
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) == 1:

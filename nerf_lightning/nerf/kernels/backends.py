@@ -91,13 +91,10 @@ def is_on(module: str) -> bool:
 
 
 def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
-    """Return a numba module for tensors on the CPU, with its threads set to torch's; else None."""
+    """Return a numba module for tensors on the CPU; else None."""
     if device.type != "cpu" or not is_on(module):
         return None
-    found = twin(module)
-    if found is not None:
-        set_threads()
-    return found
+    return twin(module)
 
 
 def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
@@ -110,21 +107,11 @@ def can_compile(device: torch.device) -> bool:
     return device.type == "cuda" or any(shutil.which(name) for name in ("g++", "clang++", "cl"))
 
 
-def set_threads() -> None:
-    """Give numba as many threads as torch has."""
-    import numba
-
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-
-
 def _configure_numba() -> None:
     import numba
 
     # Straight code of four equal operations becomes one of four lanes.
     numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
-    # The layer that every platform has, and whose threads sleep while torch works.
-    if "NUMBA_THREADING_LAYER" not in os.environ:
-        numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
     _require_own_cache(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
 
 

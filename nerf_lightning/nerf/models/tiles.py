@@ -12,13 +12,16 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
 from nerf_lightning.nerf.types.scene import Background
 
 
-def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
+def tiles(num_rays: int, tile_rays: int, multiple: int = 1) -> Iterator[slice]:
     """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
+
+    Their number is a multiple of `multiple`, where there are so many rays: threads then have as many each.
 
     >>> [(part.start, part.stop) for part in tiles(10, 4)]
     [(0, 4), (4, 7), (7, 10)]
     """
     count = max(1, -(-num_rays // tile_rays))
+    count = max(1, min(num_rays, -(-count // multiple) * multiple))
     size, rest = divmod(num_rays, count)
     start = 0
     for number in range(count):

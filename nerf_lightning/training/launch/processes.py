@@ -152,13 +152,12 @@ def _exit_code(codes: list[int]) -> int:
 @contextmanager
 def _share_of_cores(count: int) -> Iterator[None]:
     share = str(max(1, torch.get_num_threads() // count))
-    former = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
-    os.environ.update(dict.fromkeys(former, share))
+    former = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = share
     try:
         yield
     finally:
-        for name, value in former.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+        os.environ.pop("OMP_NUM_THREADS") if former is None else os.environ.update(OMP_NUM_THREADS=former)
 
 
 def _require_launcher(launcher: Launcher) -> None:

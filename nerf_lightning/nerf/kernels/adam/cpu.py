@@ -4,10 +4,10 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
-CHUNK = 16384
+from nerf_lightning.nerf.kernels.threads import over_rows
 
 
 def adam_step(
@@ -22,7 +22,8 @@ def adam_step(
 ) -> None:
     """Update contiguous float32 arrays in place."""
     arrays = (x.view(-1).numpy() for x in (parameter, grad, first, second))
-    _adam_step(*arrays, *(np.float32(x) for x in (step_size, root_scale, *betas, eps)))
+    numbers = (np.float32(x) for x in (step_size, root_scale, *betas, eps))
+    over_rows(_adam_step, parameter.numel(), *arrays, *numbers)
 
 
 def trial() -> None:
@@ -30,16 +31,15 @@ def trial() -> None:
     adam_step(torch.ones(4), torch.ones(4), torch.zeros(4), torch.zeros(4), 0.1, 1.0, (0.9, 0.99), 1e-15)
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _adam_step(parameter, grad, first, second, step_size, root_scale, beta1, beta2, eps):
-    count, one = parameter.shape[0], np.float32(1.0)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            g = grad[i]
-            if g != 0:
-                m = beta1 * first[i] + (one - beta1) * g
-                v = beta2 * second[i] + (one - beta2) * g * g
-                first[i], second[i] = m, v
-                parameter[i] -= step_size * m / (np.sqrt(v) * root_scale + eps)
-                grad[i] = 0
+def _adam_step(first_row, last_row, parameter, grad, first, second, step_size, root_scale, beta1, beta2, eps):
+    one = np.float32(1.0)
+    for i in range(first_row, last_row):
+        g = grad[i]
+        if g != 0:
+            m = beta1 * first[i] + (one - beta1) * g
+            v = beta2 * second[i] + (one - beta2) * g * g
+            first[i], second[i] = m, v
+            parameter[i] -= step_size * m / (np.sqrt(v) * root_scale + eps)
+            grad[i] = 0

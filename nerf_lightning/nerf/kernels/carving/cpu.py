@@ -9,10 +9,11 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.carving.reference import widened
+from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.scene import Cameras
 
 ZERO, ONE, WIDEST = np.float32(0.0), np.float32(1.0), np.float32(9.0)
@@ -28,7 +29,9 @@ def add_seen(
     half_diagonal: float,
 ) -> None:
     """Mark the cells that a view sees, if only a part of them."""
-    _add_seen(cells.numpy(), *_axes(centers), *_camera(cameras, view), *_halves(half_diagonal))
+    over_rows(
+        _add_seen, cells.shape[0], cells.numpy(), *_axes(centers), *_camera(cameras, view), *_halves(half_diagonal)
+    )
 
 
 def carve(
@@ -42,10 +45,10 @@ def carve(
     """Unmark the cells that a view sees whole, with no matter in any of their pixels."""
     pixel, radius = torch.empty(cells.shape, dtype=torch.int32), torch.empty(cells.shape)
     given = (cells.numpy(), *_axes(centers), *_camera(cameras, view), *_halves(half_diagonal))
-    _find_pixels(*given, pixel.numpy(), radius.numpy())
+    over_rows(_find_pixels, cells.shape[0], *given, pixel.numpy(), radius.numpy())
     covered = widened(matter, radius)
     if covered is not None:
-        _keep_covered(cells.numpy(), pixel.numpy(), covered.reshape(-1).numpy())
+        over_rows(_keep_covered, cells.shape[0], cells.numpy(), pixel.numpy(), covered.reshape(-1).numpy())
 
 
 def trial() -> None:
@@ -112,27 +115,27 @@ def _find(cells, xs, ys, zs, camera, width, height, half, nearest, pixels, radii
         radii[i] = radius if whole else ZERO
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
+@njit(nogil=True, error_model="numpy", cache=True)
 @no_type_check
-def _add_seen(cells, xs, ys, zs, camera, width, height, half, nearest):
-    for chunk in prange((cells.shape[0] + CHUNK - 1) // CHUNK):
-        part = slice(chunk * CHUNK, (chunk + 1) * CHUNK)
+def _add_seen(first, last, cells, xs, ys, zs, camera, width, height, half, nearest):
+    for start in range(first, last, CHUNK):
+        part = slice(start, min(last, start + CHUNK))
         _see(cells[part], xs[part], ys[part], zs[part], camera, width, height, half, nearest)
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
+@njit(nogil=True, error_model="numpy", cache=True)
 @no_type_check
-def _find_pixels(cells, xs, ys, zs, camera, width, height, half, nearest, pixels, radii):
+def _find_pixels(first, last, cells, xs, ys, zs, camera, width, height, half, nearest, pixels, radii):
     # The pixel in the middle of each cell's disc, and the disc's radius; -1 and 0 where the view shows no whole disc.
-    for chunk in prange((cells.shape[0] + CHUNK - 1) // CHUNK):
-        part = slice(chunk * CHUNK, (chunk + 1) * CHUNK)
+    for start in range(first, last, CHUNK):
+        part = slice(start, min(last, start + CHUNK))
         given = (cells[part], xs[part], ys[part], zs[part], camera, width, height, half, nearest)
         _find(*given, pixels[part], radii[part])
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 @no_type_check
-def _keep_covered(cells, pixels, covered):
-    for i in prange(cells.shape[0]):
+def _keep_covered(first, last, cells, pixels, covered):
+    for i in range(first, last):
         if pixels[i] >= 0 and not covered[pixels[i]]:
             cells[i] = False

@@ -1,4 +1,4 @@
-"""The hash grid for the CPU. The backward pass goes level by level in parallel, so two threads never write one entry.
+"""The hash grid for the CPU. The backward pass goes level by level, so two threads never write one entry.
 
 `lanes` is a tuple of F zeros: its length is part of the compiled signature, so the loops over features become vectors.
 """
@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
+from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
@@ -27,7 +28,7 @@ def forward(
     """Return the features."""
     lanes = (0,) * table.shape[1]
     out = torch.empty(points.shape[0], len(layout.resolutions) * len(lanes))
-    _forward(table.numpy(), points.numpy(), *_arrays(layout), lanes, out.numpy())
+    over_rows(_forward, points.shape[0], table.numpy(), points.numpy(), *_arrays(layout), lanes, out.numpy())
     return out
 
 
@@ -38,10 +39,9 @@ def add_table_gradient(
     layout: "HashGridLayout",
 ) -> None:
     """Add the gradient with respect to the table to `into`."""
-    # Threads get runs of levels, and fine ones take longer: even numbers first, then odd, shares them out.
-    levels = len(layout.resolutions)
-    order = np.array([*range(0, levels, 2), *range(1, levels, 2)])
-    _add_table_gradient(into.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), (0,) * into.shape[1], order)
+    given = (into.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), (0,) * into.shape[1])
+    # Fine levels take longest: they come first.
+    in_parallel(lambda level: _add_table_gradient(level, *given), range(len(layout.resolutions))[::-1])
 
 
 def point_gradient(
@@ -53,7 +53,8 @@ def point_gradient(
     """Return the gradient with respect to the points."""
     out = torch.empty_like(points)
     lanes = (0,) * table.shape[1]
-    _point_gradient(table.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), lanes, out.numpy())
+    arrays = (table.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), lanes, out.numpy())
+    over_rows(_point_gradient, points.shape[0], *arrays)
     return out
 
 
@@ -181,14 +182,14 @@ def _scatter(into, e, w, grad, row, column, lanes):
 
 
 # Each loop below finds a point's cell in the same four lines: a function that returned all of it took twice the time.
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):
-    count, width = points.shape[0], len(lanes)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
+def _forward(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
+    width = len(lanes)
+    for chunk in range(first, last, CHUNK):
         for level in range(resolutions.shape[0]):
             resolution, column = resolutions[level], level * width
-            for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+            for i in range(chunk, min(last, chunk + CHUNK)):
                 x, fx = _cell(points[i, 0], resolution)
                 y, fy = _cell(points[i, 1], resolution)
                 z, fz = _cell(points[i, 2], resolution)
@@ -196,26 +197,23 @@ def _forward(table, points, resolutions, offsets, hashed, mask, lanes, out):
                 _gather(table, e, _weights(fx, fy, fz), out, i, column, lanes)
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _add_table_gradient(into, points, grad, resolutions, offsets, hashed, mask, lanes, order):
+def _add_table_gradient(level, into, points, grad, resolutions, offsets, hashed, mask, lanes):
+    resolution, column = resolutions[level], level * len(lanes)
+    for i in range(points.shape[0]):
+        x, fx = _cell(points[i, 0], resolution)
+        y, fy = _cell(points[i, 1], resolution)
+        z, fz = _cell(points[i, 2], resolution)
+        e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+        _scatter(into, e, _weights(fx, fy, fz), grad, i, column, lanes)
+
+
+@njit(nogil=True, fastmath=True, cache=True)
+@no_type_check
+def _point_gradient(first, last, table, points, grad, resolutions, offsets, hashed, mask, lanes, out):
     width = len(lanes)
-    for place in prange(order.shape[0]):
-        level = order[place]
-        resolution, column = resolutions[level], level * width
-        for i in range(points.shape[0]):
-            x, fx = _cell(points[i, 0], resolution)
-            y, fy = _cell(points[i, 1], resolution)
-            z, fz = _cell(points[i, 2], resolution)
-            e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-            _scatter(into, e, _weights(fx, fy, fz), grad, i, column, lanes)
-
-
-@njit(parallel=True, fastmath=True, cache=True)
-@no_type_check
-def _point_gradient(table, points, grad, resolutions, offsets, hashed, mask, lanes, out):
-    count, width = points.shape[0], len(lanes)
-    for i in prange(count):
+    for i in range(first, last):
         gx = gy = gz = np.float32(0.0)
         for level in range(resolutions.shape[0]):
             resolution, column = resolutions[level], level * width

@@ -4,6 +4,11 @@ Sec. 3 of arXiv 2201.05989. Letters: R_l the cells along a side of level l, T th
 F the features of an entry.
 """
 
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -38,6 +43,44 @@ def interpolate(
     return _Interpolate.apply(table, points.float().contiguous(), layout, twin, known)
 
 
+@dataclass(frozen=True)
+class TableGradient:
+    """What a backward pass would add to the gradients of a table."""
+
+    table: Float[Tensor, "entries features"]
+    points: Float[Tensor, "points 3"]
+    grad: Float[Tensor, "points out"]
+    layout: HashGridLayout
+    kernels: ModuleType
+
+    def add(self, scale: float = 1.0) -> None:
+        """Add it."""
+        if self.table.grad is None:
+            self.table.grad = torch.zeros_like(self.table)
+        grad = self.grad if scale == 1.0 else self.grad * scale
+        self.kernels.add_table_gradient(self.table.grad, self.points, grad, self.layout)
+
+
+@contextmanager
+def hold_back() -> Iterator[Sequence[TableGradient]]:
+    """Let backward passes of this thread collect gradients of tables instead of adding them.
+
+    Two threads must not add to one table, and a table for each would cost more than the gradients themselves.
+    """
+    former, _held.gradients = _held.gradients, []
+    try:
+        yield _held.gradients
+    finally:
+        _held.gradients = former
+
+
+class _Held(threading.local):
+    gradients: list[TableGradient] | None = None
+
+
+_held = _Held()
+
+
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, twin: Any, known: Any) -> Tensor:
@@ -55,6 +98,10 @@ class _Interpolate(torch.autograd.Function):
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad = grad.float().contiguous()
         grad_table = None
+        if wants_table:
+            if _held.gradients is not None:
+                _held.gradients.append(TableGradient(table, points, grad, layout, twin))
+                wants_table = False
         if wants_table:
             # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh
             # table of zeros for each tile costs more than the gradients themselves.

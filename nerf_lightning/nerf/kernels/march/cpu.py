@@ -5,11 +5,12 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -29,11 +30,11 @@ def march(
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
     arrays = (*ray, lattice, grid.cells, grid.blocks, grid.floor, state.next, numbers, bounds, following)
-    _find(*(x.contiguous().numpy() for x in arrays))
+    over_rows(_find, count, *(x.contiguous().numpy() for x in arrays))
     torch.cumsum(bounds, 0, out=bounds)
     total = int(bounds[-1])
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
-    _pack(*(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
+    over_rows(_pack, count, *(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
     return PackedSamples(*out, bounds, bounds[-1]), following
 
 
@@ -146,10 +147,12 @@ def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, blocks, floor, 
     return found, min(k, end)
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _find(o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following):
-    for r in prange(o.shape[0]):
+def _find(
+    first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following
+):
+    for r in range(first_ray, last_ray):
         found, k = 0, lattice.shape[0] - 2
         if enter[r] < leave[r]:
             k = _first_from(lattice, jitters[r], first[r], enter[r])
@@ -161,10 +164,10 @@ def _find(o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, num
         following[r] = k
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _pack(jitters, lattice, numbers, bounds, index, starts, ends):
-    for r in prange(bounds.shape[0] - 1):
+def _pack(first_ray, last_ray, jitters, lattice, numbers, bounds, index, starts, ends):
+    for r in range(first_ray, last_ray):
         for place in range(bounds[r], bounds[r + 1]):
             k = numbers[r, place - bounds[r]]
             index[place] = r

@@ -4,16 +4,14 @@ The tiles and the order of their sums are fixed, so the result does not depend o
 """
 
 import functools
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.products import TILE_ROWS, few_sizes, multiply, own_precision, tiles_of_rows
 
-Result = TypeVar("Result")
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 
 
@@ -32,7 +30,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
         out[rows] = multiply(hidden, weights[-1].t())[: rows.stop - rows.start]
         return kept if keep else []
 
-    return out, in_tiles(tile, points.shape[0])
+    return out, in_parallel(tile, tiles_of_rows(points.shape[0]))
 
 
 @own_precision
@@ -57,28 +55,7 @@ def backward(
                 grad_points[rows] = flowing[: rows.stop - rows.start]
         return grads
 
-    parts = in_tiles(tile, grad.shape[0])
+    parts = in_parallel(tile, tiles_of_rows(grad.shape[0]))
     if not parts:
         return grad_points, [torch.zeros_like(weight, dtype=torch.float32) for weight in weights]
     return grad_points, [torch.stack([part[layer].float() for part in parts]).sum(0) for layer in range(len(weights))]
-
-
-def in_tiles(work: Callable[[slice], Result], rows: int) -> list[Result]:
-    """Do the work on each tile of rows, on as many threads as torch has, and return the results in order."""
-    slices = tiles_of_rows(rows)
-    threads = torch.get_num_threads()
-    inference = torch.is_inference_mode_enabled()  # like the gradient mode, a thread's own
-
-    def alone(rows: slice) -> Result:
-        with torch.inference_mode(inference), torch.no_grad():
-            return work(rows)
-
-    if threads == 1 or len(slices) < 2:
-        return [work(rows) for rows in slices]
-    return list(_pool(threads).map(alone, slices))
-
-
-@functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    # Each thread of the pool computes alone; the number of threads is a thread's own setting.
-    return ThreadPoolExecutor(threads, "tiles", initializer=torch.set_num_threads, initargs=(1,))

@@ -6,9 +6,10 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples
 
 
@@ -22,7 +23,7 @@ def integrate(
     """Return foreground, opacity, depth and weights."""
     rays = bounds.shape[0] - 1
     out = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays), torch.zeros_like(density)
-    _integrate(*(x.detach().numpy() for x in (density, rgb, starts, ends, bounds, *out)))
+    over_rows(_integrate, rays, *(x.detach().numpy() for x in (density, rgb, starts, ends, bounds, *out)))
     return out
 
 
@@ -37,7 +38,11 @@ def integrate_gradient(
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Return the gradients of density and colour, given those of foreground, opacity, depth and weights."""
     out = torch.zeros_like(density), torch.zeros_like(rgb)
-    _gradient(*(x.detach().numpy() for x in (density, rgb, starts, ends, bounds, weights, *grads, *out)))
+    over_rows(
+        _gradient,
+        bounds.shape[0] - 1,
+        *(x.detach().numpy() for x in (density, rgb, starts, ends, bounds, weights, *grads, *out)),
+    )
     return out
 
 
@@ -45,7 +50,8 @@ def num_visible(density: Float[Tensor, "n"], samples: PackedSamples, opaque_belo
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
     out = torch.empty_like(samples.bounds[1:])
     arrays = (density.detach().contiguous(), samples.starts, samples.ends, samples.bounds, out)
-    _num_visible(np.float32(-math.log(opaque_below)), *(x.numpy() for x in arrays))
+    most = np.float32(-math.log(opaque_below))
+    over_rows(_num_visible, out.shape[0], most, *(x.numpy() for x in arrays))
     return out
 
 
@@ -60,10 +66,10 @@ def trial() -> None:
     num_visible(density, samples, 0.01)
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 @no_type_check
-def _integrate(density, rgb, starts, ends, bounds, foreground, opacity, depth, weights):
-    for r in prange(bounds.shape[0] - 1):
+def _integrate(first, last, density, rgb, starts, ends, bounds, foreground, opacity, depth, weights):
+    for r in range(first, last):
         optical = red = green = blue = total = distance = np.float32(0.0)
         for i in range(bounds[r], bounds[r + 1]):
             thickness = density[i] * (ends[i] - starts[i])
@@ -79,10 +85,12 @@ def _integrate(density, rgb, starts, ends, bounds, foreground, opacity, depth, w
         opacity[r], depth[r] = total, distance
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 @no_type_check
-def _gradient(density, rgb, starts, ends, bounds, weights, d_light, d_opacity, d_depth, d_weights, d_density, d_rgb):
-    for r in prange(bounds.shape[0] - 1):
+def _gradient(
+    first, last, density, rgb, starts, ends, bounds, weights, d_light, d_opacity, d_depth, d_weights, d_density, d_rgb
+):
+    for r in range(first, last):
         optical = np.float32(0.0)
         for i in range(bounds[r], bounds[r + 1]):
             optical += density[i] * (ends[i] - starts[i])
@@ -98,10 +106,10 @@ def _gradient(density, rgb, starts, ends, bounds, weights, d_light, d_opacity, d
             behind += w * g
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 @no_type_check
-def _num_visible(most, density, starts, ends, bounds, out):
-    for r in prange(bounds.shape[0] - 1):
+def _num_visible(first, last, most, density, starts, ends, bounds, out):
+    for r in range(first, last):
         optical = np.float32(0.0)
         i = bounds[r]
         while i < bounds[r + 1] and optical < most:

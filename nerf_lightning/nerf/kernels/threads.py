@@ -1,0 +1,65 @@
+"""Work that is shared out over threads of ours, each of which computes alone.
+
+The kernels release Python's lock and know of no threads; torch's own operations release it too. So whole tiles of a
+training step run beside each other, or, where one thread stands alone, the rows of one kernel. Nothing depends on
+which thread takes what: parts and their order are fixed.
+"""
+
+import functools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import torch
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+FEWEST_ROWS = 512
+"""A part of fewer rows costs more to hand over than to compute."""
+PARTS_PER_THREAD = 4
+"""More parts than threads, since some take longer than others."""
+
+
+def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Do the work on each part, on as many threads as torch has here, and return the results in order.
+
+    Within a part torch has one thread, and so has whatever is called there. Raises what the work raises.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1 or len(parts) < 2:
+        return [work(part) for part in parts]
+    # A thread's own settings, which those of the pool do not share.
+    inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def alone(part: Part) -> Result:
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            return work(part)
+
+    return list(_pool(threads).map(alone, parts))
+
+
+def over_rows(kernel: Callable[..., Any], rows: int, *arrays: Any) -> None:
+    """Call kernel(first, last, *arrays) for parts of the rows that together are all of them."""
+    in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, torch.get_num_threads()))
+
+
+def parts_of(rows: int, threads: int) -> list[tuple[int, int]]:
+    """Return the parts that rows are shared out in; for one thread a single one.
+
+    >>> parts_of(4096, 1), parts_of(1200, 8)
+    ([(0, 4096)], [(0, 600), (600, 1200)])
+    """
+    count = 1 if threads == 1 else max(1, min(PARTS_PER_THREAD * threads, rows // FEWEST_ROWS))
+    return [(rows * part // count, rows * (part + 1) // count) for part in range(count)]
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    # The number of threads is a thread's own setting.
+    return ThreadPoolExecutor(threads, "tiles", initializer=torch.set_num_threads, initargs=(1,))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork has none of its parent's threads
