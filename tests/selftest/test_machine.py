@@ -37,7 +37,6 @@ def test_what_cannot_be_known_is_unknown(monkeypatch):
 
     monkeypatch.setattr(module.Path, "read_text", missing)
     monkeypatch.setattr(subprocess, "run", missing)
-    monkeypatch.setattr(module.backends, "twin", lambda name: None)
     known = machine(CPU)
     assert known["cpu_flags"] == "unknown"
     assert "numba" not in known["threads"]

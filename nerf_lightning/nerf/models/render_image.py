@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
@@ -118,13 +119,21 @@ def _render_all(model: Model, rays: RayBundle, background: Background, tile_poin
 
 def _render_in_tiles(model: Model, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
     device, count = next(model.parameters()).device, rays.near.numel()
-    columns: list[Tensor] = []
-    for part in tiles(count, at_once):
-        rendered = _render_tile(model, rays[part].to(device), background)
-        # Made once: thousands of small results between what comes and goes would leave holes many times their size.
-        columns = columns or [result.new_empty(count, *result.shape[1:]) for result in rendered]
-        for column, result in zip(columns, rendered, strict=True):
+    # Made once: thousands of small results between what comes and goes would leave holes many times their size.
+    one = _render_tile(model, rays[:1].to(device), background)
+    columns = [result.new_empty(count, *result.shape[1:]) for result in one]
+
+    def render(part: slice) -> None:
+        for column, result in zip(columns, _render_tile(model, rays[part].to(device), background), strict=True):
             column[part] = result
+
+    threads = torch.get_num_threads() if device.type == "cpu" and count > at_once else 1
+    parts = list(tiles(count, at_once, multiple=threads))
+    if threads > 1:
+        in_parallel(render, parts)
+    else:
+        for part in parts:
+            render(part)
     return columns
 
 
