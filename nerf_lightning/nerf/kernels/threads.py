@@ -9,6 +9,7 @@ import functools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 from typing import Any, TypeVar
 
 import torch
@@ -57,8 +58,15 @@ def parts_of(rows: int, threads: int) -> list[tuple[int, int]]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    # The number of threads is a thread's own setting.
-    return ThreadPoolExecutor(threads, "tiles", initializer=torch.set_num_threads, initargs=(1,))
+    pool, all_there = ThreadPoolExecutor(threads, "tiles", initializer=_compute_alone), Barrier(threads)
+    list(pool.map(lambda _: all_there.wait(), range(threads)))
+    torch.set_num_threads(threads)  # the calling thread's and what threads begin with: those of the pool changed that
+    return pool
+
+
+def _compute_alone() -> None:
+    torch.get_num_threads()  # else a thread takes what threads begin with when it asks for the first time
+    torch.set_num_threads(1)
 
 
 if hasattr(os, "register_at_fork"):

@@ -1,5 +1,6 @@
 """A level whose samples are packed: only where its sampler says that there may be something is anything computed."""
 
+from threading import Lock
 from typing import Any
 
 import torch
@@ -23,6 +24,8 @@ MOST_SAMPLES = 1 << 12
 LEAST_ALPHA = 1e-3
 # Samples that a ray takes in one round of rendering; more where few rays are left.
 ROUND_SAMPLES, MOST_ROUND_SAMPLES = 6, 64
+# Tiles of a step may be taken by threads beside each other.
+COUNTING = Lock()
 
 
 class PackedLevel(Level):
@@ -107,7 +110,9 @@ class PackedLevel(Level):
         capacity = self.sampler.capacity_on(rays.near.device)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         count = torch.full_like(samples.found, rays.near.shape[0])
-        self.tally += torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
+        counted = torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
+        with COUNTING:
+            self.tally += counted
         output = self.field(packed_points(rays, samples, random), features)
         return composite_packed(output, samples, rays, background)
 

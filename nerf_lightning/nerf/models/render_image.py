@@ -120,8 +120,9 @@ def _render_all(model: Model, rays: RayBundle, background: Background, tile_poin
 def _render_in_tiles(model: Model, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
     device, count = next(model.parameters()).device, rays.near.numel()
     # Made once: thousands of small results between what comes and goes would leave holes many times their size.
-    one = _render_tile(model, rays[:1].to(device), background)
-    columns = [result.new_empty(count, *result.shape[1:]) for result in one]
+    columns = [torch.empty(count, 3), torch.empty(count), torch.empty(count)]
+    if model.first_picture is not None:
+        columns.append(torch.empty(count, 3))
 
     def render(part: slice) -> None:
         for column, result in zip(columns, _render_tile(model, rays[part].to(device), background), strict=True):

@@ -98,10 +98,9 @@ class _Interpolate(torch.autograd.Function):
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad = grad.float().contiguous()
         grad_table = None
-        if wants_table:
-            if _held.gradients is not None:
-                _held.gradients.append(TableGradient(table, points, grad, layout, twin))
-                wants_table = False
+        if wants_table and _held.gradients is not None:
+            _held.gradients.append(TableGradient(table, points, grad, layout, twin))
+            wants_table = False
         if wants_table:
             # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh
             # table of zeros for each tile costs more than the gradients themselves.

@@ -1,0 +1,76 @@
+import multiprocessing
+import threading
+import time
+
+import pytest
+import torch
+
+from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def threads_of_parts(_=None):
+    return in_parallel(lambda part: torch.get_num_threads(), range(6))
+
+
+def test_each_part_computes_alone_whatever_was_set_before():
+    assert threads_of_parts() == [1] * 6
+    torch.set_num_threads(3)
+    assert threads_of_parts() == [1] * 6
+    torch.set_num_threads(2)
+    assert threads_of_parts() == [1] * 6
+
+
+def test_other_threads_keep_theirs():
+    threads_of_parts()
+    seen = []
+    other = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+    other.start()
+    other.join()
+    assert [*seen, torch.get_num_threads()] == [2, 2]
+
+
+def test_results_come_in_order_and_parts_within_parts_wait_for_nobody():
+    def slow_first(part):
+        time.sleep(0.05 if part == 0 else 0.0)
+        return [part, *in_parallel(lambda inner: inner, range(3))]
+
+    assert in_parallel(slow_first, range(4)) == [[part, 0, 1, 2] for part in range(4)]
+
+
+def test_what_fails_in_a_part_fails_here():
+    with pytest.raises(ZeroDivisionError):
+        in_parallel(lambda part: 1 // part, range(3))
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])
+def test_gradients_are_kept_in_a_part_where_they_are_outside(mode):
+    with mode():
+        wanted = (torch.is_grad_enabled(), torch.is_inference_mode_enabled())
+        seen = in_parallel(lambda part: (torch.is_grad_enabled(), torch.is_inference_mode_enabled()), range(3))
+    assert seen == [wanted] * 3
+
+
+@pytest.mark.parametrize("rows", [0, 1, 511, 1024, 5000])
+def test_every_row_is_taken_once(rows):
+    taken = torch.zeros(rows)
+
+    def take(first, last, into):
+        into[first:last] += 1
+
+    over_rows(take, rows, taken)
+    assert taken.tolist() == [1.0] * rows
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
+def test_a_fork_has_threads_of_its_own():
+    threads_of_parts()
+    with multiprocessing.get_context("fork").Pool(1) as forks:
+        assert forks.apply_async(threads_of_parts).get(timeout=60) == [1] * 6
