@@ -266,7 +266,7 @@ class TrainStep:
             return TileLoss(levels * ((tile.stop - tile.start) / share.num_rays), renderings[-1].foreground)
 
         tile_rays = self._tile_rays(num_rays, training=True)
-        threads = torch.get_num_threads() if device.type == "cpu" and tile_rays < num_rays else 1
+        threads = torch.get_num_threads() if device.type == "cpu" and self.tile_points is not None else 1
         if threads > 1:
             parts = list(tiles(num_rays, tile_rays, multiple=threads))
             lost = side_by_side(lose, parts, backward, self._parameters())
