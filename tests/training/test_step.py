@@ -107,6 +107,15 @@ def test_the_learning_rate_follows_the_schedule():
     assert rates == [0.5, 0.5, 0.25, 0.125]
 
 
+@pytest.fixture
+def one_thread():
+    """What is tried is tried in order: several threads would each take a tile."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def stingy_model(room):
     """A model that has room for so many rays at once, and a list of what was tried."""
     model, tried = tiny_model(density_bias=0.5), []
@@ -122,7 +131,7 @@ def stingy_model(room):
     return model, tried
 
 
-def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog):
+def test_without_memory_the_tile_is_halved_and_the_step_repeated(caplog, one_thread):
     scene = ball_scene()
     wanted, losses = gradients(make_step(100_000), scene)
     model, tried = stingy_model(room=20)
@@ -139,7 +148,7 @@ def test_without_memory_for_a_single_ray_the_run_ends_with_advice():
         gradients(make_step(100_000, model=stingy_model(room=0)[0]), ball_scene())
 
 
-def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(caplog):
+def test_without_memory_pictures_are_rendered_in_smaller_tiles_from_then_on(caplog, one_thread):
     scene = ball_scene()
     wanted = render_picture(tiny_model(density_bias=0.5), rays_of(scene), 1, "white", 10**6)
     model, tried = stingy_model(room=40)
