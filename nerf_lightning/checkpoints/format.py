@@ -12,7 +12,7 @@ from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 FORMAT = 4
 KEY = "nerf_lightning"
 PRECISIONS = ("32-true", "tf32", "bf16-mixed")
-PARTS = ("model", "rays")
+PARTS = ("model", "rays", "correction")
 """Of a training step: what their weights' names begin with."""
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
 """Types of what those hold. Numbers of other types would be cast without a word."""

@@ -17,6 +17,8 @@ from nerf_lightning import ranks
 from nerf_lightning.data.ray_batches import batch_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.corrections.none import NoCorrection
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
@@ -27,7 +29,7 @@ from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.rays import Batch, Target
+from nerf_lightning.nerf.types.rays import Batch, PixelIndex, Target
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 
@@ -74,6 +76,7 @@ class TrainStep:
         sample_budget: rays per step are chosen so that a step has about so many samples; None leaves them alone.
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
+        correction: what photographs make of the rendered colours; None leaves them alone.
 
     Raises:
         InputError: a model that cannot be cut into tiles.
@@ -94,8 +97,10 @@ class TrainStep:
         sample_budget: int | None = None,
         start_weights: dict[str, Tensor] | None = None,
         num_steps: int | None = None,
+        correction: Correction | None = None,
     ):
         self.model, self.rays, self.loss = model, rays, loss
+        self.correction = NoCorrection() if correction is None else correction
         self.build_optimizer, self.schedule = optimizer, schedule
         self.progress, self.num_steps, self.seed = progress, num_steps, seed
         self.background = background
@@ -122,7 +127,7 @@ class TrainStep:
     @property
     def parts(self) -> dict[str, Any]:
         """All that learns, by the name under which a checkpoint keeps it; the model first."""
-        return {"model": self.model, "rays": self.rays}
+        return {"model": self.model, "rays": self.rays, "correction": self.correction}
 
     @property
     def device(self) -> torch.device:
@@ -278,20 +283,26 @@ class TrainStep:
         behind = background_colors(self.background, num_rays, device, random)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
-        target = Target(blend(batch.rgba, behind), weight, batch.pixels)
+        target = Target(blend(batch.rgba, self._photographed(behind, batch.pixels)), weight, batch.pixels)
         losses, foreground = [], []
         for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
             renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
-            part = torch.stack(list(self.loss(renderings, target[tile])))
+            shown = [replace(each, rgb=self.correction(each.rgb, pixels)) for each in renderings]
+            part = torch.stack(list(self.loss(shown, target[tile])))
             part = part * ((tile.stop - tile.start) / share.num_rays)
             backward(part.sum())
             losses.append(part.detach())
             foreground.append(renderings[-1].foreground.detach())
         seen = {"foreground": torch.cat(foreground), "target": target.rgb, "weight": batch.weight}
         return {"losses": torch.stack(losses).sum(0)} | seen
+
+    @torch.no_grad()
+    def _photographed(self, background: Tensor | None, pixels: PixelIndex) -> Tensor | None:
+        # No camera saw it: where nothing stands before it, the correction has nothing to learn.
+        return None if background is None else self.correction(background, pixels)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) == 1:

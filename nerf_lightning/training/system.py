@@ -40,7 +40,7 @@ class RadianceFieldSystem(LightningModule):
         self.automatic_optimization = False
         self.step, self.record = step, record
         # Modules of the step are this module's, so that they move to the trainer's device and are saved.
-        self.model, self.rays = step.model, step.rays
+        self.model, self.rays, self.correction = step.model, step.rays, step.correction
         self.val_errors = RayErrors()
 
     @classmethod

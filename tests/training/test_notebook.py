@@ -14,6 +14,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
+from support.configs import options
 from support.learnt_cameras import LearntShifts
 from support.running import refused
 
@@ -251,6 +252,21 @@ def test_the_fast_path_goes_on_too(run, trainer):
     first.fit(begun.system, begun.data)
     trainer(max_steps=40).fit(rest.system, rest.data, ckpt_path=kept(first))
     assert_equal(rest, whole)
+
+
+@pytest.mark.parametrize("option", [each for each in options("correction") if each != "auto"])
+def test_a_run_with_a_correction_goes_on_to_the_bit(run, trainer, option):
+    settings = (f"correction={option}", "scheduler=constant")
+    whole, begun, rest = run(*settings), run(*settings), run(*settings)
+    trainer(max_steps=8).fit(whole.system, whole.data)
+    first = trainer(max_steps=4)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=8).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert_equal(rest, whole)
+    names = [name for name in whole.system.state_dict() if name.startswith("correction.")]
+    assert bool(names) == (option != "none")
+    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
+    assert not [name for name in loaded.state_dict() if name.startswith("correction.")]
 
 
 def test_what_learns_beside_the_model_goes_on_too(run, trainer):
