@@ -26,7 +26,8 @@ def with_stops(scene: Scene, stops: Tensor, dim: float = 1.0) -> Scene:
         dim: factor on the light of all, which leaves room to expose some longer.
     """
     gains = torch.full((len(scene.view_names), 3), dim)
-    shift = torch.stack([stops[:, 0] + stops[:, 1], stops[:, 0], stops[:, 0] + stops[:, 2]], dim=-1)
+    exposure, red, blue = stops.unbind(-1)
+    shift = torch.stack([exposure + red, exposure - red - blue, exposure + blue], dim=-1)
     gains[list(scene.splits["train"])] *= torch.exp2(shift)
     rgba = scene.pixels.rgba.clone()
     for view, gain in enumerate(gains):

@@ -12,7 +12,10 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class Exposure(Correction):
-    """Per photograph one exposure, and the gains of red and blue against green, all in stops of linear light.
+    """Per photograph one exposure, and the gains of red and blue against it, all in stops of linear light.
+
+    The exposure is the mean of the three channels: green gains what red and blue lose. So a channel that a scene hardly
+    has, and of which little can be known, spoils neither of the others.
 
     The light of all photographs can be scaled together, and the model's the other way: a penalty on the three means
     over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
@@ -49,7 +52,7 @@ class Exposure(Correction):
     def gains(self) -> Float[Tensor, "views 3"]:
         """Return the factors on the linear light of red, green and blue in each photograph."""
         exposure, red, blue = self.stops.unbind(-1)
-        return torch.exp2(torch.stack([exposure + red, exposure, exposure + blue], dim=-1))
+        return torch.exp2(torch.stack([exposure + red, exposure - red - blue, exposure + blue], dim=-1))
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the sum of the squared means of exposure, red and blue over the photographs that train."""
