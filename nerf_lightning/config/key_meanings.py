@@ -103,7 +103,7 @@ SWEEP_WORD = replace(OF_THE_USER, in_sweep=Trust.WORDS)
 OF_OTHER_COMMANDS = Meaning()
 
 ROWS: tuple[tuple[Meaning, str], ...] = (
-    (PART, "model.** encoder.** direction_encoder.** field.** loss.** optimizer.** scheduler.**"),
+    (PART, "model.** encoder.** direction_encoder.** field.** loss.** correction.** optimizer.** scheduler.**"),
     (
         LEARNT,
         """
@@ -148,7 +148,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         scene.verify doctor final.evaluate final.video final.report path.file path.view path.views
         evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
-        evaluation.lpips_weights evaluation.lpips_net
+        evaluation.lpips_weights evaluation.lpips_net evaluation.colors
         """,
     ),
     (CURVE, "path.**"),
@@ -180,7 +180,7 @@ THE_REST = {
 }
 
 CHOSEN_GROUPS = (
-    *("callbacks", "data", "encoder", "evaluation", "experiment", "field", "logger", "loss", "model"),
+    *("callbacks", "correction", "data", "encoder", "evaluation", "experiment", "field", "logger", "loss", "model"),
     *("optimizer", "path", "sampler", "scene", "scheduler", "trainer"),
 )
 """Groups of conf/ of which a file may choose an option by its name."""

@@ -1,20 +1,24 @@
 """Measure a model on the views of a split: numbers per picture, what they come to, and the protocol of all of them."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from rich.progress import track
+from torch import Tensor
 
 from nerf_lightning import ranks
 from nerf_lightning.console import stderr_console
 from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.color_fit import exposure_fitted
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import summary, write_metrics
-from nerf_lightning.evaluation.protocol import environment, measured_how
+from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -37,6 +41,8 @@ class Scoring:
         num_worst: how many more, those of the lowest PSNR.
         lpips_weights: a file with the backbone's weights; None: LPIPS is not computed.
         lpips_net: the backbone, alex or vgg.
+        colors: raw compares renders as they are; half_fit gives each the exposure and white balance that suit the left
+            half of its photograph, and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
     """
 
     def __init__(
@@ -48,6 +54,7 @@ class Scoring:
         num_worst: int = 3,
         lpips_weights: str | None = None,
         lpips_net: Literal["alex", "vgg"] = "alex",
+        colors: Colors = "raw",
     ):
         if max_views is not None and max_views < 1:
             raise InputError(f"evaluation.max_views={max_views}: give at least one view, or null for all.")
@@ -55,6 +62,7 @@ class Scoring:
             if count < 0:
                 raise InputError(f"evaluation.{name}={count}: give 0 or more.")
         self.split, self.max_views, self.quantize = split, max_views, quantize
+        self.colors: Colors = colors
         self.num_pictures, self.num_worst = num_pictures, num_worst
         self.lpips = load_lpips(lpips_weights, lpips_net)
 
@@ -102,7 +110,7 @@ class Scoring:
     def protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
         """Return how these views are measured."""
         lpips = None if self.lpips is None else self.lpips.net
-        return measured_how(scene, self.split, views, background, self.quantize, lpips)
+        return measured_how(scene, self.split, views, background, self.quantize, lpips, self.colors)
 
     def _views(self, scene: Scene) -> list[int]:
         views = scene.splits.get(self.split, ())
@@ -115,15 +123,24 @@ class Scoring:
     def _compare(
         self, picture: Picture, scene: Scene, view: int, background: Background
     ) -> tuple[dict[str, Any], ScoredView]:
-        truth = photograph(scene, view, background)
+        truth, kept = photograph(scene, view, background), scene.pixels.kept(view)
+        scored = slice(None)
+        if self.colors == "half_fit":
+            scored = slice(truth.shape[1] // 2, None)
+            picture = replace(picture, rgb=_fitted_on_the_left(picture, truth, kept, scored.start))
         if self.quantize:
-            picture = Picture((picture.rgb.clamp(0, 1) * 255).round() / 255, picture.depth, picture.opacity)
-        kept = scene.pixels.kept(view)
-        row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(picture.rgb, truth, kept)}
-        compared = masked_out(picture.rgb, truth, kept)
-        row["lpips"] = None if self.lpips is None else self.lpips.score(compared, truth)
+            picture = replace(picture, rgb=(picture.rgb.clamp(0, 1) * 255).round() / 255)
+        render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
+        row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(render, true, counts)}
+        row["lpips"] = None if self.lpips is None else self.lpips.score(masked_out(render, true, counts), true)
         depth = unit_of(scene.to_user) * picture.depth
         return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
+
+
+def _fitted_on_the_left(picture: Picture, truth: Tensor, kept: Tensor | None, middle: int) -> Tensor:
+    fitted = torch.ones(truth.shape[:2], dtype=torch.bool) if kept is None else kept.clone()
+    fitted[:, middle:] = False
+    return exposure_fitted(picture.rgb, truth, picture.opacity, fitted)
 
 
 def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, float | None]:

@@ -13,13 +13,14 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from nerf_lightning import ranks
+from nerf_lightning.evaluation.color_fit import color_corrected
 from nerf_lightning.nerf.products import own_precision
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
 LEAST_MSE = 1e-10
 """Errors below count as this one, a PSNR of 100 dB."""
-HIGHER_IS_BETTER = ("psnr", "ssim")
+HIGHER_IS_BETTER = ("psnr", "cc_psnr", "ssim")
 """Of the others, which are errors, the lower is better."""
 
 
@@ -49,7 +50,10 @@ def image_metrics(
     truth: Float[Tensor, "height width 3"],
     kept: Bool[Tensor, "height width"] | None = None,
 ) -> dict[str, float | None]:
-    """Return `psnr` (dB) and `ssim` of one image; the render is clamped to [0, 1] first.
+    """Return `psnr` (dB), `cc_psnr` and `ssim` of one image; the render is clamped to [0, 1] first.
+
+    `cc_psnr` is the PSNR after an affine fit of the render's colours to the photograph's (`color_fit`), so that neither
+    exposure nor white balance counts.
 
     SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
     is None where the image is smaller than the window: with another window it would be another metric.
@@ -67,8 +71,16 @@ def image_metrics(
         similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
         assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
         ssim = float(similarity)
+    return {
+        "psnr": _psnr_of(render, truth, kept),
+        "cc_psnr": _psnr_of(color_corrected(render, truth, kept).clamp(0, 1), truth, kept),
+        "ssim": ssim,
+    }
+
+
+def _psnr_of(render: Tensor, truth: Tensor, kept: Tensor | None) -> float:
     error = (render - truth).square()
-    return {"psnr": float(psnr((error if kept is None else error[kept]).mean())), "ssim": ssim}
+    return float(psnr((error if kept is None else error[kept]).mean()))
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

@@ -13,7 +13,7 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.machine import peak_memory
 
-METRICS = ("psnr", "ssim", "lpips", "depth_error", "normal_error")
+METRICS = ("psnr", "cc_psnr", "ssim", "lpips", "depth_error", "normal_error")
 COLUMNS = ("name", *METRICS, "seconds")
 
 

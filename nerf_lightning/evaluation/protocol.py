@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import psutil
 import torch
@@ -26,12 +26,25 @@ from nerf_lightning.nerf.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]
 GIT_SECONDS = 10
-EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras")
+EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras", "colors")
 """What must agree between results of different scenes, too."""
+MAY_LACK = ("lpips", "cc_psnr")
+"""What one result may have and another not."""
+Colors = Literal["raw", "half_fit"]
+"""Whether a render is compared as it is; or on its right half alone, with exposure and white balance of the left."""
+COLORS = {"raw": "raw", "half_fit": "exposure and white balance fitted on the left half, scored on the right"}
+UNSAID = {"colors": "raw"}
+"""What older results meant without saying it."""
 
 
 def measured_how(
-    scene: Scene, split: str, views: list[int], background: Background, quantize: bool, lpips: str | None
+    scene: Scene,
+    split: str,
+    views: list[int],
+    background: Background,
+    quantize: bool,
+    lpips: str | None,
+    colors: Colors = "raw",
 ) -> dict[str, Any]:
     """Return the protocol of a measurement.
 
@@ -42,6 +55,7 @@ def measured_how(
         background: what the pictures were composited over; random means white.
         quantize: the render was rounded to 8 bits.
         lpips: the backbone, None where LPIPS is not computed.
+        colors: whether exposure and white balance were fitted first.
     """
     sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
     return {
@@ -52,8 +66,10 @@ def measured_how(
         "resolution": [list(size) for size in sizes],
         "pixels": "8-bit" if quantize else "float",
         "cameras": "raw",
+        "colors": COLORS[colors],
         "masks": "none" if scene.pixels.mask is None else "left out",
         "psnr": "mean of the pictures' own",
+        "cc_psnr": "after an affine fit of each picture's colours, by least squares",
         "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
         "lpips": None if lpips is None else f"{lpips}, version 0.1",
         **scene.protocol,
@@ -133,7 +149,7 @@ def commit() -> str | None:
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bool = True) -> list[str]:
-    """Return what keeps two results from being compared, in words; LPIPS that one lacks keeps nothing.
+    """Return what keeps two results from being compared, in words; a metric that one lacks keeps nothing.
 
     >>> differences({"pixels": "float"}, {"pixels": "8-bit"})
     ['pixels: float and 8-bit']
@@ -142,12 +158,16 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
     return [
         f"{key}: {_said(one, key)} and {_said(other, key)}"
         for key in keys
-        if one.get(key) != other.get(key) and not (key == "lpips" and None in (one.get(key), other.get(key)))
+        if _meant(one, key) != _meant(other, key) and not (key in MAY_LACK and None in (one.get(key), other.get(key)))
     ]
 
 
+def _meant(protocol: Mapping[str, Any], key: str) -> Any:
+    return protocol.get(key, UNSAID.get(key))
+
+
 def _said(protocol: Mapping[str, Any], key: str) -> str:
-    return str(protocol[key])[:80] if key in protocol else "not said"
+    return str(_meant(protocol, key))[:80] if key in protocol or key in UNSAID else "not said"
 
 
 LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")

@@ -12,6 +12,7 @@ from nerf_lightning.report.page import Pairs, ViewOnPage
 
 FORMATS = {
     "psnr": "{:.2f} dB",
+    "cc_psnr": "{:.2f} dB",
     "ssim": "{:.4f}",
     "lpips": "{:.4f}",
     "depth_error": "{:.4f}",
@@ -19,6 +20,7 @@ FORMATS = {
     "seconds": "{:.3f}",
 }
 LABELS = {
+    "cc_psnr": "PSNR, colours fitted",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "depth_error": "depth error, scene units",

@@ -18,6 +18,7 @@ from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import require_sound
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.types.progress import Progress
@@ -168,10 +169,10 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
 def build_step(
     config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, start: Checkpoint | None = None
 ) -> TrainStep:
-    """Build model, loss, optimizer and schedule into the step of training.
+    """Build model, loss, correction, optimizer and schedule into the step of training.
 
     Raises:
-        InputError: a value of the wrong kind, or a model that cannot be cut into tiles.
+        InputError: a value of the wrong kind, a model that cannot be cut into tiles, a correction for one photograph.
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
@@ -182,12 +183,15 @@ def build_step(
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     model.fit_to(scene)
+    correction: Correction = build(config.correction)
+    correction.fit_to(scene)
     if start is not None:
         load_weights(model, start)
     return TrainStep(
         model=model,
         rays=RayGenerator(scene.cameras, scene.near, scene.far),
         loss=build(config.loss),
+        correction=correction,
         optimizer=optimizer,
         schedule=build(config.scheduler),
         progress=progress,

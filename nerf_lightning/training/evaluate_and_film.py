@@ -14,7 +14,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
-from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.evaluation.protocol import COLORS, measured_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
@@ -94,9 +94,11 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Return the lines that a person reads at the end."""
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
+    halves = "" if protocol["colors"] == COLORS["raw"] else f" ({protocol['colors']})"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
         f"({metrics['num_images']} views, {protocol['background']} background)",
+        f"               {metrics['cc_psnr']:.2f} dB once the colours of each picture are fitted{halves}",
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']})",
     ]

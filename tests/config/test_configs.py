@@ -23,6 +23,7 @@ BUILT = {
     "path": "path",
     "evaluation": "evaluation",
     "optimizer": "optimizer",
+    "correction": "correction",
 }
 
 
@@ -149,7 +150,11 @@ def targets(node, path=""):
 
 
 @pytest.mark.parametrize(
-    "group", ["encoder", "field", "sampler", "loss", "scheduler", "scene", "path", "evaluation", "trainer", "what"]
+    "group",
+    [
+        *("encoder", "field", "sampler", "loss", "correction", "scheduler", "scene", "path", "evaluation", "trainer"),
+        "what",
+    ],
 )
 def test_a_yaml_names_its_constructors_arguments_and_all_of_them(group):
     """The signature is the schema: a setting that exists can be seen in the yaml, and no key is read by nobody."""

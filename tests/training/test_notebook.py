@@ -14,6 +14,8 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
+from support.configs import options
+from support.learnt_cameras import LearntShifts
 from support.running import refused
 
 import nerf_lightning
@@ -250,6 +252,41 @@ def test_the_fast_path_goes_on_too(run, trainer):
     first.fit(begun.system, begun.data)
     trainer(max_steps=40).fit(rest.system, rest.data, ckpt_path=kept(first))
     assert_equal(rest, whole)
+
+
+@pytest.mark.parametrize("option", [each for each in options("correction") if each != "auto"])
+def test_a_run_with_a_correction_goes_on_to_the_bit(run, trainer, option):
+    settings = (f"correction={option}", "scheduler=constant")
+    whole, begun, rest = run(*settings), run(*settings), run(*settings)
+    trainer(max_steps=8).fit(whole.system, whole.data)
+    first = trainer(max_steps=4)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=8).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert_equal(rest, whole)
+    names = [name for name in whole.system.state_dict() if name.startswith("correction.")]
+    assert bool(names) == (option != "none")
+    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
+    assert not [name for name in loaded.state_dict() if name.startswith("correction.")]
+
+
+def test_what_learns_beside_the_model_goes_on_too(run, trainer):
+    def with_learnt_cameras():
+        made = run("scheduler=constant")
+        cameras = made.scene.cameras, made.scene.near, made.scene.far
+        made.system.rays = made.system.step.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
+        return made
+
+    whole, begun, rest, other = with_learnt_cameras(), with_learnt_cameras(), with_learnt_cameras(), run()
+    trainer(max_steps=12).fit(whole.system, whole.data)
+    first = trainer(max_steps=5)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=12).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert float(whole.system.rays.shift.detach().abs().max()) > 0
+    assert_equal(rest, whole)
+    assert not [name for name in read_checkpoint(kept(first)).weights if "shift" in name]
+    goes_on = trainer(max_steps=12)
+    with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no part"):
+        goes_on.fit(other.system, other.data, ckpt_path=kept(first))
 
 
 def test_a_checkpoint_of_another_run_is_refused(run, trainer):

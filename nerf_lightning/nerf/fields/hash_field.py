@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
@@ -36,12 +37,16 @@ class HashField(Field):
             alpha, which tells at once where nothing is, and thin (-1) where they have none: there a dense start would
             remain as fog of the background's colour.
         contraction: map all space, contracted around the box, instead of the box alone; None: as the scene's space.
+        appearance: numbers of a code that each photograph has, and that its colours depend on (Sec. 4.1, arXiv
+            2008.02268); 0: none. What is seen without a photograph has the mean code of those that train.
     """
 
     compiles = False
 
     aabb: Tensor
     bias: Tensor
+    codes: Tensor
+    trained: Tensor
 
     def __init__(
         self,
@@ -51,9 +56,10 @@ class HashField(Field):
         feature_dim: int = 16,
         density_bias: float | None = None,
         contraction: bool | None = None,
+        appearance: int = 0,
     ):
         super().__init__()
-        require_ranges(locals(), {"width": (1, 1 << 20), "feature_dim": (1, 1 << 20)})
+        require_ranges(locals(), {"width": (1, 1 << 20), "feature_dim": (1, 1 << 20), "appearance": (0, 1 << 10)})
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
@@ -62,13 +68,29 @@ class HashField(Field):
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
         self.density_mlp = _weights(position_encoder.out_dim, width, feature_dim)
-        self.color_mlp = _weights(feature_dim + direction_encoder.out_dim, width, width, 3)
+        self.color_mlp = _weights(feature_dim + direction_encoder.out_dim + appearance, width, width, 3)
+        self.appearance = appearance
+        if appearance:
+            self.codes = nn.Parameter(torch.zeros(1, appearance))
+            self.register_buffer("trained", torch.zeros(1, dtype=torch.int64))
         self.reset_parameters()
 
     def fit_to(self, scene: Scene) -> None:
-        """Take note of the box that holds the scene's content, and whether the photographs have alpha."""
+        """Take note of the box that holds the scene's content, whether the photographs have alpha, and how many train.
+
+        Raises:
+            InputError: a code is asked for, and there is but one photograph.
+        """
         self.aabb.copy_(scene.aabb)
         self.contracted.fit_to(scene)
+        if self.appearance:
+            if len(scene.splits["train"]) < 2:
+                raise InputError(
+                    f"The scene {scene.name} trains on one photograph, and codes learn how the colours of several "
+                    "differ: add field.appearance=0, or give more photographs."
+                )
+            self.codes = nn.Parameter(torch.zeros(len(scene.view_names), self.appearance))
+            self.trained = torch.tensor(scene.splits["train"])
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
 
@@ -76,9 +98,11 @@ class HashField(Field):
         """Look at what was loaded.
 
         Raises:
-            InputError: a box without inside.
+            InputError: a box without inside, or codes of views that there are none of.
         """
         require_box(self.aabb)
+        if self.appearance and not bool(((self.trained >= 0) & (self.trained < len(self.codes))).all()):
+            raise InputError(f"The photographs that have codes in the field's state are none. {ANOTHER}")
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density per unit length, and the encoder's features."""
@@ -92,8 +116,9 @@ class HashField(Field):
         encoded = encoder(unit) if features is None else encoder.attach_gradients(unit, features)
         hidden = self._through(self.density_mlp, encoded)
         direction = self.direction_encoder(points.directions).to(hidden.dtype)
-        direction = direction.expand(*hidden.shape[:-1], direction.shape[-1])
-        raw_rgb = self._through(self.color_mlp, torch.cat([hidden, direction], dim=-1))
+        seen = [direction] if not self.appearance else [direction, self._code(points).to(hidden.dtype)]
+        seen = [each.expand(*hidden.shape[:-1], each.shape[-1]) for each in seen]
+        raw_rgb = self._through(self.color_mlp, torch.cat([hidden, *seen], dim=-1))
         density = self._density(hidden, points.positions)
         return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
 
@@ -103,6 +128,19 @@ class HashField(Field):
         self.direction_encoder.reset_parameters()
         for weight in (*self.density_mlp, *self.color_mlp):
             nn.init.kaiming_uniform_(weight, a=5**0.5)
+        if self.appearance:
+            nn.init.zeros_(self.codes)
+
+    def _code(self, points: Points) -> Tensor:
+        return self.codes[self.trained].mean(dim=0) if points.photograph is None else self.codes[points.photograph]
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        # As many photographs as the checkpoint's run had, which a field that is newly built does not know.
+        codes, trained = state_dict.get(f"{prefix}codes"), state_dict.get(f"{prefix}trained")
+        if codes is not None and trained is not None and codes.shape[1:] == (self.appearance,) and trained.ndim == 1:
+            self.codes.data = self.codes.new_zeros(len(codes), self.appearance)
+            self.trained = self.trained.new_zeros(len(trained))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _through(self, weights: nn.ParameterList, features: Tensor) -> Tensor:
         out = mlp(features.flatten(0, -2), list(weights), self.products)

@@ -1,0 +1,73 @@
+"""Renders whose colours are fitted to photographs: what remains is no matter of exposure or white balance."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.nerf.rendering.linear_light import scale_light
+
+FEWEST = 8
+"""Pixels from which twelve numbers are not fitted."""
+
+
+def color_corrected(
+    render: Float[Tensor, "height width 3"],
+    truth: Float[Tensor, "height width 3"],
+    kept: Bool[Tensor, "height width"] | None = None,
+) -> Float[Tensor, "height width 3"]:
+    """Return A c + b for each colour c of a render, with the A (3 x 3) and b of the least squared error.
+
+    The fit of multinerf and gsplat (`cc_psnr`), affine and in encoded colours.
+
+    Args:
+        render: the picture to judge.
+        truth: the photograph.
+        kept: pixels that count; None: all. Fewer than 8 leave the render as it is.
+    """
+    ours, true = (picture.double() if kept is None else picture.double()[kept] for picture in (render, truth))
+    ours, true = ours.reshape(-1, 3), true.reshape(-1, 3)
+    if len(ours) < FEWEST:
+        return render
+    # About the means, and by the pseudoinverse: of a picture of one colour nothing but its mean is fitted.
+    at, to = ours.mean(dim=0), true.mean(dim=0)
+    spread = ours - at
+    matrix = torch.linalg.pinv(spread.T @ spread, rtol=1e-9, hermitian=True) @ (spread.T @ (true - to))
+    return ((render.double() - at) @ matrix + to).to(render.dtype)
+
+
+def exposure_fitted(
+    render: Float[Tensor, "height width 3"],
+    truth: Float[Tensor, "height width 3"],
+    opacity: Float[Tensor, "height width"],
+    fitted: Bool[Tensor, "height width"],
+) -> Float[Tensor, "height width 3"]:
+    """Return a render under the exposure and white balance that bring some of its pixels closest to its photograph.
+
+    One gain of linear light per channel, as `correction=exposure` gives a photograph that trains; the background, which
+    no camera saw, keeps its colour.
+
+    Args:
+        render: the picture to judge.
+        truth: the photograph.
+        opacity: of each pixel of the render.
+        fitted: pixels that are compared; where there is none the render stays as it is.
+    """
+    if not bool(fitted.any()):
+        return render
+
+    def shown(stops: Tensor, ours: Tensor, opaque: Tensor) -> Tensor:
+        return ours + opaque[:, None] * (scale_light(ours, torch.exp2(stops)) - ours)
+
+    stops = torch.zeros(3, device=render.device, requires_grad=True)
+    ours, true, opaque = render[fitted], truth[fitted], opacity[fitted]
+    optimizer = torch.optim.LBFGS([stops], max_iter=50, tolerance_grad=1e-9, line_search_fn="strong_wolfe")
+
+    def error() -> float:
+        optimizer.zero_grad()
+        squared = (shown(stops, ours, opaque) - true).square().mean()
+        squared.backward()
+        return float(squared.detach())
+
+    with torch.enable_grad():
+        optimizer.step(error)
+    return shown(stops.detach(), render.reshape(-1, 3), opacity.reshape(-1)).view_as(render)

@@ -1,0 +1,41 @@
+"""The contract of a correction: what a photograph made of the light that reached its camera."""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.learnt_part import LearntPart
+from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.scene import Scene
+
+
+class Correction(LearntPart, ABC):
+    """Map the colours that a model renders to those that a photograph shows of them.
+
+    A step of training applies it after compositing and before the loss, so that the model need not explain what
+    differs from photograph to photograph. Nothing else does: validation, evaluation, films, exports and the viewer show
+    the model's own, neutral colours. As it begins, it changes no bit.
+    """
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of the photographs, once, before training.
+
+        Raises:
+            InputError: a single one trains, whose colours differ from none.
+        """
+        if len(scene.splits["train"]) < 2:
+            raise InputError(
+                f"The scene {scene.name} trains on one photograph, and a correction learns how the colours of several "
+                "differ: add correction=none, or give more photographs."
+            )
+
+    @abstractmethod
+    def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
+        """Return what photographs show of rendered colours.
+
+        Args:
+            rgb: sRGB-encoded, composited; in [0, 1] or somewhat beyond. So is what comes out, without a clamp.
+            pixels: where in which photograph each colour stands.
+        """

@@ -1,0 +1,63 @@
+"""Photographs that were exposed differently, under different white balance."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.rendering.linear_light import scale_light
+from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.scene import Scene
+
+
+class Exposure(Correction):
+    """Per photograph one exposure, and the gains of red and blue against it, all in stops of linear light.
+
+    The exposure is the mean of the three channels: green gains what red and blue lose. So a channel that a scene hardly
+    has, and of which little can be known, spoils neither of the others.
+
+    The light of all photographs can be scaled together, and the model's the other way: a penalty on the three means
+    over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
+
+    Args:
+        learning_rate: of the stops; Adam moves each by at most about so much in a step.
+        mean_weight: factor on the sum of the squared means, which is added to the loss.
+    """
+
+    trained: Tensor
+
+    def __init__(self, learning_rate: float = 1e-2, mean_weight: float = 1.0):
+        super().__init__()
+        require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "mean_weight": (0.0, 1e6)})
+        self.learning_rate, self.mean_weight = learning_rate, mean_weight
+        self.stops = nn.Parameter(torch.zeros(1, 3))
+        """Of each view: exposure, red, blue."""
+        self.register_buffer("trained", torch.zeros(1, dtype=torch.int64), persistent=False)
+
+    def fit_to(self, scene: Scene) -> None:
+        """Make room for each photograph.
+
+        Raises:
+            InputError: there is but one.
+        """
+        super().fit_to(scene)
+        self.stops = nn.Parameter(torch.zeros(len(scene.view_names), 3))
+        self.trained = torch.tensor(scene.splits["train"])
+
+    def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
+        """Return the colours with their light scaled by the gains of their photographs."""
+        return scale_light(rgb, self.gains()[pixels.view])
+
+    def gains(self) -> Float[Tensor, "views 3"]:
+        """Return the factors on the linear light of red, green and blue in each photograph."""
+        exposure, red, blue = self.stops.unbind(-1)
+        return torch.exp2(torch.stack([exposure + red, exposure - red - blue, exposure + blue], dim=-1))
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Return the sum of the squared means of exposure, red and blue over the photographs that train."""
+        return self.mean_weight * self.stops[self.trained].mean(dim=0).square().sum()
+
+    def reset_parameters(self) -> None:
+        """Begin with photographs that are all alike."""
+        nn.init.zeros_(self.stops)

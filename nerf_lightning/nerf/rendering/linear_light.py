@@ -1,0 +1,63 @@
+"""Light that is scaled, in colours that are encoded for a screen (sRGB, IEC 61966-2-1).
+
+Letters: encoded colour x, linear light v, gain g. v = x / 12.92 up to x = 0.04045, ((x + 0.055) / 1.055)^2.4 above.
+Both curves are used beyond [0, 1], too: the straight one below 0, the power above 1.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+KNEE, SLOPE, OFFSET, POWER = 0.04045, 12.92, 0.055, 2.4
+
+
+def to_linear(rgb: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
+    """Return the linear light of encoded colours, v(x).
+
+    >>> to_linear(torch.tensor([0.0, 0.5, 1.0]))
+    tensor([0.0000, 0.2140, 1.0000])
+    """
+    above = rgb > KNEE
+    power = ((torch.where(above, rgb, 1.0) + OFFSET) / (1.0 + OFFSET)) ** POWER
+    return torch.where(above, power, rgb / SLOPE)
+
+
+def to_encoded(light: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
+    """Return the encoded colours of linear light, x(v).
+
+    >>> to_encoded(torch.tensor([0.0, 0.5, 1.0]))
+    tensor([0.0000, 0.7354, 1.0000])
+    """
+    above = light > KNEE / SLOPE
+    power = (1.0 + OFFSET) * torch.where(above, light, 1.0) ** (1.0 / POWER) - OFFSET
+    return torch.where(above, power, light * SLOPE)
+
+
+def scale_light(rgb: Float[Tensor, "*colours"], gain: Float[Tensor, "*#colours"]) -> Float[Tensor, "*colours"]:
+    """Return the encoded colours of g times the light of encoded colours, x(g v(x)).
+
+    Where both colours lie on the power's part that is s (x + 0.055) - 0.055 with s = g^(1/2.4), and where both lie on
+    the straight one g x: so written, a gain of 1 changes no bit, neither of the colours nor of their gradients.
+
+    Args:
+        rgb: encoded; in [0, 1], or beyond.
+        gain: of the light, > 0.
+
+    >>> scale_light(torch.tensor([0.25, 0.5]), torch.tensor(2.0))
+    tensor([0.3521, 0.6858])
+    """
+    s = gain ** (1.0 / POWER)
+    bright = rgb > KNEE
+    scaled = torch.where(bright, rgb * s + OFFSET * (s - 1.0), rgb * gain)
+    stays = scaled > KNEE
+    darkened = _straight(torch.where(bright & ~stays, rgb, 1.0), gain)
+    brightened = _power(torch.where(~bright & stays, rgb, KNEE), gain)
+    return torch.where(bright == stays, scaled, torch.where(bright, darkened, brightened))
+
+
+def _straight(bright: Tensor, gain: Tensor) -> Tensor:
+    return SLOPE * gain * ((bright + OFFSET) / (1.0 + OFFSET)) ** POWER
+
+
+def _power(dark: Tensor, gain: Tensor) -> Tensor:
+    return (1.0 + OFFSET) * (gain * dark / SLOPE) ** (1.0 / POWER) - OFFSET

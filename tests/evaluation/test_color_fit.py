@@ -1,0 +1,109 @@
+"""Colours that are fitted to a photograph before they are compared."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from support.planted_exposures import with_stops
+from support.scenes import ball_scene, tiny_model
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation import evaluator
+from nerf_lightning.evaluation.color_fit import color_corrected, exposure_fitted
+from nerf_lightning.evaluation.evaluator import Scoring
+from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.nerf.models.render_image import Picture
+from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.linear_light import scale_light
+
+GAINS = torch.tensor([1.6, 0.7, 1.1])
+
+
+def picture():
+    return torch.rand(16, 20, 3, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.1
+
+
+def test_an_affine_change_of_colours_is_undone():
+    truth, matrix = picture(), torch.tensor([[0.9, 0.1, 0.0], [0.0, 0.8, 0.1], [0.05, 0.0, 1.1]])
+    render = (truth - 0.02) @ matrix.inverse()
+    torch.testing.assert_close(color_corrected(render, truth), truth, atol=1e-5, rtol=0)
+
+
+def test_it_is_the_fit_of_least_squares():
+    render, truth = picture(), picture().flip(0)
+    ones = torch.cat([render, torch.ones(16, 20, 1)], dim=-1).reshape(-1, 4)
+    solved = ones @ torch.linalg.lstsq(ones.double(), truth.reshape(-1, 3).double()).solution.float()
+    torch.testing.assert_close(color_corrected(render, truth).reshape(-1, 3), solved, atol=1e-5, rtol=0)
+
+
+def test_what_a_mask_leaves_out_is_not_fitted_and_flat_pictures_have_no_fit_to_lose():
+    truth, kept = picture(), torch.zeros(16, 20, dtype=torch.bool)
+    kept[4:12] = True
+    render = (truth * 0.5).where(kept[..., None], 0.9)
+    torch.testing.assert_close(color_corrected(render, truth, kept)[kept], truth[kept], atol=1e-5, rtol=0)
+    flat = torch.full((16, 20, 3), 0.25)
+    torch.testing.assert_close(color_corrected(flat, flat + 0.5), flat + 0.5)
+    assert torch.equal(color_corrected(render, truth, torch.zeros_like(kept)), render)
+
+
+def test_a_picture_has_both_numbers_and_fitting_never_harms():
+    truth = picture()
+    found = image_metrics(scale_light(truth, GAINS), truth)
+    assert found["psnr"] < 24 < found["cc_psnr"] - 10
+    same = image_metrics(truth, truth)
+    assert same["psnr"] == same["cc_psnr"] == 100.0
+
+
+def test_exposure_is_fitted_to_some_of_the_pixels_and_the_background_keeps_its_colour():
+    truth, opacity, left = picture(), torch.ones(16, 20), torch.zeros(16, 20, dtype=torch.bool)
+    opacity[:3], left[:, :10] = 0.0, True
+    render = scale_light(truth, 1.0 / GAINS)
+    render[:3] = truth[:3]
+    torch.testing.assert_close(exposure_fitted(render, truth, opacity, left), truth, atol=1e-4, rtol=0)
+    assert torch.equal(exposure_fitted(render, truth, opacity, torch.zeros_like(left)), render)
+
+
+@pytest.fixture
+def scored(monkeypatch, tmp_path):
+    """Score pictures of the ball, which are right but for exposure, and for a fault in the left halves."""
+    scene = ball_scene(num_views=6, size=24, background="none")
+    truth = with_stops(scene, torch.zeros(len(scene.splits["train"]), 3), dim=0.5)
+
+    def render(model, rays, view, background, tile_points):
+        rgb = photograph(scene, view, background)
+        return Picture(rgb, torch.ones(24, 24), torch.ones(24, 24))
+
+    monkeypatch.setattr(evaluator, "render_picture", render)
+
+    def score(colors) -> dict:
+        with torch.no_grad():
+            return Scoring(colors=colors).score(tiny_model(), truth, "none", 4096, Path(tmp_path))
+
+    return score
+
+
+def test_the_protocol_says_which_number_it_is(scored):
+    raw, half = scored("raw"), scored("half_fit")
+    assert raw["protocol"]["colors"] == "raw"
+    assert half["protocol"]["colors"].endswith("scored on the right")
+    assert raw["psnr"] < 25
+    assert half["psnr"] > 40
+    assert raw["cc_psnr"] > raw["psnr"] + 5
+    assert [word.partition(":")[0] for word in differences(raw["protocol"], half["protocol"])] == ["colors"]
+
+
+def test_older_numbers_are_raw_and_only_raw_ones_are_compared_with_them(scored):
+    raw, half = scored("raw")["protocol"], scored("half_fit")["protocol"]
+    older = {key: value for key, value in raw.items() if key not in ("colors", "cc_psnr")}
+    assert differences(older, raw) == differences(raw, older) == []
+    assert differences(older, half, same_scene=False) == [f"colors: raw and {half['colors']}"]
+
+
+def test_another_word_is_refused():
+    from support.configs import composed
+
+    from nerf_lightning.config.instantiate import build
+
+    with pytest.raises(InputError, match=r"evaluation\.colors=best"):
+        build(composed("train", "evaluation.colors=best").evaluation)
