@@ -12,8 +12,10 @@ from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 FORMAT = 4
 KEY = "nerf_lightning"
 PRECISIONS = ("32-true", "tf32", "bf16-mixed")
+PARTS = ("model", "rays")
+"""Of a training step: what their weights' names begin with."""
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
-"""Types of what a model holds. Numbers of other types would be cast without a word."""
+"""Types of what those hold. Numbers of other types would be cast without a word."""
 MOST_THREADS = 4096
 LOOPS = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
 """Lightning's; each is held against the trainer's own (`resume_state`)."""
@@ -95,7 +97,7 @@ def checkpoint(resumable: bool) -> Record:
     """
     name = Text(500)
     use: dict[str, Description] = {
-        "state_dict": Named(Text(500, r"model\..+"), Numbers(dtypes=WEIGHTS), 100_000),
+        "state_dict": Named(Text(500, rf"({'|'.join(PARTS)})\..+"), Numbers(dtypes=WEIGHTS), 100_000),
         "global_step": Whole(),
         KEY: record(resumable),
     }

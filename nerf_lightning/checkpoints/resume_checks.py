@@ -1,4 +1,4 @@
-"""What training goes on from, held against the run that takes it up: its model, optimizer, callbacks and loops."""
+"""What training goes on from, held against the run that takes it up: its weights, optimizer, callbacks and loops."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -21,13 +21,17 @@ CURE = (
 
 
 def require_resumable(
-    content: Mapping[str, Any], model: nn.Module, build_optimizer: Build, progress: Progress, optimizer: Any
+    content: Mapping[str, Any],
+    parts: Mapping[str, nn.Module],
+    build_optimizer: Build,
+    progress: Progress,
+    optimizer: Any,
 ) -> None:
     """Refuse a checkpoint that is sound in itself, and not of this run.
 
     Args:
         content: as `read_content` returned it.
-        model: the run's.
+        parts: of the run's step, by name: the model, and what learns beside it.
         build_optimizer: the run's.
         progress: the run's, as the loader has set it up.
         optimizer: newly made, of the run's parameters.
@@ -36,10 +40,8 @@ def require_resumable(
         InputError: with the place in the checkpoint.
     """
     try:
-        prefix = "model."
-        require_fitting_weights(
-            {key[len(prefix) :]: value for key, value in content["state_dict"].items()}, model.state_dict()
-        )
+        known = {f"{name}.{key}": value for name, part in parts.items() for key, value in part.state_dict().items()}
+        require_fitting_weights(content["state_dict"], known)
         require_fitting_optimizer(
             content["optimizer_states"][0], optimizer, build_optimizer, most_steps=content["global_step"]
         )
@@ -49,22 +51,22 @@ def require_resumable(
 
 
 def require_fitting_weights(weights: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> None:
-    """Refuse weights of another model.
+    """Refuse weights of another model, or of other parts beside it.
 
     Raises:
         Unfit: other names, shapes or types.
     """
     for name in [*(known.keys() - weights.keys()), *(weights.keys() - known.keys())][:1]:
-        raise Unfit(f"state_dict.model.{name}", "is missing" if name in known else "belongs to no part of this model")
+        raise Unfit(f"state_dict.{name}", "is missing" if name in known else "belongs to no part of this model")
     for name, tensor in weights.items():
         if tensor.shape != known[name].shape or tensor.dtype != known[name].dtype:
             raise Unfit(
-                f"state_dict.model.{name}",
-                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the model {known[name].dtype} in "
+                f"state_dict.{name}",
+                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the run {known[name].dtype} in "
                 f"{tuple(known[name].shape)}",
             )
         if tensor.dtype == torch.bool and not tensor.dim() and not torch.equal(tensor.cpu(), known[name].cpu()):
-            raise Unfit(f"state_dict.model.{name}", f"is {bool(tensor)}, which the run's scene and settings are not")
+            raise Unfit(f"state_dict.{name}", f"is {bool(tensor)}, which the run's scene and settings are not")
 
 
 def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:

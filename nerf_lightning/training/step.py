@@ -4,7 +4,7 @@ What a tile of rays needs stays in the cache, and the sum of the tiles' gradient
 """
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from nerf_lightning.data.ray_batches import batch_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import follow_run, tables_of
+from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -113,9 +114,15 @@ class TrainStep:
         """Draw the weights of this attempt, or take those that it starts from."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(fold(self.seed, self.progress.attempt, "weights"))
-            self.model.reset_parameters()
+            for part in self.parts.values():
+                part.reset_parameters()
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """All that learns, by the name under which a checkpoint keeps it; the model first."""
+        return {"model": self.model, "rays": self.rays}
 
     @property
     def device(self) -> torch.device:
@@ -124,8 +131,8 @@ class TrainStep:
 
     def to(self, device: torch.device) -> "TrainStep":
         """Move all that is computed with to a device."""
-        self.model.to(device)
-        self.rays.to(device)
+        for part in self.parts.values():
+            part.to(device)
         return self
 
     def restart(self, optimizer: Optimizer) -> None:
@@ -145,16 +152,19 @@ class TrainStep:
         self.guard.restore([skipped, 0], self.device)
 
     def new_optimizer(self) -> Optimizer:
-        """Return the optimizer of all that learns; the tables of encoders do not decay.
+        """Return the optimizer of all that learns; the tables of encoders and what has its own rate do not decay.
 
         Raises:
             InputError: a setting of the optimizer that it refuses.
         """
         tables = tables_of(self.model)
-        known = set(map(id, tables))
-        groups: list[dict[str, Any]] = [{"params": [p for p in self._parameters() if id(p) not in known]}]
-        if tables:
-            groups.append({"params": tables, "weight_decay": 0.0})
+        groups: list[dict[str, Any]] = [{"params": tables, "weight_decay": 0.0}] if tables else []
+        for part in self._beside_the_model():
+            own = list(part.parameters())
+            if own and part.learning_rate is not None:
+                groups.append({"params": own, "weight_decay": 0.0, "lr": part.learning_rate})
+        known = {id(parameter) for group in groups for parameter in group["params"]}
+        groups.insert(0, {"params": [p for p in self._parameters() if id(p) not in known]})
         try:
             return self.build_optimizer(groups)
         except (ValueError, TypeError) as error:  # torch looks at its settings here
@@ -188,7 +198,7 @@ class TrainStep:
         ranks.add_up([seen["losses"]])
         ranks.add_up_gradients(self._parameters())
         norms: dict[str, Tensor] = {}
-        if self.guard.allows(seen["losses"], self.model.named_parameters()):
+        if self.guard.allows(seen["losses"], self._named_parameters()):
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
         progress.advance(num_rays)
@@ -215,15 +225,20 @@ class TrainStep:
         counts = [count.clone() for count in self.model.counts()]
         while True:
             try:
-                return self._in_tiles(batch, backward, share)
+                seen = self._in_tiles(batch, backward, share)
+                break
             except RuntimeError as error:
                 if not is_out_of_memory(error):
                     raise
                 self._take_smaller_tiles(batch, error)
-            for part in (self.model, self.rays):
+            for part in self.parts.values():
                 part.zero_grad(set_to_none=False)
             for count, before in zip(self.model.counts(), counts, strict=True):
                 count.copy_(before)
+        for penalty in [part.penalty() for part in self._beside_the_model()]:
+            if penalty is not None:
+                backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
+        return seen
 
     def validate(self, batch: Batch, errors: RayErrors) -> None:
         """Collect the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
@@ -236,7 +251,7 @@ class TrainStep:
 
     def forget_measurements(self) -> None:
         """Undo what trial steps have left behind: gradients and counts, no weights."""
-        for part in (self.model, self.rays):
+        for part in self.parts.values():
             part.zero_grad(set_to_none=True)
         self.model.forget_measurements()
 
@@ -246,10 +261,17 @@ class TrainStep:
 
     def broken_weights(self) -> str | None:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
-        return first_not_finite(self.model)
+        return first_not_finite(self._named_parameters())
+
+    def _beside_the_model(self) -> list[LearntPart]:
+        return [part for part in self.parts.values() if part is not self.model]
 
     def _parameters(self) -> list[Parameter]:
-        return [*self.model.parameters(), *self.rays.parameters()]
+        return [parameter for _, parameter in self._named_parameters()]
+
+    def _named_parameters(self) -> Iterator[tuple[str, Parameter]]:
+        for name, part in self.parts.items():
+            yield from part.named_parameters(prefix="" if part is self.model else name)
 
     def _in_tiles(self, batch: Batch, backward: Backward, share: Share) -> dict[str, Tensor]:
         num_rays, device = batch.num_rays, batch.weight.device

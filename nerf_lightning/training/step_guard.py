@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 LARGE = 1 << 20
 
@@ -20,7 +20,7 @@ class StepGuard:
         self.place: Tensor | None = None
         self.watched: list[str] = []
 
-    def allows(self, losses: Tensor, parameters: Iterable[tuple[str, nn.Parameter]]) -> bool:
+    def allows(self, losses: Tensor, parameters: Iterable[tuple[str, Tensor]]) -> bool:
         """Tell whether the step may be taken."""
         # Large tables are left out: what reaches them has passed through the MLPs, whose gradients show it too.
         gradients = {name: parameter.grad for name, parameter in parameters if parameter.grad is not None}
@@ -64,9 +64,9 @@ class StepGuard:
         self.counts = torch.tensor(state, device=device)
 
 
-def first_not_finite(model: nn.Module) -> str | None:
+def first_not_finite(named: Iterable[tuple[str, Tensor]]) -> str | None:
     """Return the first module whose weights are not all finite numbers, or None."""
-    names, parameters = zip(*model.named_parameters(), strict=True)
+    names, parameters = zip(*named, strict=True)
     # One read from the device for all.
     finite = torch.stack([torch.isfinite(parameter).all() for parameter in parameters]).tolist()
     return next((name.rpartition(".")[0] for name, good in zip(names, finite, strict=True) if not good), None)

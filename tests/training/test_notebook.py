@@ -14,6 +14,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
+from support.learnt_cameras import LearntShifts
 from support.running import refused
 
 import nerf_lightning
@@ -250,6 +251,26 @@ def test_the_fast_path_goes_on_too(run, trainer):
     first.fit(begun.system, begun.data)
     trainer(max_steps=40).fit(rest.system, rest.data, ckpt_path=kept(first))
     assert_equal(rest, whole)
+
+
+def test_what_learns_beside_the_model_goes_on_too(run, trainer):
+    def with_learnt_cameras():
+        made = run("scheduler=constant")
+        cameras = made.scene.cameras, made.scene.near, made.scene.far
+        made.system.rays = made.system.step.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
+        return made
+
+    whole, begun, rest, other = with_learnt_cameras(), with_learnt_cameras(), with_learnt_cameras(), run()
+    trainer(max_steps=12).fit(whole.system, whole.data)
+    first = trainer(max_steps=5)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=12).fit(rest.system, rest.data, ckpt_path=kept(first))
+    assert float(whole.system.rays.shift.detach().abs().max()) > 0
+    assert_equal(rest, whole)
+    assert not [name for name in read_checkpoint(kept(first)).weights if "shift" in name]
+    goes_on = trainer(max_steps=12)
+    with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no part"):
+        goes_on.fit(other.system, other.data, ckpt_path=kept(first))
 
 
 def test_a_checkpoint_of_another_run_is_refused(run, trainer):

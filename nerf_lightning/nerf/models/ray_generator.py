@@ -3,16 +3,17 @@
 from dataclasses import replace
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 
 MOVED = ("c2w", "focal", "center", "lens", "width", "height", "ndc")
 
 
-class RayGenerator(nn.Module):
+class RayGenerator(LearntPart):
     """Make the rays through pixels of views, on the device that it was moved to.
 
     It is a module so that cameras may be learnt, corrected or perturbed: whoever does so derives from it and returns

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from support.learnt_cameras import LearntShifts
 from support.scenes import ball_scene, tiny_model
 from support.steps import make_step, rays_of
 
@@ -29,19 +30,6 @@ def test_rays_through_the_world_are_not_bent():
     straight = RayGenerator(forward, scene.near, scene.far)(pixels)
     assert torch.equal(bent.through_world(pixels).origins, straight.origins)
     assert not torch.allclose(bent(pixels).origins, straight.origins)
-
-
-class LearntShifts(RayGenerator):
-    """Cameras that may move: all that it takes is a parameter, and other cameras."""
-
-    def __init__(self, *given):
-        super().__init__(*given)
-        self.shift = torch.nn.Parameter(torch.zeros(len(self.near), 3))
-
-    @property
-    def cameras(self):
-        given = super().cameras
-        return replace(given, c2w=torch.cat([given.c2w[..., :3], given.c2w[..., 3:] + self.shift[..., None]], dim=-1))
 
 
 def test_cameras_can_learn_in_tiles_and_whole():

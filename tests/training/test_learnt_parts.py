@@ -1,0 +1,79 @@
+"""What learns in a step beside the model: its own rate, its penalty, its beginning."""
+
+import copy
+
+import pytest
+import torch
+from support.learnt_cameras import LearntShifts
+from support.scenes import ball_scene, tiny_model
+from support.steps import make_step
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.training.step import Share
+
+
+def a_step(tile_points=None, model=None, **settings):
+    scene, step = ball_scene(), make_step(tile_points, model)
+    step.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
+    return step
+
+
+def batch_of(step):
+    return RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
+
+
+def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales():
+    step = a_step(learning_rate=0.25)
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3, weight_decay=0.1)
+    step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1)
+    optimizer = step.new_optimizer()
+    for _ in range(3):
+        step(batch_of(step), optimizer)
+    model, own = optimizer.param_groups
+    assert own["params"] == [step.rays.shift]
+    assert not any(parameter is step.rays.shift for parameter in model["params"])
+    assert (own["lr"], own["weight_decay"]) == (0.25 / 4, 0.0)
+    assert (model["lr"], model["weight_decay"]) == (1e-3 / 4, 0.1)
+
+
+def test_without_a_rate_of_its_own_it_learns_as_the_model_does():
+    (group,) = a_step().new_optimizer().param_groups
+    assert any(parameter.shape == (6, 3) for parameter in group["params"])
+
+
+@pytest.mark.parametrize("tile_points", [None, 16, 200])
+def test_a_penalty_counts_once_however_the_step_is_cut(tile_points):
+    model, scene = tiny_model(density_bias=0.5), ball_scene()
+    model.requires_grad_(False)
+    light, heavy = (a_step(tile_points, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
+    for step in (light, heavy):
+        step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
+    torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
+
+
+def test_the_shares_of_several_processes_add_up_to_one_penalty():
+    model = tiny_model(density_bias=0.5)
+    light, heavy = (a_step(None, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
+    for step in (light, heavy):
+        batch = batch_of(step)
+        for part in (slice(0, 16), slice(16, 64)):
+            step.gradients(batch[part], share=Share(part.start, 64, batch.weight.sum()))
+    torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
+
+
+def test_a_new_attempt_begins_where_the_first_began():
+    step = a_step()
+    with torch.no_grad():
+        step.rays.shift.fill_(3.0)
+    step.restart(step.new_optimizer())
+    assert float(step.rays.shift.detach().abs().max()) == 0
+
+
+def test_gradients_and_weights_of_a_part_that_are_not_finite_are_seen():
+    step = a_step(weight=1.0)
+    with torch.no_grad():
+        step.rays.shift[:] = float("inf")
+    step(batch_of(step), step.new_optimizer())
+    assert step.guard.skipped == 1
+    assert step.broken_weights() == "rays"
