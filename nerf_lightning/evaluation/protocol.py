@@ -51,7 +51,7 @@ def measured_how(
         "background": "white" if background == "random" else background,
         "resolution": [list(size) for size in sizes],
         "pixels": "8-bit" if quantize else "float",
-        "cameras": "raw",
+        "cameras": "refined" if scene.refined else "raw",
         "masks": "none" if scene.pixels.mask is None else "left out",
         "psnr": "mean of the pictures' own",
         "ssim": "torchmetrics, Gaussian 11 x 11, sigma 1.5",
