@@ -191,6 +191,7 @@ class TrainStep:
         optimizer.zero_grad()
         if self.num_steps is not None:
             follow_run(self.model, progress.step / self.num_steps)
+            self.rays.follow(progress.step / self.num_steps)
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         num_rays = progress.batch_rays
         share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))

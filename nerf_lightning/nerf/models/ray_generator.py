@@ -64,6 +64,10 @@ class RayGenerator(LearntPart):
         """Return the rays through the centres of pixels, in the world or in normalised device coordinates."""
         return rays_through_pixels(self.cameras, pixels, self.near, self.far)
 
+    def follow(self, share: float) -> None:
+        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
+        self.refinement.follow(share)
+
     def penalty(self) -> Float[Tensor, ""] | None:
         """Return what keeps the cameras from moving far."""
         return self.refinement.penalty()

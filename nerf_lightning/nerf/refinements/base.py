@@ -16,6 +16,9 @@ class Refinement(LearntPart, ABC):
             InputError: a scene whose cameras cannot be learnt.
         """
 
+    def follow(self, share: float) -> None:
+        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
+
     @abstractmethod
     def forward(self, cameras: Cameras) -> Cameras:
         """Return the cameras as they have been learnt so far."""

@@ -37,6 +37,8 @@ class SmallMotions(Refinement):
         poses: learn w and t.
         focal: learn g.
         learning_rate: of all three, at the beginning; the run's schedule scales it.
+        hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
+            would only wander.
         weight: of the penalty, the sum of |w|^2, |t|^2 and g^2 over the number of photographs.
     """
 
@@ -45,14 +47,24 @@ class SmallMotions(Refinement):
     camera: Tensor
 
     def __init__(
-        self, poses: bool = True, focal: bool = False, learning_rate: float = 1e-3, weight: float = 1e-2
+        self,
+        poses: bool = True,
+        focal: bool = False,
+        learning_rate: float = 1e-3,
+        hold: float = 0.1,
+        weight: float = 1e-2,
     ) -> None:
         super().__init__()
-        require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "weight": (0.0, 1e6)})
+        require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "hold": (0.0, 1.0), "weight": (0.0, 1e6)})
         if not (poses or focal):
             raise ValueError("poses=false and focal=false leave nothing to learn: choose refinement=none")
         self.poses, self.focal = poses, focal
-        self.learning_rate, self.weight = learning_rate, weight
+        self.learning_rate, self.hold, self.weight = learning_rate, hold, weight
+        self.is_held = False
+
+    def follow(self, share: float) -> None:
+        """Let the cameras go when it is time."""
+        self.is_held = share < self.hold
 
     def fit_to(self, scene: Scene) -> None:
         """Take note of the cameras and of the scene's extent, once, before training.
@@ -94,6 +106,8 @@ class SmallMotions(Refinement):
     @own_precision
     def forward(self, cameras: Cameras) -> Cameras:
         """Return the cameras as they have been learnt so far."""
+        if self.is_held:
+            return cameras
         if self.poses:
             shift, axes = self.extent * self.shift, cameras.c2w[..., :3]
             back = torch.stack([-shift[:, 1], shift[:, 0], torch.zeros_like(shift[:, 0])], dim=1)

@@ -49,7 +49,7 @@ def test_without_a_refinement_nothing_learns_and_nothing_is_kept():
 
 def test_only_photographs_that_are_trained_on_move():
     scene = ball_scene()
-    step = a_step(scene, SmallMotions(learning_rate=1e-2, weight=1.0))
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=1.0))
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
     for _ in range(3):
@@ -59,10 +59,22 @@ def test_only_photographs_that_are_trained_on_move():
     assert float(moved[3:].max()) == 0.0
 
 
+def test_cameras_are_held_until_there_is_a_scene():
+    scene = ball_scene()
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    loader, optimizer, moved = RayBatches(scene, step.progress, 0, 64), step.new_optimizer(), []
+    for _ in range(3):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+        moved.append(float(step.rays.refinement.shift.detach().abs().max()))
+    assert moved[:2] == [0.0, 0.0]
+    assert moved[2] > 1e-3
+
+
 def test_wrong_cameras_before_a_known_scene_find_their_place():
     true, model = photographed_ball()
     scene = with_noise(true, degrees=1.0, share=0.01)
-    step = a_step(scene, SmallMotions(learning_rate=1e-2, weight=0.0), model)
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=0.0), model)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     step.schedule, step.num_steps = ExponentialDecay(decay_rate=0.01), 80
     loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
@@ -88,7 +100,7 @@ def test_photographs_of_one_camera_share_its_focal_length():
 def test_a_wrong_focal_length_is_found_before_a_known_scene():
     true, model = photographed_ball()
     scene = replace(true, cameras=replace(true.cameras, focal=1.03 * true.cameras.focal))
-    step = a_step(scene, SmallMotions(poses=False, focal=True, learning_rate=3e-3, weight=0.0), model)
+    step = a_step(scene, SmallMotions(poses=False, focal=True, learning_rate=3e-3, hold=0.0, weight=0.0), model)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
     for _ in range(30):
