@@ -14,7 +14,6 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
 from nerf_lightning.nerf.products import own_precision
-from nerf_lightning.nerf.rows import rows
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 
@@ -66,12 +65,12 @@ def rays_through_pixels(
     """
     view = pixels.view
     at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
-    plane = (at - cameras.center[view]) / rows(cameras.focal, view)
+    plane = (at - cameras.center[view]) / cameras.focal[view]
     if cameras.lens_model == "pinhole":
         local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
     else:
         local = _turned(unproject(plane, cameras.lens[view], cameras.lens_model))
-    c2w = rows(cameras.c2w, view)
+    c2w = cameras.c2w[view]
     directions = (c2w[..., :3] @ local[..., None])[..., 0]
     directions = directions / directions.norm(dim=-1, keepdim=True)
     rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions)

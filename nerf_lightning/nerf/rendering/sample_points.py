@@ -1,7 +1,6 @@
 """From rays and their samples to the points that a field is asked about, in both layouts."""
 
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
-from nerf_lightning.nerf.rows import rows
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 
@@ -21,10 +20,10 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None)
 def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | None) -> Points:
     """Return the midpoints of packed samples: one axis."""
     ray = samples.ray_index
-    along = samples.midpoints[:, None] * rows(rays.directions, ray)
+    along = samples.midpoints[:, None] * rays.directions[ray]
     return Points(
-        positions=rows(rays.origins, ray) + along,
-        directions=rows(rays.view_directions, ray),
+        positions=rays.origins[ray] + along,
+        directions=rays.view_directions[ray],
         photograph=None if rays.photograph is None else rays.photograph[ray],
         random=None if random is None else PointRandom(random.key[ray], random.slots[ray], samples.place),
     )
