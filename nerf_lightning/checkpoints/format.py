@@ -86,7 +86,8 @@ def record(resumable: bool) -> Record:
         "num_threads": Whole(1, MOST_THREADS),
         "world_size": Whole(1, 1 << 16),
     }
-    return Record(use | run) if resumable else Record(use, run)
+    learnt: dict[str, Description] = {"refined": cameras()}
+    return Record(use | run, learnt) if resumable else Record(use, run | learnt)
 
 
 def checkpoint(resumable: bool) -> Record:

@@ -26,8 +26,7 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
         InputError: a picture that is larger than a person has agreed to, or a name that cannot be shown.
     """
     cameras, views = scene["cameras"], len(scene["view_names"])
-    if not bool(is_rigid(cameras["c2w"]).all()):
-        raise Unfit("scene.cameras.c2w", "holds a pose that is not a rotation and a centre")
+    _require_poses(cameras, "scene.cameras")
     require_within("view_pixels", int((cameras["width"] * cameras["height"]).max()), where, "pixels in one picture")
     if not bool((scene["near"] < scene["far"]).all()):
         raise Unfit("scene.near", "is not everywhere less than far")
@@ -43,6 +42,25 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
         raise Unfit("scene.view_names", "names two views alike")
     for name in (scene["name"], *scene["view_names"]):
         require_printable(name, f"{where}: scene.view_names")
+
+
+def require_possible_refinement(refined: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Refuse cameras that no training can have learnt from those of the scene.
+
+    Raises:
+        Unfit: poses that are none, or what no refinement changes.
+    """
+    _require_poses(refined, "refined")
+    for name in ("width", "height"):
+        if not torch.equal(refined[name], given[name]):
+            raise Unfit(f"refined.{name}", "is not that of the scene's cameras")
+    if refined["lens_model"] != given["lens_model"] or refined["ndc"] is not None or given["ndc"] is not None:
+        raise Unfit("refined", "has another kind of lens or space than the scene's cameras")
+
+
+def _require_poses(cameras: Mapping[str, Any], place: str) -> None:
+    if not bool(is_rigid(cameras["c2w"]).all()):
+        raise Unfit(f"{place}.c2w", "holds a pose that is not a rotation and a centre")
 
 
 def _require_similarity(to_user: Tensor) -> None:

@@ -2,7 +2,8 @@
 
 A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
 Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
-config group), scene (cameras, bounds, splits, frame), and the run's state that the system adds.
+config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learnt, where they were), and
+the run's state that the system adds.
 """
 
 import contextlib
@@ -19,7 +20,7 @@ from torch import Tensor
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
 from nerf_lightning.checkpoints.format import scene as scene_format
-from nerf_lightning.checkpoints.possible_scenes import require_possible_scene
+from nerf_lightning.checkpoints.possible_scenes import require_possible_refinement, require_possible_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.schema import Unfit, shown
@@ -41,6 +42,9 @@ class Checkpoint:
     """The run's resolved config, yaml text from a stranger."""
     choices: dict[str, str]
     scene: SceneRecord
+    """Its cameras are those that training has refined, where it did."""
+    given_cameras: Cameras | None
+    """As they were before training refined them; None where it did not."""
     weights: dict[str, Tensor]
     """The model's state dict."""
     step: int
@@ -87,11 +91,14 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     content = read_content(path, resumable=False)
     record, prefix = content[KEY], "model."
     scene = record["scene"]
+    given = Cameras(**scene["cameras"])
+    refined = Cameras(**record["refined"]) if "refined" in record else None
     return Checkpoint(
         path=path,
         config=record["config"],
         choices=record["choices"],
-        scene=SceneRecord(**scene | {"cameras": Cameras(**scene["cameras"])}),
+        scene=SceneRecord(**scene | {"cameras": refined or given}),
+        given_cameras=None if refined is None else given,
         weights={k[len(prefix) :]: value for k, value in content["state_dict"].items() if k.startswith(prefix)},
         step=content["global_step"],
         precision=record["precision"],
@@ -137,6 +144,8 @@ def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
     try:
         require_checkpoint(content, resumable)
         require_possible_scene(record["scene"], str(path))
+        if "refined" in record:
+            require_possible_refinement(record["refined"], record["scene"]["cameras"])
     except Unfit as problem:
         raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
 

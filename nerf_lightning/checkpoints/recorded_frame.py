@@ -1,12 +1,42 @@
-"""A scene as the model of a checkpoint knows it: in the frame that the model was trained in."""
+"""A scene as the model of a checkpoint knows it: in the frame of its training, with the cameras that it refined."""
 
 from dataclasses import replace
 
 import torch
 
+from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
+
+SAME_POSE = 1e-3
+"""Of two readings of one capture, in scene units and in the entries of a rotation."""
+
+
+def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
+    """Return the scene in the frame that a model was trained in, and with its refined cameras where it has some.
+
+    Views that it was not trained on go where the trained ones have gone as a whole.
+
+    Raises:
+        InputError: the model was trained in another kind of space.
+    """
+    scene, given, refined = in_recorded_frame(scene, checkpoint.scene), checkpoint.given_cameras, checkpoint.scene
+    if given is None:
+        return scene
+    trained = list(refined.splits["train"])
+    by = similarity_between(given.c2w[trained], refined.cameras.c2w[trained])
+    c2w, focal = carried(scene.cameras.c2w, by), scene.cameras.focal.clone()
+    known = {name: number for number, name in enumerate(refined.view_names)}
+    for view, name in enumerate(scene.view_names):
+        number = known.get(name)
+        # Another capture may have photographs of the same names.
+        if number is None or float((scene.cameras.c2w[view] - given.c2w[number]).abs().max()) > SAME_POSE:
+            continue
+        c2w[view] = refined.cameras.c2w[number]
+        focal[view] *= refined.cameras.focal[number] / given.focal[number]
+    return replace(scene, cameras=replace(scene.cameras, c2w=c2w, focal=focal), refined=True)
 
 
 def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:

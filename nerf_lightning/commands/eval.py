@@ -3,7 +3,7 @@
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
+from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.evaluation.protocol import measured_of
@@ -27,7 +27,7 @@ def evaluate(config: DictConfig) -> float:
     opened = open_checkpoint(config)
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
     folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
-    scene = in_recorded_frame(build(config.scene).read(), checkpoint.scene)
+    scene = as_trained(build(config.scene).read(), checkpoint)
     origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
     scoring = build(config.evaluation)
     with torch.no_grad():

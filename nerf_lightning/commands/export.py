@@ -27,4 +27,6 @@ def export(config: DictConfig) -> None:
     folder = output_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "export"))
     with torch.no_grad():
         written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
+    if opened.checkpoint.given_cameras is not None:
+        say("the cameras are those that training refined (refinement=...), not those that were read")
     say(*map(str, written))

@@ -103,7 +103,12 @@ SWEEP_WORD = replace(OF_THE_USER, in_sweep=Trust.WORDS)
 OF_OTHER_COMMANDS = Meaning()
 
 ROWS: tuple[tuple[Meaning, str], ...] = (
-    (PART, "model.** encoder.** direction_encoder.** field.** loss.** correction.** optimizer.** scheduler.**"),
+    (
+        PART,
+        """
+        model.** encoder.** direction_encoder.** field.** loss.** correction.** refinement.** optimizer.** scheduler.**
+        """,
+    ),
     (
         LEARNT,
         """
@@ -181,7 +186,7 @@ THE_REST = {
 
 CHOSEN_GROUPS = (
     *("callbacks", "correction", "data", "encoder", "evaluation", "experiment", "field", "logger", "loss", "model"),
-    *("optimizer", "path", "sampler", "scene", "scheduler", "trainer"),
+    *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
 """Groups of conf/ of which a file may choose an option by its name."""
 SWEEP_GROUPS = ("hydra/launcher", "hydra/sweeper", "hydra/sweeper/sampler")

@@ -12,6 +12,7 @@ from torch import Tensor
 from nerf_lightning import ranks
 from nerf_lightning.console import stderr_console
 from nerf_lightning.errors import InputError
+from nerf_lightning.evaluation.camera_fit import fitted_camera
 from nerf_lightning.evaluation.color_fit import exposure_fitted
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
@@ -87,6 +88,9 @@ class Scoring:
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
         for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
+            if scene.refined and view not in scene.splits["train"]:
+                cameras = fitted_camera(model, scene, view, background, tile_points)
+                rays_of = RayGenerator(cameras, scene.near, scene.far)
             started = time.perf_counter()
             picture = render_picture(model, rays_of, view, background, tile_points)
             seconds = time.perf_counter() - started

@@ -65,7 +65,7 @@ def measured_how(
         "background": "white" if background == "random" else background,
         "resolution": [list(size) for size in sizes],
         "pixels": "8-bit" if quantize else "float",
-        "cameras": "raw",
+        "cameras": "refined" if scene.refined else "raw",
         "colors": COLORS[colors],
         "masks": "none" if scene.pixels.mask is None else "left out",
         "psnr": "mean of the pictures' own",

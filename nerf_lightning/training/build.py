@@ -1,7 +1,7 @@
 """What a run is made of, from its config: scene, data, system; and for `nerf train` callbacks, and what follows."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import yaml
@@ -21,6 +21,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.auto_settings import settled
@@ -169,14 +170,18 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
 def build_step(
     config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, start: Checkpoint | None = None
 ) -> TrainStep:
-    """Build model, loss, correction, optimizer and schedule into the step of training.
+    """Build model, cameras, loss, correction, optimizer and schedule into the step of training.
 
     Raises:
-        InputError: a value of the wrong kind, a model that cannot be cut into tiles, a correction for one photograph.
+        InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
+            correction for one photograph.
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
     model: Model = build(config.model)
+    refinement: Refinement = build(config.refinement)
+    refinement.fit_to(scene)
+    scene = replace(scene, refined=refinement.moves())
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":
         xla.require_static_shapes(model)
@@ -189,7 +194,7 @@ def build_step(
         load_weights(model, start)
     return TrainStep(
         model=model,
-        rays=RayGenerator(scene.cameras, scene.near, scene.far),
+        rays=RayGenerator(scene.cameras, scene.near, scene.far, refinement),
         loss=build(config.loss),
         correction=correction,
         optimizer=optimizer,

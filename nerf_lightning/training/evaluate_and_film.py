@@ -1,6 +1,6 @@
 """The end of a training run: test metrics, the video, the film of how a view improved, and a summary for the person."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.refinements.carry import motions, moved_far
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -26,6 +27,7 @@ from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, lay_path
 
 PROGRESS_FPS = 4
+MOST_NAMED = 10
 
 
 @dataclass
@@ -64,6 +66,7 @@ class Finish:
         settings.prepare(model).eval()
         lines, psnr = [], trainer.callback_metrics.get("val/psnr")
         tile_points = settings.inference_tile_points
+        scene, moved = _with_learnt_cameras(scene, trainer)
         with torch.no_grad():
             if self.scoring is not None:
                 origin = _origin(trainer, model, settings)
@@ -77,11 +80,32 @@ class Finish:
                 video, depth = film([subject], self.path, tile_points, folder, shown)
                 lines += [f"video        {video}", f"depth        {depth}"]
                 lines += _film_progress(folder) if ranks.is_first() else []
+        lines += moved
         lines.append(f"checkpoint   {folder / 'checkpoints' / 'last.ckpt'}")
         if (folder / "tensorboard").is_dir():
             lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
         say(*lines)
         return None if psnr is None else float(psnr)
+
+
+def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:
+    """Return the scene with the cameras that the run has learnt, and what a person reads about them."""
+    system: Any = trainer.lightning_module
+    trained = scene.splits["train"]
+    learnt = system.rays.refined(trained)
+    if learnt is None:
+        return scene, []
+    extent = float((scene.aabb[1] - scene.aabb[0]).norm()) / 2.0
+    motion = motions(scene.cameras, learnt, trained, extent)
+    lines = [
+        f"cameras      refined: half of them moved by more than {float(motion.median()):.2%} of the scene's extent"
+    ]
+    far = moved_far(motion)
+    if far:
+        names = [f"{scene.view_names[trained[place]]} ({float(motion[place]):.1%})" for place in far[:MOST_NAMED]]
+        more = f" and {len(far) - MOST_NAMED} more" if len(far) > MOST_NAMED else ""
+        lines.append(f"             far more than that, so look at their poses: {', '.join(names)}{more}")
+    return replace(scene, cameras=learnt, refined=True), lines
 
 
 def _origin(trainer: Trainer, model: Model, settings: TrainerSettings) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.corrections.none import NoCorrection
-from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.encoders.base import follow_run, tables_of
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
@@ -193,6 +193,9 @@ class TrainStep:
         """
         progress = self.progress
         optimizer.zero_grad()
+        if self.num_steps is not None:
+            follow_run(self.model, progress.step / self.num_steps)
+            self.rays.follow(progress.step / self.num_steps)
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         num_rays = progress.batch_rays
         share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))

@@ -109,6 +109,9 @@ class RadianceFieldSystem(LightningModule):
             "num_threads": torch.get_num_threads(),
             "world_size": ranks.world_size(),
         }
+        refined = self.rays.refined(self.record["scene"]["splits"]["train"])
+        if refined is not None:
+            checkpoint[KEY]["refined"] = dict(vars(refined))
         record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

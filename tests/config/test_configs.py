@@ -17,6 +17,7 @@ BUILT = {
     "field": "field",
     "model": "model",
     "loss": "loss",
+    "refinement": "refinement",
     "scheduler": "scheduler",
     "callbacks": "callbacks",
     "viewer": "viewer",

@@ -1,12 +1,16 @@
 """Models whose surface is known: solids of constant density, given by their signed distance."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
+from support.scenes import ball_scene
 
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
@@ -50,3 +54,14 @@ def solid(distance: Distance, samples: int = 192, **settings) -> RadianceModel:
 def ball(radius: float = 0.8, center=(0.0, 0.0, 0.0)) -> Distance:
     """The signed distance of a ball."""
     return lambda positions: (positions - torch.tensor(center)).norm(dim=-1) - radius
+
+
+def photographed_ball(size: int = 24):
+    """A soft ball and what eight cameras see of it, all of which train: gradients of its pictures are exact."""
+    model = solid(lambda positions: 0.1 * ball()(positions), 64, color=lambda positions: 0.5 + 0.4 * positions.sin())
+    scene = ball_scene(num_views=8, size=size, background="black")
+    rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+    pictures = torch.stack([render_picture(model, rays_of, view, "black", 1 << 20).rgb for view in range(8)])
+    rgba = torch.cat([pictures, torch.ones(8, size, size, 1)], dim=-1).clamp(0, 1)
+    pixels = replace(scene.pixels, rgba=(255 * rgba).round().to(torch.uint8).view(-1, 4), has_transparency=False)
+    return replace(scene, pixels=pixels, splits={"train": tuple(range(8))}), model

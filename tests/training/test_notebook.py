@@ -38,6 +38,7 @@ pytestmark = [
 ]
 RAYS_OF_AN_EPOCH = 8 * 24  # eight of the ten pictures of 6 x 4 pixels train
 STEPS_OF_AN_EPOCH = 6  # of 32 rays each
+LAST_LEVELS = "model.levels.fine.field.position_encoder.level_weights"
 
 
 @pytest.fixture
@@ -240,6 +241,24 @@ def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
     trainer(max_epochs=2, callbacks=[saves()]).fit(rest.system, rest.data, ckpt_path=found)
     assert rest.system.step.progress.step == 12
     assert_equal(rest, whole)
+
+
+def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
+    from support.running import FAST_PATH
+
+    learning = (*FAST_PATH, "refinement=se3_focal", "encoder.blend_in=0.8")
+    whole, rest = run(*learning), run(*learning)
+    saves = ModelCheckpoint(every_n_train_steps=5, save_top_k=-1)
+    trainer(max_steps=12, callbacks=[saves]).fit(whole.system, whole.data)
+    found = next(Path(saves.dirpath).glob("*step=5.ckpt"))
+    assert 0.0 < float(torch.load(found, weights_only=True)["state_dict"][LAST_LEVELS][-2]) < 1.0
+    saves = ModelCheckpoint(every_n_train_steps=5, save_top_k=-1)
+    trainer(max_steps=12, callbacks=[saves]).fit(rest.system, rest.data, ckpt_path=found)
+    assert float(rest.system.rays.refinement.rotation.detach().abs().max()) > 0
+    assert_equal(rest, whole)
+    refined = read_checkpoint(found).scene.cameras
+    assert not torch.equal(refined.c2w, rest.scene.cameras.c2w)
+    assert not torch.equal(refined.focal, rest.scene.cameras.focal)
 
 
 def test_the_fast_path_goes_on_too(run, trainer):

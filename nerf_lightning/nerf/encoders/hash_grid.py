@@ -1,11 +1,14 @@
 """Learnt features on a multiresolution hash grid (Sec. 3, arXiv 2201.05989)."""
 
+import math
+
 import psutil
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
@@ -25,18 +28,24 @@ class HashGridEncoder(Encoder):
     Points lie in the unit cube; a field that maps its positions there is needed (`field=hash`). A level whose
     vertices fit into its table is dense; a finer one shares entries by a hash, and training sorts out the collisions.
 
+    Finer levels may be blended in one after the other, from coarse to fine, over a first share of the run (Sec. 3.3,
+    arXiv 2104.06405; for hash grids Heo et al., ICML 2023): until then the scene is smooth, in which cameras find their
+    place, and geometry its rough shape. Levels that are not on yet are not computed.
+
     Args:
         num_levels: grids.
         features_per_level: features of a vertex.
         log2_table_size: most entries of a level, as a power of two.
         min_resolution: cells along a side of the coarsest grid.
         max_resolution: of the finest; about the scene's size over its smallest detail.
+        blend_in: share of the run after which all levels are on; 0: they are from the start.
 
     Raises:
         InputError: training the tables would not fit into the machine's memory.
     """
 
     needs_unit_cube = True
+    level_weights: Tensor
 
     def __init__(
         self,
@@ -45,15 +54,20 @@ class HashGridEncoder(Encoder):
         log2_table_size: int = 18,
         min_resolution: int = 16,
         max_resolution: int = 512,
+        blend_in: float = 0.0,
     ):
         super().__init__()
         if not 1 <= min_resolution <= max_resolution or num_levels < 1 or features_per_level < 1:
             raise ValueError("1 <= min_resolution <= max_resolution, and at least one level and feature are needed")
         if num_levels > MOST_LEVELS:
             raise ValueError(f"num_levels={num_levels}: give {MOST_LEVELS} at most")
-        require_ranges(locals(), {"log2_table_size": (1, 30), "max_resolution": (1, FINEST)})
+        require_ranges(locals(), {"log2_table_size": (1, 30), "max_resolution": (1, FINEST), "blend_in": (0.0, 1.0)})
         self.layout = hash_grid_layout(num_levels, log2_table_size, min_resolution, max_resolution)
-        self.features_per_level = features_per_level
+        self.features_per_level, self.blend_in = features_per_level, blend_in
+        self._weights = [1.0] * num_levels  # as in the buffer, which is not read at each step
+        if blend_in:
+            # In the checkpoint, so that its pictures are made as the last step was.
+            self.register_buffer("level_weights", torch.ones(num_levels))
         _require_memory(self.layout.offsets[-1] * features_per_level)
         self.table = nn.Parameter(torch.empty(self.layout.offsets[-1], features_per_level))
         self.reset_parameters()
@@ -75,14 +89,60 @@ class HashGridEncoder(Encoder):
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]
     ) -> Float[Tensor, "*points features"]:
         """Return the features of points, with gradients, where they have been computed without them before."""
-        return self._interpolate(points, features.reshape(-1, self.out_dim))
+        # While levels are blended in they are computed again: what is known has been weighted.
+        return self._interpolate(points, None if self._blends else features.reshape(-1, self.out_dim))
+
+    def follow(self, share: float) -> None:
+        """Blend the levels in that are due: level l (from 0) rises over the l-th part of `blend_in`."""
+        if self.blend_in:
+            self._set_weights(blending_weights(len(self.layout.resolutions), share / self.blend_in))
+
+    def require_sound_state(self) -> None:
+        """Look at what was loaded.
+
+        Raises:
+            InputError: weights of levels that are none.
+        """
+        if self.blend_in:
+            weights = self.level_weights.tolist()
+            if not all(0.0 <= weight <= 1.0 for weight in weights):
+                raise InputError(f"The weights of the levels in the encoder's state are no weights. {ANOTHER}")
+            self._set_weights(weights)
+
+    def _set_weights(self, weights: list[float]) -> None:
+        if weights != self._weights:
+            self._weights = weights
+            self.level_weights.copy_(torch.tensor(weights))
+
+    @property
+    def _blends(self) -> bool:
+        return self._weights[-1] < 1.0
 
     def _interpolate(self, points: Tensor, known: Tensor | None) -> Tensor:
-        return interpolate(self.table, points.reshape(-1, 3), self.layout, known).view(*points.shape[:-1], self.out_dim)
+        if not self._blends:
+            features = interpolate(self.table, points.reshape(-1, 3), self.layout, known)
+        else:
+            levels = sum(weight > 0.0 for weight in self._weights)
+            features = interpolate(self.table, points.reshape(-1, 3), self.layout.coarsest(levels))
+            features = features * self.level_weights[:levels].repeat_interleave(self.features_per_level)
+            features = functional.pad(features, (0, self.out_dim - features.shape[-1]))
+        return features.view(*points.shape[:-1], self.out_dim)
 
     def reset_parameters(self) -> None:
         """Draw the tables anew: uniform within 1e-4, as the paper has it."""
         nn.init.uniform_(self.table, -INITIAL_RANGE, INITIAL_RANGE)
+
+
+def blending_weights(num_levels: int, share: float) -> list[float]:
+    """Return the weight of each level, coarsest first, `share` of the way from the coarsest alone to all of them.
+
+    w_l = (1 - cos(pi a)) / 2 with a = share (L - 1) - (l - 1), held within 0 and 1 (Eq. 14, arXiv 2104.06405).
+
+    >>> blending_weights(3, 0.0), blending_weights(3, 0.75), blending_weights(3, 1.0)
+    ([1.0, 0.0, 0.0], [1.0, 1.0, 0.5], [1.0, 1.0, 1.0])
+    """
+    risen = [min(1.0, max(0.0, share * (num_levels - 1) - (level - 1))) for level in range(1, num_levels)]
+    return [1.0, *(0.5 - 0.5 * math.cos(math.pi * part) for part in risen)]
 
 
 def _require_memory(num_parameters: int) -> None:

@@ -32,6 +32,35 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*views 4"]) -> Float[Ten
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
+SMALL_ANGLE = 0.1
+"""Below it (radians) the coefficients of the exponential map are their series, to 1e-14."""
+
+
+@own_precision
+def rotation_from_vector(vector: Float[Tensor, "*views 3"]) -> Float[Tensor, "*views 3 3"]:
+    """Return the rotation about an axis by its length in radians: the exponential map of SO(3).
+
+    exp(K) = I + (sin a / a) K + ((1 - cos a) / a^2) K^2 (Rodrigues), where a is the length and K x = vector cross x.
+    Near zero both coefficients are their Taylor series in a^2, so that gradients are finite at zero, too.
+
+    >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round().tolist()  # a quarter turn around z
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    square = vector.square().sum(dim=-1)
+    is_small = square < SMALL_ANGLE**2
+    # The branch that is not taken is given a safe angle: its gradient would be NaN, and NaN times 0 is NaN.
+    angle = torch.where(is_small, 1.0, square).sqrt()
+    series = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
+    half_series = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
+    first = torch.where(is_small, series, angle.sin() / angle)
+    second = torch.where(is_small, half_series, 2.0 * ((0.5 * angle).sin() / angle).square())
+    x, y, z = vector.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return identity + first[..., None, None] * skew + second[..., None, None] * (skew @ skew)
+
+
 def quaternion_from_rotation(rotation: Float[Tensor, "*views 3 3"]) -> Float[Tensor, "*views 4"]:
     """Return the unit quaternion w, x, y, z (w not negative) of a rotation; the inverse of `rotation_from_quaternion`.
 

@@ -152,6 +152,7 @@ class OccupancySampler(PackedSampler):
     def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
         """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
         capacity, grid = self.capacity_on(rays.near.device), self.grid.occupied()
+        rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
         return march(rays, self.start(rays, random), self.lattice, grid, capacity=capacity)[0]
 
     def walk(self, rays: RayBundle) -> Walk:

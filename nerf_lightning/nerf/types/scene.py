@@ -119,3 +119,5 @@ class Scene(SceneRecord):
     """Sparse points of a reconstruction, in scene units; there may be none."""
     left_out: tuple[str, ...] = ()
     """Photographs of the capture that have no pose, and so are no views."""
+    refined: bool = False
+    """Whether its cameras learn with the model, or have learnt: they stand near where the photographs were taken."""

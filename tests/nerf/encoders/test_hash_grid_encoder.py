@@ -35,3 +35,44 @@ def test_an_mlp_that_knows_no_box_refuses_it():
 
     with pytest.raises(ValueError, match="field=hash"):
         NerfMLP(HashGridEncoder(num_levels=1, log2_table_size=6), FrequencyEncoder(2))
+
+
+def test_levels_are_blended_in_from_coarse_to_fine():
+    encoder = HashGridEncoder(num_levels=3, features_per_level=2, log2_table_size=9, max_resolution=40, blend_in=0.5)
+    torch.nn.init.normal_(encoder.table)
+    points = torch.rand(50, 3)
+    whole = encoder(points)
+    for share, weights in {0.0: (1, 0, 0), 0.25: (1, 1, 0), 0.375: (1, 1, 0.5), 0.5: (1, 1, 1), 1.0: (1, 1, 1)}.items():
+        encoder.follow(share)
+        torch.testing.assert_close(encoder(points), whole * torch.tensor(weights).repeat_interleave(2))
+        assert encoder.level_weights.tolist() == list(weights)
+
+
+def test_while_levels_are_blended_in_known_features_have_the_gradients_of_computed_ones():
+    encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40, blend_in=0.5)
+    encoder.follow(0.2)
+    points, grad = torch.rand(50, 3), torch.randn(50, 12)
+    with torch.no_grad():
+        known = encoder(points)
+    results = []
+    for features in (encoder(points), encoder.attach_gradients(points, known)):
+        encoder.table.grad = None
+        features.backward(grad)
+        results.append((features.detach(), encoder.table.grad.clone()))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
+    assert float(results[0][1][encoder.layout.offsets[2] :].abs().max()) == 0.0
+
+
+def test_a_grid_whose_levels_are_all_on_holds_nothing_else():
+    plain, blended = (HashGridEncoder(num_levels=2, log2_table_size=8, blend_in=share) for share in (0.0, 0.3))
+    assert list(plain.state_dict()) == ["table"]
+    plain.follow(0.1)
+    blended.load_state_dict(plain.state_dict() | {"level_weights": torch.ones(2)})
+    points = torch.rand(9, 3)
+    assert torch.equal(plain(points), blended(points))
+
+
+def test_a_share_that_is_none_is_refused():
+    with pytest.raises(ValueError, match=r"blend_in=1\.5: give 0\.0 to 1\.0"):
+        HashGridEncoder(num_levels=1, log2_table_size=6, blend_in=1.5)

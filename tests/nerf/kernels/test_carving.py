@@ -121,3 +121,11 @@ def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
     fast = possible_cells(scene, *cells(scene))
     with without("carving.cpu"):
         assert torch.equal(possible_cells(scene, *cells(scene)), fast)
+
+
+def test_where_cameras_are_learnt_nothing_is_carved():
+    scene = ball_scene(size=24)
+    centers, half_diagonal = cells(scene)
+    kept = possible_cells(replace(scene, refined=True), centers, half_diagonal)
+    assert bool(kept.all())
+    assert not bool(possible_cells(scene, centers, half_diagonal).all())

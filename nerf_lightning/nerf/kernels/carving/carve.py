@@ -19,7 +19,7 @@ def possible_cells(
 
     A cell is left out where no view sees it, and where some view sees it whole and shows only pixels of alpha 0 there:
     a ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha
-    nothing is carved.
+    nothing is carved, nor where cameras are learnt: from a wrong place they would carve into the content, for good.
 
     Args:
         scene: cameras and pixels.
@@ -34,7 +34,7 @@ def possible_cells(
         if bool(cells.all()):
             break
         steps.add_seen(cells, scene.cameras, view, centers, half_diagonal)
-    if scene.pixels.has_transparency:
+    if scene.pixels.has_transparency and not scene.refined:
         for view in evenly_spaced_subset(views, most_views):
             steps.carve(cells, scene.cameras, view, centers, half_diagonal, _matter(scene, view))
     return cells

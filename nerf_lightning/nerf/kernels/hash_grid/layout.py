@@ -18,6 +18,10 @@ class HashGridLayout:
         """Tell whether a level has more vertices than its table has entries."""
         return (self.resolutions[level] + 1) ** 3 > self.table_size
 
+    def coarsest(self, levels: int) -> "HashGridLayout":
+        """Return the layout of the first so many levels, in the same table."""
+        return HashGridLayout(self.resolutions[:levels], self.offsets[: levels + 1], self.table_size)
+
 
 def hash_grid_layout(num_levels: int, log2_table_size: int, min_resolution: int, max_resolution: int) -> HashGridLayout:
     """Return the layout: resolutions grow geometrically (Eq. 2, 3); dense where a level's vertices fit (Sec. 3).

@@ -1,0 +1,93 @@
+"""Test cameras of a run that refined its own: each is fitted to its photograph before it is scored.
+
+Where training cameras were wrong and have moved, those of the test views are as wrong and have not. What is scored
+should be the scene, and not the pose file, so each test camera takes some steps on its own photograph with all weights
+frozen (as BARF, arXiv 2104.06405, and Nerfies do); the protocol of the numbers says so.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.scene import Background, Cameras, Scene
+
+NUM_STEPS = 60
+STEP_RAYS = 1024
+FIRST_RATE, LAST_RATE = 3e-3, 1e-4
+
+
+@torch.enable_grad()
+def fitted_camera(model: Model, scene: Scene, view: int, background: Background, tile_points: int) -> Cameras:
+    """Return the scene's cameras, of which one has been fitted to its photograph.
+
+    Args:
+        model: in evaluation mode; its weights and counts stay as they are.
+        scene: refined cameras, photographs, masks.
+        view: whose camera is fitted.
+        background: what lies behind the photograph.
+        tile_points: most points that go through a field at once.
+    """
+    device = next(model.parameters()).device
+    motion = SmallMotions(weight=0.0)
+    motion.learn(scene.cameras[view : view + 1], scene.aabb, photographs=1)
+    near, far = scene.near[view : view + 1], scene.far[view : view + 1]
+    rays_of = RayGenerator(scene.cameras[view : view + 1], near, far, motion).to(device)
+    optimizer = torch.optim.Adam(motion.parameters(), lr=FIRST_RATE)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_RATE / FIRST_RATE) ** (1.0 / NUM_STEPS))
+    truth = photograph(scene, view, background)
+    pixels = _pixels(scene, view)
+    draw = torch.Generator().manual_seed(view)
+    with _frozen(model):
+        for _ in range(NUM_STEPS):
+            y, x = pixels[torch.randint(len(pixels), (min(STEP_RAYS, len(pixels)),), generator=draw)].unbind(dim=1)
+            optimizer.zero_grad()
+            seen = PixelIndex(torch.zeros_like(x), x, y).to(device)
+            _add_gradients(model, rays_of, seen, truth[y, x].to(device), background, tile_points)
+            optimizer.step()
+            decay.step()
+    found = rays_of.cameras.c2w.detach().cpu()
+    c2w = scene.cameras.c2w.clone()
+    c2w[view] = found[0]
+    return replace(scene.cameras, c2w=c2w)
+
+
+def _pixels(scene: Scene, view: int) -> Tensor:
+    kept = scene.pixels.kept(view)
+    height, width = int(scene.pixels.height[view]), int(scene.pixels.width[view])
+    shown = torch.ones(height, width, dtype=torch.bool) if kept is None or not bool(kept.any()) else kept
+    return shown.nonzero()
+
+
+def _add_gradients(
+    model: Model, rays_of: RayGenerator, pixels: PixelIndex, truth: Tensor, background: Background, tile_points: int
+) -> None:
+    count = truth.shape[0]
+    behind = background_colors(background, count, truth.device, random=None)
+    for part in tiles(count, tile_rays_for(model, tile_points, training=True)):
+        rendering = model(rays_of(pixels[part]), None if behind is None else behind[part], random=None)[-1]
+        ((rendering.rgb - truth[part]).square().sum() / truth.numel()).backward()
+
+
+@contextmanager
+def _frozen(model: Model) -> Iterator[None]:
+    """Let a model learn nothing and count nothing meanwhile."""
+    learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    counts = [count.clone() for count in model.counts()]
+    try:
+        for parameter in learning:
+            parameter.requires_grad_(False)
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
+        for count, before in zip(model.counts(), counts, strict=True):
+            count.copy_(before)

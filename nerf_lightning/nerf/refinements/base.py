@@ -1,0 +1,28 @@
+"""The contract of a refinement: cameras in, cameras out, as a function of parameters that learn with the model."""
+
+from abc import ABC, abstractmethod
+
+from nerf_lightning.nerf.learnt_part import LearntPart
+from nerf_lightning.nerf.types.scene import Cameras, Scene
+
+
+class Refinement(LearntPart, ABC):
+    """Cameras that learn: where they start from, every parameter is zero and nothing is changed."""
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of the cameras and of the scene's extent, once, before training.
+
+        Raises:
+            InputError: a scene whose cameras cannot be learnt.
+        """
+
+    def follow(self, share: float) -> None:
+        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
+
+    @abstractmethod
+    def forward(self, cameras: Cameras) -> Cameras:
+        """Return the cameras as they have been learnt so far."""
+
+    def moves(self) -> bool:
+        """Tell whether there is anything to learn."""
+        return next(self.parameters(), None) is not None

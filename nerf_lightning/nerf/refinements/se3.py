@@ -1,0 +1,131 @@
+"""Small motions of cameras, one per photograph, and their focal lengths, one per camera."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.poses import rotation_from_vector
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.refinements.base import Refinement
+from nerf_lightning.nerf.types.scene import Cameras, Scene
+
+FEWEST_PHOTOGRAPHS = 2
+SAME_CAMERA = ("focal", "center", "lens", "width", "height")
+"""Photographs that agree in all of these were taken with one camera."""
+
+
+class SmallMotions(Refinement):
+    """Shift and turn each camera by a little: SO(3) x R^3, by the exponential map.
+
+    R' = R exp(w + (-s_y, s_x, 0) / d), c' = c + R s with s = e t, and f' = f exp(g). The vector w turns the camera
+    about its own axes (radians); the shift t, along them, is in units of the scene's extent e (half the diagonal of
+    its box); g is shared by all photographs of one camera. All are zero at first. A photograph that is not trained on
+    has no gradients, and stays where it is.
+
+    To turn and to shift sideways move a picture all but alike, and an optimizer that takes each number by itself
+    wavers between the two. So a shifted camera turns back to what lies at the distance d of the scene's middle: w is
+    where the picture lies, and t what of it is parallax.
+
+    The loss does not change where all cameras and the whole scene move as one (turn, shift, grow); the penalty keeps
+    them from drifting that way.
+
+    Args:
+        poses: learn w and t.
+        focal: learn g.
+        learning_rate: of all three, at the beginning; the run's schedule scales it.
+        hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
+            would only wander.
+        weight: of the penalty, the sum of |w|^2, |t|^2 and g^2 over the number of photographs.
+    """
+
+    extent: Tensor
+    distance: Tensor
+    camera: Tensor
+
+    def __init__(
+        self,
+        poses: bool = True,
+        focal: bool = False,
+        learning_rate: float = 1e-3,
+        hold: float = 0.1,
+        weight: float = 1e-2,
+    ) -> None:
+        super().__init__()
+        require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "hold": (0.0, 1.0), "weight": (0.0, 1e6)})
+        if not (poses or focal):
+            raise ValueError("poses=false and focal=false leave nothing to learn: choose refinement=none")
+        self.poses, self.focal = poses, focal
+        self.learning_rate, self.hold, self.weight = learning_rate, hold, weight
+        self.is_held = False
+
+    def follow(self, share: float) -> None:
+        """Let the cameras go when it is time."""
+        self.is_held = share < self.hold
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of the cameras and of the scene's extent, once, before training.
+
+        Raises:
+            InputError: rays run through normalised device coordinates, or there are too few photographs.
+        """
+        if scene.cameras.ndc is not None:
+            raise InputError(
+                f"refinement: the scene {scene.name} is trained in normalised device coordinates (scene.space=ndc), "
+                "which bend all rays as one camera that looks straight ahead sees them, so a camera that turns would "
+                "no longer fit the others. Train with scene.space=contracted, or with refinement=none."
+            )
+        photographs = len(scene.splits["train"])
+        if photographs < FEWEST_PHOTOGRAPHS:
+            raise InputError(
+                f"refinement: the scene {scene.name} trains on {photographs} photograph, and where one camera stands "
+                "shows only against others. Give more photographs, or refinement=none."
+            )
+        self.learn(scene.cameras, scene.aabb, photographs)
+
+    def learn(self, cameras: Cameras, aabb: Float[Tensor, "2 3"], photographs: int) -> None:
+        """Make room for what is learnt of some cameras; `photographs` of them are trained on, the box holds content."""
+        views = len(cameras.width)
+        extent = (aabb[1] - aabb[0]).norm() / 2.0
+        ahead = -((aabb.mean(dim=0) - cameras.c2w[:, :, 3]) * cameras.c2w[:, :, 2]).sum(dim=1)
+        kinds = torch.cat([getattr(cameras, name).double().view(views, -1) for name in SAME_CAMERA], dim=1)
+        camera = torch.unique(kinds, dim=0, return_inverse=True)[1]
+        self.photographs = photographs
+        self.register_buffer("extent", extent, persistent=False)
+        self.register_buffer("distance", torch.maximum(ahead, extent / 2.0), persistent=False)
+        self.register_buffer("camera", camera, persistent=False)
+        if self.poses:
+            self.rotation = nn.Parameter(torch.zeros(views, 3))
+            self.shift = nn.Parameter(torch.zeros(views, 3))
+        if self.focal:
+            self.log_focal = nn.Parameter(torch.zeros(int(camera.max()) + 1))
+
+    @own_precision
+    def forward(self, cameras: Cameras) -> Cameras:
+        """Return the cameras as they have been learnt so far."""
+        if self.is_held:
+            return cameras
+        if self.poses:
+            shift, axes = self.extent * self.shift, cameras.c2w[..., :3]
+            back = torch.stack([-shift[:, 1], shift[:, 0], torch.zeros_like(shift[:, 0])], dim=1)
+            turned = axes @ rotation_from_vector(self.rotation + back / self.distance[:, None])
+            centers = cameras.c2w[..., 3:] + axes @ shift[..., None]
+            cameras = replace(cameras, c2w=torch.cat([turned, centers], dim=-1))
+        if self.focal:
+            cameras = replace(cameras, focal=cameras.focal * self.log_focal.exp()[self.camera, None])
+        return cameras
+
+    def penalty(self) -> Float[Tensor, ""] | None:
+        """Return the sum of the squared changes over the number of photographs, weighted."""
+        if not self.weight:
+            return None
+        squares = [parameter.square().sum() for parameter in self.parameters()]
+        return self.weight / self.photographs * torch.stack(squares).sum()
+
+    def reset_parameters(self) -> None:
+        """Put every camera back."""
+        for parameter in self.parameters():
+            nn.init.zeros_(parameter)

@@ -1,0 +1,184 @@
+"""Cameras that learn: what may move, what does not, and where it ends."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from support.known_fields import photographed_ball
+from support.running import refused
+from support.scenes import ball_scene, tiny_model
+from support.steps import make_step
+from support.wrong_cameras import mean_errors, with_noise
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
+from nerf_lightning.nerf.geometry.cameras import project
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.refinements.carry import motions, moved_far
+from nerf_lightning.nerf.refinements.none import NoRefinement
+from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.types.rays import PixelIndex
+
+
+def a_step(scene, refinement, model=None):
+    step = make_step(None, model, background=scene.background)
+    step.model.fit_to(scene)
+    refinement.fit_to(scene)
+    step.rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    return step
+
+
+@pytest.mark.parametrize("refinement", [NoRefinement(), SmallMotions(), SmallMotions(poses=False, focal=True)])
+def test_at_first_every_ray_is_as_it_was_to_the_bit(refinement):
+    scene = ball_scene()
+    step = a_step(scene, refinement)
+    plain = RayGenerator(scene.cameras, scene.near, scene.far)
+    pixels = PixelIndex(torch.arange(6), torch.arange(6), torch.arange(6))
+    assert torch.equal(step.rays(pixels).directions, plain(pixels).directions)
+    assert torch.equal(step.rays(pixels).origins, plain(pixels).origins)
+
+
+def test_without_a_refinement_nothing_learns_and_nothing_is_kept():
+    rays = a_step(ball_scene(), NoRefinement()).rays
+    assert not list(rays.parameters())
+    assert not rays.state_dict()
+    assert rays.penalty() is None
+    assert rays.refined((0, 1, 2)) is None
+
+
+def test_only_photographs_that_are_trained_on_move():
+    scene = ball_scene()
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=1.0))
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
+    for _ in range(3):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+    moved = (step.rays.cameras.c2w.detach() - scene.cameras.c2w).abs().amax(dim=(1, 2))
+    assert float(moved[:3].min()) > 1e-3
+    assert float(moved[3:].max()) == 0.0
+
+
+def test_cameras_are_held_until_there_is_a_scene():
+    scene = ball_scene()
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    loader, optimizer, moved = RayBatches(scene, step.progress, 0, 64), step.new_optimizer(), []
+    for _ in range(3):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+        moved.append(float(step.rays.refinement.shift.detach().abs().max()))
+    assert moved[:2] == [0.0, 0.0]
+    assert moved[2] > 1e-3
+
+
+def test_wrong_cameras_before_a_known_scene_find_their_place():
+    true, model = photographed_ball()
+    scene = with_noise(true, degrees=1.0, share=0.01)
+    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=0.0), model)
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
+    step.schedule, step.num_steps = ExponentialDecay(decay_rate=0.01), 80
+    loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
+    for _ in range(80):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+    views = true.splits["train"]
+    before, after = (mean_errors(each, true.cameras.c2w, views) for each in (scene.cameras.c2w, step.rays.cameras.c2w))
+    assert after[0] < before[0] / 4, (before, after)
+    assert after[1] < before[1] / 4, (before, after)
+
+
+def test_photographs_of_one_camera_share_its_focal_length():
+    scene = ball_scene()
+    scene = replace(scene, cameras=replace(scene.cameras, focal=scene.cameras.focal.clone()))
+    scene.cameras.focal[4:] *= 2.0
+    refinement = SmallMotions(poses=False, focal=True)
+    refinement.fit_to(scene)
+    assert refinement.log_focal.shape == (2,)
+    torch.nn.init.constant_(refinement.log_focal, 0.1)
+    torch.testing.assert_close(refinement(scene.cameras).focal, scene.cameras.focal * torch.tensor(0.1).exp())
+
+
+def test_a_wrong_focal_length_is_found_before_a_known_scene():
+    true, model = photographed_ball()
+    scene = replace(true, cameras=replace(true.cameras, focal=1.03 * true.cameras.focal))
+    step = a_step(scene, SmallMotions(poses=False, focal=True, learning_rate=3e-3, hold=0.0, weight=0.0), model)
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
+    loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
+    for _ in range(30):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+    assert float((step.rays.cameras.focal.detach() / true.cameras.focal).mean()) == pytest.approx(1.0, abs=6e-3)
+
+
+def test_the_penalty_is_the_mean_square_of_what_has_moved():
+    refinement = SmallMotions(weight=0.5)
+    refinement.fit_to(ball_scene())  # three photographs
+    torch.nn.init.constant_(refinement.rotation[:1], 0.1)
+    assert float(refinement.penalty().detach()) == pytest.approx(0.5 * 3 * 0.01 / 3)
+    assert SmallMotions(weight=0.0).penalty() is None
+
+
+def test_cameras_in_normalised_device_coordinates_are_refused():
+    scene = ball_scene()
+    bent = replace(scene, cameras=replace(scene.cameras, ndc=torch.ones(6, 2)), space="ndc")
+    refused(SmallMotions().fit_to, bent, parts=("scene.space=ndc", "scene.space=contracted", "refinement=none"))
+
+
+def test_one_photograph_is_refused():
+    alone = replace(ball_scene(), splits={"train": (2,)})
+    refused(SmallMotions().fit_to, alone, parts=("trains on 1 photograph", "refinement=none"))
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    ({"learning_rate": 0.0}, "learning_rate=0.0: give"), ({"weight": -1.0}, "weight=-1.0: give"),
+    ({"poses": False}, "nothing to learn"),
+])  # fmt: skip
+def test_settings_that_make_no_sense_are_refused(settings, said):
+    with pytest.raises(ValueError, match=said):
+        SmallMotions(**settings)
+
+
+def test_views_that_are_not_trained_on_follow_the_others():
+    scene = ball_scene(num_views=8)
+    refinement = SmallMotions()
+    refinement.fit_to(scene)
+    rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    with torch.no_grad():
+        refinement.shift[:4] = torch.tensor([0.0, 0.0, 0.02])  # each goes back, and the others are left behind
+    rows, eyes = [0, 1, 2, 3], rays.refined(scene.splits["train"]).c2w[:, :, 3]
+    by = similarity_between(scene.cameras.c2w[rows], rays.cameras.c2w[rows].detach())
+    torch.testing.assert_close(eyes[4:], carried(scene.cameras.c2w, by)[4:, :, 3])
+    torch.testing.assert_close(eyes[:4], rays.cameras.c2w[:4, :, 3].detach())
+    assert float((eyes - scene.cameras.c2w[:, :, 3]).norm(dim=1).min()) > 0.01
+
+
+def test_a_shifted_camera_turns_back_to_the_middle_of_the_scene():
+    scene = ball_scene()
+    refinement = SmallMotions()
+    refinement.fit_to(scene)
+    with torch.no_grad():
+        refinement.shift[:] = torch.tensor([0.01, -0.02, 0.0])
+        cameras = refinement(scene.cameras)
+    for view in range(6):
+        before, after = (project(each, view, torch.zeros(1, 3)) for each in (scene.cameras, cameras))
+        torch.testing.assert_close(after, before, atol=5e-3, rtol=0)
+        shift = (cameras.c2w[view, :, 3] - scene.cameras.c2w[view, :, 3]).norm()
+        torch.testing.assert_close(shift, 3**0.5 * torch.tensor([0.01, 0.02]).norm())
+
+
+def test_who_moved_far_is_told_from_what_all_did():
+    scene, trained = ball_scene(num_views=12), tuple(range(10))
+    drifted = replace(scene.cameras, c2w=1.0 * scene.cameras.c2w)
+    drifted.c2w[:, :, 3] *= 1.2
+    wrong = with_noise(with_noise(replace(scene, cameras=drifted), 0.1, 0.001), 6.0, 0.02, views=[4], seed=3)
+    motion = motions(scene.cameras, wrong.cameras, trained, extent=3**0.5)
+    assert moved_far(motion) == [4]
+    assert float(motion[4]) == pytest.approx(0.105 + 0.02 * 4.1 / 3**0.5, rel=0.2)
+    assert moved_far(motions(scene.cameras, drifted, trained, extent=1.0)) == []
+
+
+def test_a_restart_puts_the_cameras_back():
+    scene = ball_scene()
+    step = a_step(scene, SmallMotions(), tiny_model(density_bias=0.5))
+    torch.nn.init.normal_(step.rays.refinement.rotation)
+    step.restart(torch.optim.SGD(step.rays.parameters(), lr=1.0))
+    assert torch.equal(step.rays.cameras.c2w, scene.cameras.c2w)
+    assert torch.equal(step.rays.refined((0, 1, 2)).c2w[:3], scene.cameras.c2w[:3])
