@@ -95,7 +95,7 @@ def checkpoint(resumable: bool) -> Record:
     """
     name = Text(500)
     use: dict[str, Description] = {
-        "state_dict": Named(Text(500, r"model\..+"), Numbers(dtypes=WEIGHTS), 100_000),
+        "state_dict": Named(Text(500, r"(model|loss)\..+"), Numbers(dtypes=WEIGHTS), 100_000),
         "global_step": Whole(),
         KEY: record(resumable),
     }

@@ -92,7 +92,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         config=record["config"],
         choices=record["choices"],
         scene=SceneRecord(**scene | {"cameras": Cameras(**scene["cameras"])}),
-        weights={key[len(prefix) :]: value for key, value in content["state_dict"].items()},
+        weights={key[len(prefix) :]: value for key, value in content["state_dict"].items() if key.startswith(prefix)},
         step=content["global_step"],
         precision=record["precision"],
         tile_points=record["tile_points"],

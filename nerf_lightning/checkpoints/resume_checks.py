@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.optimizer_state import Build, require_fitting_optimizer
@@ -21,13 +21,13 @@ CURE = (
 
 
 def require_resumable(
-    content: Mapping[str, Any], model: nn.Module, build_optimizer: Build, progress: Progress, optimizer: Any
+    content: Mapping[str, Any], known: Mapping[str, Tensor], build_optimizer: Build, progress: Progress, optimizer: Any
 ) -> None:
     """Refuse a checkpoint that is sound in itself, and not of this run.
 
     Args:
         content: as `read_content` returned it.
-        model: the run's.
+        known: the run's own weights and what else it learns, by name.
         build_optimizer: the run's.
         progress: the run's, as the loader has set it up.
         optimizer: newly made, of the run's parameters.
@@ -36,10 +36,7 @@ def require_resumable(
         InputError: with the place in the checkpoint.
     """
     try:
-        prefix = "model."
-        require_fitting_weights(
-            {key[len(prefix) :]: value for key, value in content["state_dict"].items()}, model.state_dict()
-        )
+        require_fitting_weights(content["state_dict"], known)
         require_fitting_optimizer(
             content["optimizer_states"][0], optimizer, build_optimizer, most_steps=content["global_step"]
         )
@@ -49,22 +46,22 @@ def require_resumable(
 
 
 def require_fitting_weights(weights: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> None:
-    """Refuse weights of another model.
+    """Refuse the weights of another model, and what another loss has learnt.
 
     Raises:
         Unfit: other names, shapes or types.
     """
     for name in [*(known.keys() - weights.keys()), *(weights.keys() - known.keys())][:1]:
-        raise Unfit(f"state_dict.model.{name}", "is missing" if name in known else "belongs to no part of this model")
+        raise Unfit(f"state_dict.{name}", "is missing" if name in known else "belongs to no part of this run")
     for name, tensor in weights.items():
         if tensor.shape != known[name].shape or tensor.dtype != known[name].dtype:
             raise Unfit(
-                f"state_dict.model.{name}",
-                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the model {known[name].dtype} in "
+                f"state_dict.{name}",
+                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the run's {known[name].dtype} in "
                 f"{tuple(known[name].shape)}",
             )
         if tensor.dtype == torch.bool and not tensor.dim() and not torch.equal(tensor.cpu(), known[name].cpu()):
-            raise Unfit(f"state_dict.model.{name}", f"is {bool(tensor)}, which the run's scene and settings are not")
+            raise Unfit(f"state_dict.{name}", f"is {bool(tensor)}, which the run's scene and settings are not")
 
 
 def require_callbacks(states: Mapping[str, Any], callbacks: list[Any]) -> None:

@@ -103,7 +103,7 @@ SWEEP_WORD = replace(OF_THE_USER, in_sweep=Trust.WORDS)
 OF_OTHER_COMMANDS = Meaning()
 
 ROWS: tuple[tuple[Meaning, str], ...] = (
-    (PART, "model.** encoder.** direction_encoder.** field.** loss.** optimizer.** scheduler.**"),
+    (PART, "model.** encoder.** direction_encoder.** field.** loss.** plain_loss.** optimizer.** scheduler.**"),
     (
         LEARNT,
         """

@@ -116,6 +116,12 @@ class TrainStep:
             self.model.reset_parameters()
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
+        self.loss.forget()
+
+    @property
+    def rays_together(self) -> int:
+        """How many rays in a row of a batch no tile and no process may part: the pixels of a square."""
+        return self.loss.patch**2
 
     @property
     def device(self) -> torch.device:
@@ -126,6 +132,7 @@ class TrainStep:
         """Move all that is computed with to a device."""
         self.model.to(device)
         self.rays.to(device)
+        self.loss.to(device)
         return self
 
     def restart(self, optimizer: Optimizer) -> None:
@@ -181,7 +188,8 @@ class TrainStep:
         optimizer.zero_grad()
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         num_rays = progress.batch_rays
-        share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
+        first = ranks.share(num_rays // self.rays_together).start * self.rays_together
+        share = Share(first, num_rays, ranks.total(batch.weight.sum()))
         seen = self.gradients(batch, backward, share)
         ranks.add_up([seen["losses"]])
         ranks.add_up_gradients(self._parameters())
@@ -189,12 +197,16 @@ class TrainStep:
         if self.guard.allows(seen["losses"], self.model.named_parameters()):
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
+            self.loss.learn(seen["rgb"], seen["target"], seen["weight"])
+            ranks.average(self.loss.measurements())
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
             ranks.average(self.model.measurements())
             if self.sample_budget is not None:
                 points = self.model.points_per_ray(training=True)
-                progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
+                progress.batch_rays = batch_size(
+                    progress.largest_batch, self.sample_budget / points, self.rays_together
+                )
         return seen | {"pixels": batch.pixels, "gradient_norms": norms}
 
     def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> dict[str, Tensor]:
@@ -207,7 +219,7 @@ class TrainStep:
 
         Returns:
             `losses` per level, detached, which add up over all shares to the batch's; and of each ray its `foreground`
-            light, its `target` colour and its `weight`.
+            light, its last level's `rgb`, its `target` colour and its `weight`.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
         counts = [count.clone() for count in self.model.counts()]
@@ -257,8 +269,8 @@ class TrainStep:
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
         target = Target(blend(batch.rgba, behind), weight, batch.pixels)
-        losses, foreground = [], []
-        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True)):
+        losses, foreground, rgb = [], [], []
+        for tile in tiles(num_rays, self._tile_rays(num_rays, training=True), self.rays_together):
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
@@ -268,11 +280,13 @@ class TrainStep:
             backward(part.sum())
             losses.append(part.detach())
             foreground.append(renderings[-1].foreground.detach())
-        seen = {"foreground": torch.cat(foreground), "target": target.rgb, "weight": batch.weight}
+            rgb.append(renderings[-1].rgb.detach())
+        seen = {"foreground": torch.cat(foreground), "rgb": torch.cat(rgb)}
+        seen |= {"target": target.rgb, "weight": batch.weight}
         return {"losses": torch.stack(losses).sum(0)} | seen
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
-        if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) == 1:
+        if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:
             raise InputError(
                 f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
                 "or tiles (trainer.tile_points=auto)."

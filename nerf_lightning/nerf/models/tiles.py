@@ -12,18 +12,26 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
 from nerf_lightning.nerf.types.scene import Background
 
 
-def tiles(num_rays: int, tile_rays: int) -> Iterator[slice]:
+def tiles(num_rays: int, tile_rays: int, together: int = 1) -> Iterator[slice]:
     """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
+
+    Args:
+        num_rays: of the batch.
+        tile_rays: most rays of a tile.
+        together: so many rays in a row are never cut; a tile has as many at least.
 
     >>> [(part.start, part.stop) for part in tiles(10, 4)]
     [(0, 4), (4, 7), (7, 10)]
+    >>> [(part.start, part.stop) for part in tiles(12, 7, together=4)]
+    [(0, 4), (4, 8), (8, 12)]
     """
-    count = max(1, -(-num_rays // tile_rays))
-    size, rest = divmod(num_rays, count)
+    groups = -(-num_rays // together)
+    count = max(1, -(-groups // max(1, tile_rays // together)))
+    size, rest = divmod(groups, count)
     start = 0
     for number in range(count):
         stop = start + size + int(number < rest)
-        yield slice(start, stop)
+        yield slice(start * together, min(stop * together, num_rays))
         start = stop
 
 
