@@ -230,7 +230,8 @@ class FixedRays:
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "
-                "Raise data.val_rays, or check the masks of the validation views (white is kept)."
+                "Raise data.val_rays, or check the masks of the validation views (scene.masks_keep says which colour "
+                "counts)."
             )
 
     def __len__(self) -> int:
