@@ -144,8 +144,8 @@ def _check_patch(scene: Scene, patch: int, batch_rays: int) -> None:
     if batch_rays % together:
         fitting = max(1, round(batch_rays / together)) * together
         raise InputError(
-            f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is no multiple of "
-            f"that. Give data.batch_rays={fitting}, or a smaller loss.patch."
+            f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is no multiple "
+            f"of that. Give data.batch_rays={fitting}, or a smaller loss.patch."
         )
     train = scene.splits.get("train", ())
     small = [view for view in train if min(scene.pixels.width[view], scene.pixels.height[view]) < patch]

@@ -119,7 +119,9 @@ class RadianceFieldSystem(LightningModule):
         """
         require_ours(checkpoint, Path(self.trainer.ckpt_path or LAST), resumable=True)
         trainer, step, state = self.trainer, self.step, checkpoint[KEY]
-        require_resumable(checkpoint, self.state_dict(), step.build_optimizer, step.progress, self.configure_optimizers())
+        require_resumable(
+            checkpoint, self.state_dict(), step.build_optimizer, step.progress, self.configure_optimizers()
+        )
         require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
         loops = {key: getattr(trainer, key).state_dict() for key in LOOPS}
         require_loops(checkpoint["loops"], loops, checkpoint["global_step"], skipped=state["bad_steps"][0])

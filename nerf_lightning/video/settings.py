@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
@@ -50,8 +50,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
     if config["format"] not in ("video", "frames"):
         raise InputError(f"format={config['format']}: choose video (mp4) or frames (PNG files).")
-    if config["projection"] not in get_args(Projection):
-        raise InputError(f"projection={config['projection']}: choose one of {', '.join(get_args(Projection))}.")
+    require_one_of(get_args(Projection), projection=config["projection"])
     return FilmSettings(
         outputs=outputs,
         mosaic=config["mosaic"],

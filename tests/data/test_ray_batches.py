@@ -114,7 +114,6 @@ def test_views_of_different_sizes_share_one_domain():
 def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog):
     from dataclasses import replace
 
-
     scene = ball_scene(background="random")
     RayDataModule(scene, Progress(), seed=0)
     assert caplog.text == ""
@@ -153,9 +152,7 @@ def test_squares_follow_from_the_place_alone_and_their_grid_moves_from_epoch_to_
     parts = [loader.pixels_at(0, 64 * step, 64) for step in range(10)]
     for name in ("view", "x", "y"):
         assert torch.equal(getattr(everything, name), torch.cat([getattr(part, name) for part in parts]))
-    corners = [
-        set((loader.pixels_at(0, epoch * loader.whole.num_rays).x[::16] % 4).tolist()) for epoch in range(8)
-    ]
+    corners = [set((loader.pixels_at(0, epoch * loader.whole.num_rays).x[::16] % 4).tolist()) for epoch in range(8)]
     assert len(set(map(frozenset, corners))) > 1
 
 

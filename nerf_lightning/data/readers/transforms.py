@@ -149,6 +149,7 @@ def _picture(path: Path, where: str, name: object) -> Path:
     named = path.parent / name.replace("\\", "/")
     found = [named] if named.suffix.lower() in ENDINGS else []
     found += [named.with_name(named.name + ending) for ending in ENDINGS]
+    found += [named]  # of another format, which is named where it is opened
     there = [candidate for candidate in found if is_there(candidate)]
     if there:
         return there[0]

@@ -86,9 +86,9 @@ def panorama_focal_of(settings: dict[str, Any], width: float, height: float, whe
     x, y = number_of(settings, "fl_x", where, width / 2), number_of(settings, "fl_y", where, height)
     if not (x >= 0.495 * width and y >= 0.99 * height):
         raise InputError(
-            f"{where} is a panorama (EQUIRECTANGULAR) with fl_x={x:g} and fl_y={y:g} for {width:g} x {height:g} pixels, "
-            "which would show some directions twice. For a whole panorama these are half the width and the height: "
-            "remove both, or export it again."
+            f"{where} is a panorama (EQUIRECTANGULAR) with fl_x={x:g} and fl_y={y:g} for {width:g} x {height:g} "
+            "pixels, which would show some directions twice. For a whole panorama these are half the width and the "
+            "height: remove both, or export it again."
         )
     return max(x, width / 2) / math.pi, max(y, height) / math.pi
 

@@ -67,9 +67,9 @@ def stretches(
 ) -> Float[Tensor, "*rays 2"]:
     """Return by how much the lens stretches its surroundings at each direction: the least and the most.
 
-    For a panorama and a fisheye, per radian; of the latter: d theta_d / d theta along the radius and theta_d / sin(theta) around it. For the others,
-    against a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where the least is not above 0, the
-    lens folds back.
+    For a fisheye, per radian: d theta_d / d theta along the radius and theta_d / sin(theta) around it; for a panorama
+    per radian, too. For the others, against a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where the
+    least is not above 0, the lens folds back.
     """
     if model == "equirectangular":
         return panorama_stretches(directions)

@@ -196,8 +196,9 @@ def frame_of(
     Forward-facing captures have no middle: theirs lies in front of the mean camera, a few times as far as the near
     plane, and up is the mean camera's.
 
-    Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal point are left behind, for what is
-    rendered on a path is seen through a centred pinhole. The default `up` is the world's z axis.
+    Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal
+    point are left behind, for what is rendered on a path is seen through a centred pinhole. The default `up` is the
+    world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)
     if cameras.ndc is not None:

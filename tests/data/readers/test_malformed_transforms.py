@@ -161,6 +161,22 @@ def an_angle_in_degrees(root):
     edit_json(root, lambda content: {"camera_angle_x": 45.0, "frames": content["frames"]})
 
 
+@case("transforms", r"p_1.heic is a photograph in the format HEIC. .* Convert all of them to JPEG")
+def a_photograph_as_phones_save_it(root):
+    edit_frame(root, 1, file_path="images/p_1.heic")
+    (root / "images" / "p_1.heic").write_bytes(b"\0\0\0\x18ftypheic" + 100 * b"\0")
+
+
+@case("transforms", r"scene.masks_keep=black, and no photograph of .* has a mask. Say where", masks_keep="black")
+def inverted_masks_that_are_not_there(root):
+    pass
+
+
+@case("transforms", r"scene.masks_keep=grey: choose one of white, black", masks_keep="grey")
+def masks_that_keep_neither(root):
+    pass
+
+
 @case("transforms", r"has the camera_model 'VR180_L'; known are PINHOLE, .* export them as perspective")
 def half_a_panorama(root):
     edit_json(root, lambda content: content | {"camera_model": "VR180_L"})

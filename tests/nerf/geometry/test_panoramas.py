@@ -60,7 +60,9 @@ def test_stretches_are_those_of_finite_differences():
     directions = unproject(angles, NOTHING, "equirectangular")
     least, most = stretches(directions, NOTHING, "equirectangular").unbind(dim=-1)
     step = 1e-6
-    sideways = torch.linalg.cross(directions, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand_as(directions))
+    sideways = torch.linalg.cross(
+        directions, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand_as(directions)
+    )
     sideways = sideways / sideways.norm(dim=-1, keepdim=True)
     upwards = torch.linalg.cross(directions, sideways)
     for along, expected in ((sideways, most), (upwards, least)):

@@ -80,7 +80,7 @@ def test_the_threshold_comes_down_to_the_quantile_and_the_passer_by_is_left_out_
         loss.learn(truth, photograph, weight)
     assert float(loss.threshold) == pytest.approx(1e-4, rel=1e-3)
     levels = loss([seen(truth)] * 2, target(photograph, weight))
-    # Three quarters of the pixels, and those of the passer-by's edge that have as many good neighbours as bad ones: none.
+    # Three quarters of the pixels: none of the passer-by has as many good neighbours as bad ones.
     assert [float(level) for level in levels] == pytest.approx([0.75 * 1e-4] * 2, rel=1e-3)
     loss.forget()
     torch.testing.assert_close(loss([seen(truth)] * 2, target(photograph, weight)), plain)
