@@ -22,33 +22,38 @@ MEMORY = 0.9
 """Of the threshold, what is left of it after a step; a single batch may show hardly anything but people."""
 FIRST_THRESHOLD = 1.0
 """No colour in [0, 1] is farther off than that: at first nothing is left out."""
-RANGES = {"share": (0.01, 1.0), "patch": (4, 256)}
+RANGES = {"share": (0.01, 1.0), "times": (0.1, 1000.0), "patch": (4, 256)}
 
 
 class RobustLoss(Loss):
     """Leave the pixels that the scene does not explain out of another loss.
 
-    The threshold is learnt: the quantile of the last picture's residuals, averaged over the steps. Rays come in
-    squares of pixels; those beyond the last whole square are all kept.
+    The threshold is learnt: a multiple of a quantile of the last picture's residuals, averaged over the steps. Rays
+    come in squares of pixels; those beyond the last whole square are all kept.
+
+    The paper's threshold is the median itself, which keeps detail away for the hundred thousands of steps that it
+    trains, and its squares have 16 pixels a side. Shorter trainings need a threshold that most of the scene stays
+    below at any time, and steps that see more places.
 
     Args:
         of: the loss that the others count in, for all its levels.
-        share: of the pixels that surely show the scene, at least (T_e in the paper is the median: 0.5).
+        share: of the pixels that surely show the scene, at least: which quantile.
+        times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
         patch: side of the squares in pixels.
 
     Raises:
         ValueError: a number out of its range.
     """
 
-    def __init__(self, of: Loss, share: int | float = 0.8, patch: int = 16):
+    def __init__(self, of: Loss, share: int | float = 0.8, times: int | float = 4.0, patch: int = 8):
         super().__init__()
-        require_ranges({"share": share, "patch": patch}, RANGES)
-        self.of, self.share, self.patch = of, share, patch
+        require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
+        self.of, self.share, self.times, self.patch = of, share, times, patch
         self.every_level_is_a_picture = of.every_level_is_a_picture
         self.register_buffer("threshold", torch.tensor(FIRST_THRESHOLD))
 
     threshold: Tensor
-    """Greatest residual of a pixel that is kept by itself."""
+    """Greatest residual of a pixel that is kept for itself."""
 
     def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
         """Return what the other loss does for the rays that are kept; the others weigh 0."""
@@ -61,10 +66,10 @@ class RobustLoss(Loss):
     def learn(
         self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
     ) -> None:
-        """Move the threshold towards the quantile of a step's residuals; masked pixels have none."""
+        """Move the threshold towards that of a step's residuals; masked pixels have none."""
         known = torch.where(weight > 0, residuals(rgb, target), torch.nan)
-        quantile = torch.nanquantile(known, float(self.share))
-        moved = MEMORY * self.threshold + (1.0 - MEMORY) * quantile
+        wanted = self.times * torch.nanquantile(known, float(self.share))
+        moved = MEMORY * self.threshold + (1.0 - MEMORY) * wanted
         self.threshold.copy_(torch.where(torch.isfinite(moved), moved, self.threshold))
 
     def measurements(self) -> list[Tensor]:
