@@ -11,7 +11,7 @@ from support.panoramas import near_the_bricks, write_panoramas
 from support.scenes import tiny_model
 from support.steps import rays_of
 
-from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.checkpoints.reading import make_record, scene_record
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.doctor.examine import examine
@@ -24,7 +24,7 @@ from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.video.paths.photograph_path import PhotographPath
-from nerf_lightning.video.shots import Subject, make_shots
+from nerf_lightning.video.shots import Subject, lay_path, make_shots
 
 
 def read(root, **settings):
@@ -121,6 +121,13 @@ def test_panoramas_that_were_rendered_and_read_again_have_the_rays_they_were_ren
         strict=True,
     ):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0)
+
+
+def test_films_of_them_show_what_a_person_would_look_at_and_checkpoints_keep_them(scene):
+    cameras = lay_path(PhotographPath(3), scene)
+    assert cameras.lens_model == "pinhole"
+    assert float(cameras.focal[0, 0]) == pytest.approx(32.0)  # 90 degrees across 64 pixels
+    assert make_record(scene, "", {})["scene"]["cameras"]["lens_model"] == "equirectangular"
 
 
 def test_some_steps_of_training_on_panoramas_make_them_better(scene):
