@@ -1,8 +1,12 @@
 import pytest
 import torch
+from support.planted_ball import with_jumping_ball
+from support.scenes import ball_scene
 
+from nerf_lightning.data.ray_batches import RayBatches, gather_batch
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
-from nerf_lightning.nerf.losses.robust import RobustLoss, kept_pixels
+from nerf_lightning.nerf.losses.robust import RobustLoss, kept_pixels, residuals
+from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import PixelIndex, Target
 from nerf_lightning.nerf.types.renderings import Rendering
 
@@ -112,3 +116,20 @@ def test_masked_pixels_speak_against_no_neighbour():
 def test_numbers_out_of_range_are_refused(setting, value):
     with pytest.raises(ValueError, match=f"{setting}={value}: give"):
         RobustLoss(MeanSquaredError(), **{setting: value})
+
+
+def test_of_a_planted_ball_most_is_left_out_and_of_what_the_scene_explains_hardly_anything():
+    scene = ball_scene(num_views=4, size=64)
+    planted = with_jumping_ball(scene)
+    pixels = RayBatches(planted, Progress(), 0, 4096, patch=8).pixels_at(0, 0)
+    clean, photograph = (gather_batch(each, pixels).rgba[:, :3] for each in (scene, planted))
+    # The scene is known up to noise.
+    seen = clean + 0.02 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    loss = RobustLoss(MeanSquaredError())
+    for _ in range(100):
+        loss.learn(seen, photograph, torch.ones(len(pixels.x)))
+    kept = kept_pixels(residuals(seen, photograph) <= loss.threshold, loss.patch)
+    ball = (photograph - clean).abs().amax(dim=-1) > 0
+    assert float(ball.float().mean()) > 0.03
+    assert float(kept[ball].float().mean()) < 0.25
+    assert float(kept[~ball].float().mean()) > 0.98
