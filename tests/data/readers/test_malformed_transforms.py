@@ -172,11 +172,6 @@ def inverted_masks_that_are_not_there(root):
     pass
 
 
-@case("transforms", r"scene.masks_keep=grey: choose one of white, black", masks_keep="grey")
-def masks_that_keep_neither(root):
-    pass
-
-
 @case("transforms", r"has the camera_model 'VR180_L'; known are PINHOLE, .* export them as perspective")
 def half_a_panorama(root):
     edit_json(root, lambda content: content | {"camera_model": "VR180_L"})
