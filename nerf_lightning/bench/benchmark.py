@@ -148,7 +148,7 @@ def _prepare(config: DictConfig) -> Bench:
     step = build_step(config, settings, scene, progress).to(settings.device)
     step.num_steps = max(1, config.warmup_steps)
     settings.prepare(step.model)
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
     data.settle(settings.device)
     if settings.measures_tile:
         settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)

@@ -98,7 +98,7 @@ def checkpoint(resumable: bool) -> Record:
     """
     name = Text(500)
     use: dict[str, Description] = {
-        "state_dict": Named(Text(500, rf"({'|'.join(PARTS)})\..+"), Numbers(dtypes=WEIGHTS), 100_000),
+        "state_dict": Named(Text(500, rf"({'|'.join(PARTS)}|loss)\..+"), Numbers(dtypes=WEIGHTS), 100_000),
         "global_step": Whole(),
         KEY: record(resumable),
     }

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.optimizer_state import Build, require_fitting_optimizer
@@ -21,17 +21,13 @@ CURE = (
 
 
 def require_resumable(
-    content: Mapping[str, Any],
-    parts: Mapping[str, nn.Module],
-    build_optimizer: Build,
-    progress: Progress,
-    optimizer: Any,
+    content: Mapping[str, Any], known: Mapping[str, Tensor], build_optimizer: Build, progress: Progress, optimizer: Any
 ) -> None:
     """Refuse a checkpoint that is sound in itself, and not of this run.
 
     Args:
         content: as `read_content` returned it.
-        parts: of the run's step, by name: the model, and what learns beside it.
+        known: the run's own weights and what else it learns, by name.
         build_optimizer: the run's.
         progress: the run's, as the loader has set it up.
         optimizer: newly made, of the run's parameters.
@@ -40,7 +36,6 @@ def require_resumable(
         InputError: with the place in the checkpoint.
     """
     try:
-        known = {f"{name}.{key}": value for name, part in parts.items() for key, value in part.state_dict().items()}
         require_fitting_weights(content["state_dict"], known)
         require_fitting_optimizer(
             content["optimizer_states"][0], optimizer, build_optimizer, most_steps=content["global_step"]
@@ -51,18 +46,18 @@ def require_resumable(
 
 
 def require_fitting_weights(weights: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> None:
-    """Refuse weights of another model, or of other parts beside it.
+    """Refuse weights of another model or of other parts beside it, and what another loss has learnt.
 
     Raises:
         Unfit: other names, shapes or types.
     """
     for name in [*(known.keys() - weights.keys()), *(weights.keys() - known.keys())][:1]:
-        raise Unfit(f"state_dict.{name}", "is missing" if name in known else "belongs to no part of this model")
+        raise Unfit(f"state_dict.{name}", "is missing" if name in known else "belongs to no part of this run")
     for name, tensor in weights.items():
         if tensor.shape != known[name].shape or tensor.dtype != known[name].dtype:
             raise Unfit(
                 f"state_dict.{name}",
-                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the run {known[name].dtype} in "
+                f"holds {tensor.dtype} in the shape {tuple(tensor.shape)}, and the run's {known[name].dtype} in "
                 f"{tuple(known[name].shape)}",
             )
         if tensor.dtype == torch.bool and not tensor.dim() and not torch.equal(tensor.cpu(), known[name].cpu()):

@@ -106,7 +106,8 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (
         PART,
         """
-        model.** encoder.** direction_encoder.** field.** loss.** correction.** refinement.** optimizer.** scheduler.**
+        model.** encoder.** direction_encoder.** field.** loss.** plain_loss.** correction.** refinement.** optimizer.**
+        scheduler.**
         """,
     ),
     (
@@ -116,7 +117,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
         data.device_budget data.prefetch
         scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
-        scene.images scene.masks scene.file scene.frames scene.hold_every scene.train_fraction
+        scene.images scene.masks scene.masks_keep scene.file scene.frames scene.hold_every scene.train_fraction
         scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
         callbacks.collapse_guard.every_steps callbacks.collapse_guard.until_step callbacks.collapse_guard.patience
         callbacks.collapse_guard.ratio callbacks.collapse_guard.max_restarts
@@ -164,7 +165,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (
         OF_OTHER_COMMANDS,
         """
-        ckpt what.** labels outputs mosaic format background crop near hold_camera
+        ckpt what.** labels outputs mosaic format background crop near hold_camera projection
         host port open_browser photographs max_height
         run measured max_megabytes runs scenes models sort published force
         rounds steps warmup_steps target_psnr kernels render_rays

@@ -39,6 +39,7 @@ class RayDataModule(LightningDataModule):
         prefetch: make the next batch in a background thread while a step runs; auto does where that has been found to
             help: pixels on the host and the model on a GPU, or a mapped file that memory cannot hold. The
             batches are the same.
+        patch: side in pixels of the squares that training rays come in, as the loss wants them.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class RayDataModule(LightningDataModule):
         val_rays: int = 4096,
         device_budget: int | float | Literal["auto"] = "auto",
         prefetch: bool | Literal["auto"] = "auto",
+        patch: int = 1,
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
@@ -61,6 +63,7 @@ class RayDataModule(LightningDataModule):
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
             _require_room(name, value)
         least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
+        least = max(1, least // patch**2)
         if min(least, val_rays) < ranks.world_size():
             raise InputError(
                 f"data.batch_rays={batch_rays} and data.val_rays={val_rays} leave some of {ranks.world_size()} "
@@ -76,11 +79,12 @@ class RayDataModule(LightningDataModule):
         if not 0 < crop_fraction <= 1:
             raise InputError(f"data.crop_fraction={crop_fraction} is a share of the picture's side: between 0 and 1.")
         _check_background(scene)
+        _check_patch(scene, patch, batch_rays)
         for split in ("train", "val"):
             if not scene.splits.get(split):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays)
+        self.batches = RayBatches(scene, progress, seed, batch_rays, patch)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
         self.device_budget, self.prefetch = device_budget, prefetch
@@ -132,4 +136,23 @@ def _check_background(scene: Scene) -> None:
             "scene is part of them and is learnt as matter. Give the background's colour instead "
             "(scene.background=black or white).",
             scene.name,
+        )
+
+
+def _check_patch(scene: Scene, patch: int, batch_rays: int) -> None:
+    together = patch**2
+    if batch_rays % together:
+        fitting = max(1, round(batch_rays / together)) * together
+        raise InputError(
+            f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is no multiple "
+            f"of that. Give data.batch_rays={fitting}, or a smaller loss.patch."
+        )
+    train = scene.splits.get("train", ())
+    small = [view for view in train if min(scene.pixels.width[view], scene.pixels.height[view]) < patch]
+    if small:
+        view = small[0]
+        raise InputError(
+            f"loss.patch={patch} draws squares of {patch} x {patch} pixels, and {scene.view_names[view]} of "
+            f"{scene.name} has {int(scene.pixels.width[view])} x {int(scene.pixels.height[view])}. Give a smaller "
+            "loss.patch (4 or more), or larger pictures (scene.downscale)."
         )

@@ -31,45 +31,76 @@ def batch_sizes(largest: int) -> list[int]:
     return [max(1, largest >> number) for number in range(BATCH_SIZES)]
 
 
-def batch_size(largest: int, wanted: float) -> int:
-    """Return the largest of `batch_sizes` that is at most `wanted`.
+def batch_size(largest: int, wanted: float, together: int = 1) -> int:
+    """Return the largest of `batch_sizes` that is at most `wanted`, and a multiple of `together`, as `largest` is.
 
-    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0)
-    (1024, 4096, 32)
+    >>> batch_size(4096, 1500.0), batch_size(4096, 1e9), batch_size(4096, 0.0), batch_size(4096, 0.0, together=256)
+    (1024, 4096, 32, 256)
     """
-    sizes = batch_sizes(largest)
+    sizes = [size for size in batch_sizes(largest) if size % together == 0]
     return next((size for size in sizes if size <= wanted), sizes[-1])
 
 
 class PixelDomain:
     """The pixels of some views, or of their centres, numbered from 0; row by row, view by view.
 
+    Where pixels are to come in squares, the squares are numbered instead. They lie on a grid that may be shifted
+    against the picture; at its borders they are moved inside, so that together they hold every pixel wherever the grid
+    lies. Those near the borders may overlap.
+
     Args:
         scene: the views' sizes, and where they lie.
         views: which views take part, in order.
         fraction: share of each side, around the centre, that takes part; 1 for the whole picture.
+        patch: side of the squares in pixels, no longer than any picture's.
     """
 
-    def __init__(self, scene: Scene, views: Sequence[int], fraction: float = 1.0):
+    def __init__(self, scene: Scene, views: Sequence[int], fraction: float = 1.0, patch: int = 1):
+        self.patch = patch
         self.views = torch.tensor(views, dtype=torch.int64, device=scene.pixels.width.device)
         width, height = scene.pixels.width[self.views], scene.pixels.height[self.views]
-        self.width = (width * fraction).round().long().clamp(min=1)
-        self.height = (height * fraction).round().long().clamp(min=1)
+        self.width = (width * fraction).round().long().clamp(min=patch)
+        self.height = (height * fraction).round().long().clamp(min=patch)
         self.left = (width - self.width) // 2
         self.top = (height - self.height) // 2
-        self.ends = (self.width * self.height).cumsum(0)
-        self.num_pixels = int(self.ends[-1])
+        # One more than fit, for what a shift uncovers on the other side.
+        self.columns, self.rows = ((size + 2 * (patch - 1)) // patch for size in (self.width, self.height))
+        self.ends = (self.columns * self.rows).cumsum(0)
+        self.count = int(self.ends[-1])
 
     def __len__(self) -> int:
-        return self.num_pixels
+        return self.count
 
-    def locate(self, number: Int[Tensor, "*rays"]) -> PixelIndex:
-        """Return which pixel of which view each number stands for."""
+    @property
+    def num_rays(self) -> int:
+        """How many rays show every square once."""
+        return self.count * self.patch**2
+
+    def locate(self, number: Int[Tensor, "*rays"], shift: Int[Tensor, "*#rays"] | int = 0) -> PixelIndex:
+        """Return which pixel of which view each number stands for.
+
+        Args:
+            number: of pixels, or of squares, for each of which all pixels are returned, in one row.
+            shift: of the grid of squares, in pixels, below `patch`.
+        """
         slot = torch.searchsorted(self.ends, number, right=True)
-        within = number - (self.ends[slot] - self.width[slot] * self.height[slot])
-        row = torch.div(within, self.width[slot], rounding_mode="floor")
-        column = within - row * self.width[slot]
-        return PixelIndex(view=self.views[slot], x=column + self.left[slot], y=row + self.top[slot])
+        within = number - (self.ends[slot] - self.columns[slot] * self.rows[slot])
+        row = torch.div(within, self.columns[slot], rounding_mode="floor")
+        column = within - row * self.columns[slot]
+        view, left, top = self.views[slot], self.left[slot], self.top[slot]
+        if self.patch == 1:
+            return PixelIndex(view=view, x=column + left, y=row + top)
+        x, y = (
+            (self.patch * place - shift).clamp(min=0).minimum(size[slot] - self.patch) + start
+            for place, size, start in ((column, self.width, left), (row, self.height, top))
+        )
+        inside = torch.arange(self.patch, device=x.device)
+        down, across = (part.flatten() for part in torch.meshgrid(inside, inside, indexing="ij"))
+        return PixelIndex(
+            view=view[..., None].expand(*view.shape, len(down)).flatten(),
+            x=(x[..., None] + across).flatten(),
+            y=(y[..., None] + down).flatten(),
+        )
 
 
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
@@ -93,10 +124,11 @@ class RayBatches:
         progress: shared with the system, which advances it after each step.
         seed: the run's seed.
         batch_rays: rays per step.
+        patch: side in pixels of the squares that rays come in; a batch is made of whole ones.
     """
 
-    def __init__(self, scene: Scene, progress: Progress, seed: int, batch_rays: int):
-        self.progress, self.seed, self.batch_rays = progress, seed, batch_rays
+    def __init__(self, scene: Scene, progress: Progress, seed: int, batch_rays: int, patch: int = 1):
+        self.progress, self.seed, self.batch_rays, self.patch = progress, seed, batch_rays, patch
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device that a background thread makes batches for; None: there is no such thread.
@@ -107,8 +139,8 @@ class RayBatches:
     def take_from(self, scene: Scene) -> None:
         """Make batches from this copy of the scene, where its pixels lie: in memory, a mapped file, or on a device."""
         self.scene = scene
-        self.whole = PixelDomain(scene, scene.splits["train"])
-        self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction)
+        self.whole = PixelDomain(scene, scene.splits["train"], patch=self.patch)
+        self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction, self.patch)
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
         """See only the pictures' centres at first; without this, runs on white backgrounds may never start learning.
@@ -121,7 +153,7 @@ class RayBatches:
             restart_steps: its least length in later attempts.
         """
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = fraction, steps, max(steps, restart_steps)
-        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction)
+        self.crop = PixelDomain(self.scene, self.scene.splits["train"], fraction, self.patch)
 
     def crop_rays(self, restarts: int) -> int:
         """Return how many rays a run takes from the crop after so many restarts."""
@@ -130,7 +162,7 @@ class RayBatches:
     @property
     def epoch_steps(self) -> int:
         """Steps that show as many rays as there are."""
-        return -(-len(self.whole) // self.batch_rays)
+        return -(-self.whole.num_rays // self.batch_rays)
 
     def __len__(self) -> int:
         # The batches have no end, but to a trainer an epoch has one: without it a batch would be fetched ahead.
@@ -161,11 +193,16 @@ class RayBatches:
         else:
             domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
         count = self.progress.batch_rays if batch_rays is None else batch_rays
+        together = self.patch**2
+        count, position = count // together, position // together
         place = position + torch.arange(count)[ranks.share(count)]
         epochs, epoch = torch.unique_consecutive(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
         numbers = permute(place % len(domain), len(domain), keys if len(keys) == 1 else keys[epoch])
-        return domain.locate(sent(numbers, domain.ends.device))
+        # Each epoch has its own grid of squares, so that no pixel always lies at a border.
+        shift = (keys % self.patch)[epoch]
+        device = domain.ends.device
+        return domain.locate(sent(numbers, device), sent(shift, device) if together > 1 else 0)
 
 
 class FixedRays:
@@ -193,7 +230,8 @@ class FixedRays:
         if scene.pixels.mask is not None and not any(bool(batch.weight.any()) for batch in self):
             raise InputError(
                 f"The masks of {scene.name} leave out all {count} pixels that validation looks at. "
-                "Raise data.val_rays, or check the masks of the validation views (white is kept)."
+                "Raise data.val_rays, or check the masks of the validation views (scene.masks_keep says which colour "
+                "counts)."
             )
 
     def __len__(self) -> int:

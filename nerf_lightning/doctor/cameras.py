@@ -36,6 +36,8 @@ def rigid(evidence: Evidence) -> Check:
 def common_middle(evidence: Evidence) -> Check:
     """Judge whether the cameras look at, or away from, the place where their axes meet."""
     c2w, name = evidence.scene.cameras.c2w.double(), "common middle"
+    if evidence.scene.cameras.lens_model == "equirectangular":
+        return Check(name, "ok", "not judged: panoramas look everywhere")
     if evidence.scene.space == "ndc" or bool((c2w[:, :, 2].mean(dim=0).norm() > 0.95).item()):
         return Check(name, "ok", "the cameras all look the same way")
     to_middle = focus_point(c2w) - c2w[:, :, 3]
@@ -71,6 +73,8 @@ def upright(evidence: Evidence) -> Check:
 def field_of_view(evidence: Evidence) -> Check:
     """Judge the focal lengths by the field of view, and by how much they vary."""
     cameras, name = evidence.scene.cameras, "field of view"
+    if cameras.lens_model == "equirectangular":
+        return Check(name, "ok", "panoramas: all directions")
     side = torch.maximum(cameras.width, cameras.height)
     degrees = (2 * (0.5 * side / cameras.focal.mean(dim=-1)).atan()).rad2deg()
     low, high = float(degrees.min()), float(degrees.max())

@@ -17,6 +17,9 @@ FEW_CORNERS = 64
 # Each view is compared with so many others.
 PARTNERS = 6
 ALIKE = 0.8
+# Of a panorama only what lies ahead of its camera (within 60 degrees) is compared: to the sides, places in a plane run
+# off to infinity. Elsewhere they are held back only where they would.
+AHEAD, HARDLY_AHEAD = 0.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,9 @@ def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> 
     def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         both = [views[place] for place in pairs[number]]
         found = match(*(corners[view] for view in both))
+        if cameras.lens_model == "equirectangular":
+            sides = enumerate(both)
+            found = found[torch.stack([_ahead(cameras, v, corners[v].at[found[:, side]]) for side, v in sides]).all(0)]
         plane = [_plane(cameras, view, corners[view].at[found[:, side]]) for side, view in enumerate(both)]
         rgb = [corners[view].rgb[found[:, side]] for side, view in enumerate(both)]
         focal = cameras.focal[both].mean(dim=-1).expand(len(found), 2)
@@ -82,9 +88,14 @@ def likely_pairs(corners: Sequence[Corners]) -> list[tuple[int, int]]:
     return sorted({(min(a, b), max(a, b)) for a in range(count) for b in ranked[a] if shared[a, b] > 0})
 
 
+def _ahead(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Bool[Tensor, "places"]:
+    plane = (at - cameras.center[view]) / cameras.focal[view]
+    return unproject(plane, cameras.lens[view], cameras.lens_model)[..., 2] > AHEAD
+
+
 def _plane(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Float[Tensor, "places 2"]:
     plane = (at - cameras.center[view]) / cameras.focal[view]
     if cameras.lens_model == "pinhole":
         return plane
     local = unproject(plane, cameras.lens[view], cameras.lens_model)
-    return local[..., :2] / local[..., 2:].clamp(min=0.05)
+    return local[..., :2] / local[..., 2:].clamp(min=HARDLY_AHEAD)

@@ -1,6 +1,7 @@
 """The cameras, in the user's frame, as other programs read them: `transforms.json`, and a COLMAP model in text."""
 
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
     "radial_tangential": "OPENCV",
     "fisheye": "OPENCV_FISHEYE",
+    "equirectangular": "EQUIRECTANGULAR",
 }
+WITHOUT_COEFFICIENTS = ("pinhole", "equirectangular")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 log = logging.getLogger(__name__)
@@ -72,7 +75,10 @@ def in_user_frame(record: SceneRecord) -> Cameras:
 
 def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
     (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
-    bent = {} if cameras.lens_model == "pinhole" else dict(zip(COEFFICIENTS, cameras.lens[view].tolist(), strict=True))
+    if cameras.lens_model == "equirectangular":
+        fx, fy = math.pi * fx, math.pi * fy  # nerfstudio counts pixels per half turn
+    plain = cameras.lens_model in WITHOUT_COEFFICIENTS
+    bent = {} if plain else dict(zip(COEFFICIENTS, cameras.lens[view].tolist(), strict=True))
     return {
         "file_path": name,
         "w": int(cameras.width[view]),
@@ -96,6 +102,8 @@ MODELS = {
 
 def beyond_colmap(cameras: Cameras) -> str | None:
     """Return why COLMAP has no model for a lens, or None where it has."""
+    if cameras.lens_model == "equirectangular":
+        return "COLMAP has no model for panoramas."
     if cameras.lens_model == "radial_tangential" and bool(cameras.lens[:, 2:4].any()):
         return "The lens has the coefficients k3 or k4, which COLMAP's model OPENCV lacks."
     return None

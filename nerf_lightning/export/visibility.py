@@ -112,7 +112,8 @@ def _sees(points: Tensor, cameras: Cameras, view: int, depth: Tensor, tolerance:
     distance = local.norm(dim=-1)
     place = project(cameras, view, points)
     height, width = depth.shape
-    ahead = (local[:, 2] < 0) & (place >= 0).all(dim=-1) & (place[:, 0] < width) & (place[:, 1] < height)
+    ahead = (local[:, 2] < 0) | (cameras.lens_model == "equirectangular")
+    ahead &= (place >= 0).all(dim=-1) & (place[:, 0] < width) & (place[:, 1] < height)
     x, y = torch.where(ahead[:, None], place, 0.0).long().unbind(dim=-1)
     return ahead & ((depth[y, x] - distance).abs() <= tolerance * distance)
 

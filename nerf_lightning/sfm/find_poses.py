@@ -9,16 +9,20 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from nerf_lightning.console import StageProgress
+from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.sfm.image_pairs import chosen_matching
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
-from nerf_lightning.sfm.reconstruction import SparseModel, reconstruct
+from nerf_lightning.sfm.reconstruction import NothingFoundError, SparseModel, reconstruct
 from nerf_lightning.sfm.settings import SfmSettings, stage_costs
-from nerf_lightning.sfm.video_frames import count_frames, frame_stride, write_sharp_frames
+from nerf_lightning.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 
 READING, FRAMES = "reading photographs", "choosing frames"
 READING_COST, FRAME_COST = 0.1, 0.02
+# So many are looked at to say why a video failed.
+FRAMES_JUDGED = 20
 UNFINISHED = ".poses.part"
 
 
@@ -128,10 +132,28 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
         with StageProgress({FRAMES: FRAME_COST * num_frames}) as report:
             write_sharp_frames(video, images, stride, lambda count: report(FRAMES, count / num_frames))
         photographs = _frames(video, images, stride, num_frames)
-        with StageProgress(stage_costs(photographs, settings)) as report:
-            model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+        try:
+            with StageProgress(stage_costs(photographs, settings)) as report:
+                model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+        except NothingFoundError as error:
+            raise InputError(_nothing_in_video(video, photographs)) from error
         _publish(work, folder)
     return model, chosen_matching(settings.matching, len(photographs))
+
+
+def _nothing_in_video(video: Path, frames: list[FoundPhotograph]) -> str:
+    some = evenly_spaced_subset(range(len(frames)), FRAMES_JUDGED)
+    blurred = sum(is_blurred(read_rgba(frames[number].path)[..., :3]) for number in some)
+    if 2 * blurred > len(some):
+        cause = "nearly all of them are blurred, although they are the sharpest that there are"
+        cure = "Film again in more light, in focus, holding still or moving slowly"
+    else:
+        cause = "they share too few details"
+        cure = "Film again: walk slowly around what matters rather than turning on the spot"
+    return (
+        f"video={video}: no camera could be placed for the {len(frames)} frames that were chosen; {cause}. {cure}, "
+        "with one zoom. A smaller every= takes more frames of this video, num_features=8192 finds more details in them."
+    )
 
 
 def _frames(video: Path, images: Path, stride: int, num_frames: int) -> list[FoundPhotograph]:

@@ -9,11 +9,22 @@ from pathlib import Path
 from PIL import ExifTags, Image, ImageOps
 
 from nerf_lightning.budgets import require_within
-from nerf_lightning.data.pixels.images import DECODER_ERRORS, FORMATS, ORIENTATION, image_size, open_picture, read_rgba
+from nerf_lightning.data.pixels.images import (
+    DECODER_ERRORS,
+    FORMATS,
+    HEIC_CURE,
+    ORIENTATION,
+    image_size,
+    open_picture,
+    read_rgba,
+)
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed, require_printable
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+PANORAMA = b"equirectangular"
+"""In XMP (Google's GPano:ProjectionType), which panorama cameras write."""
 FEWEST = 3
 SMALLEST_SIDE = 64
 JPEG_QUALITY = 95
@@ -30,6 +41,8 @@ class FoundPhotograph:
     height: int
     upright: bool
     """Whether the pixels are stored as they are shown, not turned by an EXIF tag."""
+    is_panorama: bool
+    """Whether it says that it shows all directions."""
     lens: tuple[str, ...]
     """What EXIF says of camera, focal length and zoom; empty words where it says nothing."""
 
@@ -58,6 +71,7 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             "Give the folder in which the photographs lie."
         ) from error
     pictures = pictures_among(files)
+    _require_no_heic(folder, pictures, files)
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
     require_within("views", len(pictures), f"images={folder}", "photographs")
@@ -67,7 +81,9 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             f"images={folder}: {listed((path.name for path in outside), 4)} are symbolic links out of this folder. If "
             "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
         )
-    return [_photograph(path) for path in pictures]
+    photographs = [_photograph(path) for path in pictures]
+    _require_no_panoramas(folder, photographs)
+    return photographs
 
 
 def visible_files(folder: Path) -> list[Path]:
@@ -129,13 +145,33 @@ def _photograph(path: Path) -> FoundPhotograph:
             f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
             f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
-    turned, lens = _exif(path)
+    turned, is_panorama, lens = _said_of(path)
     # Orientations 5 to 8 are quarter turns.
-    return FoundPhotograph(path, *((height, width) if turned in (5, 6, 7, 8) else (width, height)), turned == 1, lens)
+    size = (height, width) if turned in (5, 6, 7, 8) else (width, height)
+    return FoundPhotograph(path, *size, turned == 1, is_panorama, lens)
 
 
-def _exif(path: Path) -> tuple[object, tuple[str, ...]]:
-    """Return how a photograph is turned, and what tells its lens apart from others."""
+def _require_no_heic(folder: Path, pictures: list[Path], files: list[Path]) -> None:
+    # Beside its JPEG of the same name it is the original of it.
+    known = {path.stem.lower() for path in pictures}
+    left = [path.name for path in files if path.suffix.lower() in HEIC_SUFFIXES and path.stem.lower() not in known]
+    if left:
+        raise InputError(f"images={folder} holds {listed(left, 4)}. {HEIC_CURE}")
+
+
+def _require_no_panoramas(folder: Path, photographs: list[FoundPhotograph]) -> None:
+    found = [photograph.path.name for photograph in photographs if photograph.is_panorama]
+    if found:
+        mixed = " among other photographs" if len(found) < len(photographs) else ""
+        raise InputError(
+            f"images={folder} holds panoramas of all directions{mixed} ({listed(found, 4)}), and cameras are found of "
+            "plain photographs only. Move them away, or find their cameras with a program for panoramas that writes a "
+            "transforms.json with camera_model EQUIRECTANGULAR, which scene=transforms reads."
+        )
+
+
+def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...]]:
+    """Return how a photograph is turned, whether it is a panorama, and what tells its lens apart from others."""
     with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
@@ -144,8 +180,10 @@ def _exif(path: Path) -> tuple[object, tuple[str, ...]]:
             details = exif.get_ifd(ExifTags.IFD.Exif)
         except DECODER_ERRORS:
             exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
+        xmp = image.info.get("xmp", b"")
+        is_panorama = PANORAMA in (xmp if isinstance(xmp, bytes) else str(xmp).encode())
     lens = (exif.get(ExifTags.Base.Model, ""), *(details.get(tag, "") for tag in LENS_TAGS))
-    return exif.get(ORIENTATION, 1), tuple(str(value)[:LONGEST_TAG] for value in lens)
+    return exif.get(ORIENTATION, 1), is_panorama, tuple(str(value)[:LONGEST_TAG] for value in lens)
 
 
 def _write_turned(path: Path, target: Path) -> None:
@@ -171,7 +209,7 @@ def _too_few(folder: Path, pictures: list[Path], files: list[Path]) -> str:
     if files:
         endings = listed(sorted({path.suffix for path in files}), cap=6)
         others = f"only other files ({endings})"
-        cure = " Convert HEIC or raw photographs to JPEG first; a film is given with video=FILE."
+        cure = " Convert raw photographs to JPEG first; a film is given with video=FILE."
     else:
         others, cure = "nothing", ""
     folders = f" It has folders of its own ({listed(inside, cap=4)}): was one of them meant?" if inside else ""

@@ -21,6 +21,11 @@ from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode,
 
 Report = Callable[[str, float], None]
 
+
+class NothingFoundError(InputError):
+    """Photographs none of whose cameras could be placed."""
+
+
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
 FEWEST_REGISTERED = 3
 
@@ -75,7 +80,8 @@ def reconstruct(
         report: called with a stage of `stage_costs` and how much of it is done, 0 to 1.
 
     Raises:
-        InputError: no pycolmap, photographs of several sizes for one camera, or nothing can be reconstructed.
+        InputError: no pycolmap, or photographs of several sizes for one camera.
+        NothingFoundError: nothing can be reconstructed.
     """
     colmap = require_pycolmap()
     names = [photograph.path.name for photograph in photographs]
@@ -87,7 +93,7 @@ def reconstruct(
         _match(colmap, database, names, work / "pairs.txt", settings, report)
         models = _models(colmap, database, folder, work / "models", settings, report)
         if not models:
-            raise InputError(_nothing_found(len(names)))
+            raise NothingFoundError(_nothing_found(len(names)))
         sparse.mkdir(parents=True)
         models[0].write_binary(sparse)
     return _in_short(models, names)

@@ -6,7 +6,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import explained, open_regular
@@ -14,6 +14,9 @@ from nerf_lightning.files.regular import explained, open_regular
 FRAMES_WANTED = 100
 SHARPNESS_SIDE = 480
 JPEG_QUALITY = 95
+# Of its fine details, what a blurred frame keeps when it is blurred again. Sharp photographs keep a tenth, and nine
+# tenths once they are blurred by two pixels.
+BLURRED = 0.7
 # Nothing but the file itself is opened.
 INPUT = ["-protocol_whitelist", "file"]
 
@@ -28,7 +31,24 @@ def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
     >>> sharpness(np.full((20, 20, 3), 128, dtype=np.uint8))
     0.0
     """
-    grey = Image.fromarray(frame).convert("L").reduce(max(1, max(frame.shape[:2]) // SHARPNESS_SIDE))
+    return _roughness(_small_grey(frame))
+
+
+def is_blurred(frame: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Tell whether a frame has no details as fine as its pixels could show, in a small grey version.
+
+    What is sharp loses most of its fine details in a blur of one pixel; what was blurred before has none to lose
+    (after Crete et al., "The blur effect", 2007). A blank frame counts as blurred.
+    """
+    grey = _small_grey(frame)
+    return _roughness(grey.filter(ImageFilter.GaussianBlur(1.0))) >= BLURRED * _roughness(grey)
+
+
+def _small_grey(frame: UInt8[np.ndarray, "height width 3"]) -> Image.Image:
+    return Image.fromarray(frame).convert("L").reduce(max(1, max(frame.shape[:2]) // SHARPNESS_SIDE))
+
+
+def _roughness(grey: Image.Image) -> float:
     g = np.asarray(grey, dtype=np.float32)
     laplacian = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:] - 4 * g[1:-1, 1:-1]
     return float(laplacian.var())

@@ -125,7 +125,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     config, choices = settled(config, choices, overrides, scene)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     run = _run(config, choices, settings, scene)
-    num_rays, data = len(run.data.batches.whole), config.data
+    num_rays, data = run.data.batches.whole.num_rays, config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
     signals = StopSignals()
     callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
@@ -155,7 +155,7 @@ def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettin
         start = read_checkpoint(required_path("init_from", config.init_from))
     step = build_step(config, settings, scene, progress, start)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
     return Run(settings, scene, data, RadianceFieldSystem(step, record))
 
 

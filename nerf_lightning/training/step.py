@@ -122,6 +122,12 @@ class TrainStep:
                 part.reset_parameters()
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
+        self.loss.forget()
+
+    @property
+    def rays_together(self) -> int:
+        """How many rays in a row of a batch no tile and no process may part: the pixels of a square."""
+        return self.loss.patch**2
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -137,6 +143,7 @@ class TrainStep:
         """Move all that is computed with to a device."""
         for part in self.parts.values():
             part.to(device)
+        self.loss.to(device)
         return self
 
     def restart(self, optimizer: Optimizer) -> None:
@@ -198,7 +205,8 @@ class TrainStep:
             self.rays.follow(progress.step / self.num_steps)
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         num_rays = progress.batch_rays
-        share = Share(ranks.share(num_rays).start, num_rays, ranks.total(batch.weight.sum()))
+        first = ranks.share(num_rays // self.rays_together).start * self.rays_together
+        share = Share(first, num_rays, ranks.total(batch.weight.sum()))
         seen = self.gradients(batch, backward, share)
         ranks.add_up([seen["losses"]])
         ranks.add_up_gradients(self._parameters())
@@ -206,12 +214,16 @@ class TrainStep:
         if self.guard.allows(seen["losses"], self._named_parameters()):
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
+            self.loss.learn(seen["rgb"], seen["target"], seen["weight"])
+            ranks.average(self.loss.measurements())
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
             ranks.average(self.model.measurements())
             if self.sample_budget is not None:
                 points = self.model.points_per_ray(training=True)
-                progress.batch_rays = batch_size(progress.largest_batch, self.sample_budget / points)
+                progress.batch_rays = batch_size(
+                    progress.largest_batch, self.sample_budget / points, self.rays_together
+                )
         return seen | {"pixels": batch.pixels, "gradient_norms": norms}
 
     def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> dict[str, Tensor]:
@@ -224,7 +236,7 @@ class TrainStep:
 
         Returns:
             `losses` per level, detached, which add up over all shares to the batch's; and of each ray its `foreground`
-            light, its `target` colour and its `weight`.
+            light, its last level's `rgb`, its `target` colour and its `weight`.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
         counts = [count.clone() for count in self.model.counts()]
@@ -294,17 +306,18 @@ class TrainStep:
             renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
             shown = [replace(each, rgb=self.correction(each.rgb, pixels)) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile])))
-            return TileLoss(levels * ((tile.stop - tile.start) / share.num_rays), renderings[-1].foreground)
+            levels = levels * ((tile.stop - tile.start) / share.num_rays)
+            return TileLoss(levels, renderings[-1].foreground, shown[-1].rgb)
 
-        tile_rays = self._tile_rays(num_rays, training=True)
+        tile_rays, together = self._tile_rays(num_rays, training=True), self.rays_together
         threads = torch.get_num_threads() if device.type == "cpu" and self.tile_points is not None else 1
         if threads > 1:
-            parts = list(tiles(num_rays, tile_rays, multiple=threads))
+            parts = list(tiles(num_rays, tile_rays, together, multiple=threads))
             lost = side_by_side(lose, parts, backward, self._parameters())
         else:
-            lost = in_turn(lose, list(tiles(num_rays, tile_rays)), backward)
-        foreground = torch.cat([each.foreground for each in lost])
-        seen = {"foreground": foreground, "target": target.rgb, "weight": batch.weight}
+            lost = in_turn(lose, list(tiles(num_rays, tile_rays, together)), backward)
+        seen = {name: torch.cat([getattr(each, name) for each in lost]) for name in ("foreground", "rgb")}
+        seen |= {"target": target.rgb, "weight": batch.weight}
         return {"losses": torch.stack([each.levels for each in lost]).sum(0)} | seen
 
     @torch.no_grad()
@@ -313,7 +326,7 @@ class TrainStep:
         return None if background is None else self.correction(background, pixels)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
-        if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) == 1:
+        if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:
             raise InputError(
                 f"There is no memory for a training step: {error}. Use fewer rays (data.batch_rays), a smaller model, "
                 "or tiles (trainer.tile_points=auto)."

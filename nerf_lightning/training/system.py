@@ -40,7 +40,7 @@ class RadianceFieldSystem(LightningModule):
         self.automatic_optimization = False
         self.step, self.record = step, record
         # Modules of the step are this module's, so that they move to the trainer's device and are saved.
-        self.model, self.rays, self.correction = step.model, step.rays, step.correction
+        self.model, self.rays, self.correction, self.loss = step.model, step.rays, step.correction, step.loss
         self.val_errors = RayErrors()
 
     @classmethod
@@ -122,7 +122,9 @@ class RadianceFieldSystem(LightningModule):
         """
         require_ours(checkpoint, Path(self.trainer.ckpt_path or LAST), resumable=True)
         trainer, step, state = self.trainer, self.step, checkpoint[KEY]
-        require_resumable(checkpoint, step.parts, step.build_optimizer, step.progress, self.configure_optimizers())
+        require_resumable(
+            checkpoint, self.state_dict(), step.build_optimizer, step.progress, self.configure_optimizers()
+        )
         require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
         loops = {key: getattr(trainer, key).state_dict() for key in LOOPS}
         require_loops(checkpoint["loops"], loops, checkpoint["global_step"], skipped=state["bad_steps"][0])

@@ -25,10 +25,13 @@ class TileLoss:
 
     levels: Float[Tensor, "levels"]
     foreground: Float[Tensor, "rays 3"]
+    """The light of its rays without the background's."""
+    rgb: Float[Tensor, "rays 3"]
+    """What was compared with the photographs."""
 
     def detached(self) -> "TileLoss":
         """Return the same without what the backward pass needs."""
-        return TileLoss(self.levels.detach(), self.foreground.detach())
+        return TileLoss(self.levels.detach(), self.foreground.detach(), self.rgb.detach())
 
 
 def in_turn(lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward) -> list[TileLoss]:

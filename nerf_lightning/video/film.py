@@ -45,7 +45,9 @@ def film(
     """
     settings = FilmSettings() if settings is None else settings
     _check(subjects, settings)
-    shots = make_shots(subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera)
+    shots = make_shots(
+        subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
+    )
     require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
     frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form)

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
 Form = Literal["video", "frames"]
+Projection = Literal["perspective", "equirectangular"]
 Corner = tuple[float, float, float]
 SWITCHES = ("mosaic", "hold_camera")
 
@@ -29,6 +30,8 @@ class FilmSettings:
     """Lower and upper corner of a box, outside of which nothing is shown."""
     hold_camera: bool = False
     """Stay at the first camera, and let only the direction from which colour is looked up move."""
+    projection: Projection = "perspective"
+    """Equirectangular: each frame is a panorama of all directions, whose middle is where the camera looks."""
     precision: str | None = None
     """What the models compute in, as the caller has seen to; frames of another precision belong to another film."""
 
@@ -47,6 +50,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
     if config["format"] not in ("video", "frames"):
         raise InputError(f"format={config['format']}: choose video (mp4) or frames (PNG files).")
+    require_one_of(get_args(Projection), projection=config["projection"])
     return FilmSettings(
         outputs=outputs,
         mosaic=config["mosaic"],
@@ -54,6 +58,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         near=_near(config["near"]),
         crop=_crop(config["crop"]),
         hold_camera=config["hold_camera"],
+        projection=config["projection"],
     )
 
 

@@ -13,6 +13,7 @@ from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.near_far import near_and_far_from
+from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
@@ -20,7 +21,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, frame_of
-from nerf_lightning.video.settings import Corner
+from nerf_lightning.video.settings import Corner, Projection
 
 # The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 8, 64
@@ -95,6 +96,7 @@ def make_shots(
     near: float | None = None,
     crop: tuple[Corner, Corner] | None = None,
     hold_camera: bool = False,
+    projection: Projection = "perspective",
 ) -> list[Shot]:
     """Return the shot of each model; the path is that of the first one's capture.
 
@@ -105,12 +107,16 @@ def make_shots(
         near: where rays begin, in the user's units; None: where the photographs' do.
         crop: lower and upper corner of a box in the user's frame, outside of which nothing is shown.
         hold_camera: stay at the first camera, and let only the direction from which colour is looked up move.
+        projection: of the pictures.
 
     Raises:
-        InputError: a camera stands inside of the box, or the path cannot be laid around this capture.
+        InputError: a camera stands inside of the box, the path cannot be laid around this capture, or panoramas cannot
+            be made of it.
     """
     first = subjects[0].scene
     cameras = lay_path(path, first)
+    if projection == "equirectangular":
+        cameras = _panoramas(cameras, path, first)
     shots = []
     for subject in subjects:
         scene = subject.scene
@@ -169,6 +175,24 @@ def in_front_of_near_plane(cameras: Cameras) -> Bool[Tensor, "views"]:
     zeros = torch.zeros(len(cameras.c2w))
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return (cameras.c2w[:, 2, 3] > -1.0) & (rays.directions[..., 2] < -LEAST_FORWARD).all(dim=-1)
+
+
+def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Cameras:
+    """Return cameras at the same places whose pictures are panoramas, twice as wide as high if the user lets them."""
+    if scene.cameras.ndc is not None:
+        raise InputError(
+            f"projection=equirectangular looks to all sides, and {scene.name} was learnt in normalised device "
+            "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted for "
+            "panoramas, or render without projection."
+        )
+    if path.fov is not None:
+        raise InputError(f"path.fov={path.fov:g} with projection=equirectangular: panoramas show all directions.")
+    width, height = int(cameras.width[0]), int(cameras.height[0])
+    if path.height is None:
+        height = max(1, round(width / 2))
+    elif path.width is None:
+        width = 2 * height
+    return panorama_cameras(cameras.c2w, width, height)
 
 
 def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Cameras:

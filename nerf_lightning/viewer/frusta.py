@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.viewer.client import ViewerClient
 
@@ -66,7 +67,7 @@ class Frusta:
         photographs = self.session.photographs
         cameras = photographs.record.cameras
         width, height = int(cameras.width[view]), int(cameras.height[view])
-        fov = 2 * float(torch.atan(0.5 * height / cameras.focal[view, 1]))
+        fov = vertical_field_of_view(cameras, view)
         thumbnail = photographs.thumbnail(view)
         image = None if thumbnail is None else thumbnail.numpy()
         handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)

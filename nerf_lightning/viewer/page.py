@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import torch
-
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
@@ -116,7 +115,7 @@ class Page:
         farther = START if record.space == "bounded" else 1.0
         start.position = tuple((center + farther * (first - center)).tolist())
         start.look_at = tuple(center.tolist())
-        start.fov = 2 * float(torch.atan(0.5 * record.cameras.height[0] / record.cameras.focal[0, 1]))
+        start.fov = vertical_field_of_view(record.cameras, 0)
         start.near, start.far = 0.01 * self.around.radius, 100 * self.around.radius
 
     def _welcome(self, client: Any) -> None:

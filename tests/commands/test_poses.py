@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 from support.alignment import colmap_poses, pose_errors
 from support.captures import real_capture
-from support.corner import write_corner
+from support.corner import corner_poses, photograph, write_corner
 
 pytest.importorskip("pycolmap")
 # imageio's reader of videos forgets its pipes.
@@ -83,7 +83,9 @@ def test_folders_without_enough_photographs_are_named(poses, tmp_path):
     refused(poses(f"images={folder}"), tmp_path, f"images={folder} holds no PNG, JPEG or TIFF, nothing.")
     (folder / "photos").mkdir()
     (folder / "a.HEIC").touch()
-    refused(poses(f"images={folder}"), tmp_path, "only other files (.HEIC)", "own (photos)", "Convert HEIC")
+    refused(poses(f"images={folder}"), tmp_path, "holds a.HEIC. HEIC, as phones save it", "Convert all of them to JPEG")
+    (folder / "a.HEIC").rename(folder / "a.cr2")
+    refused(poses(f"images={folder}"), tmp_path, "only other files (.cr2)", "own (photos)", "Convert raw")
     Image.new("RGB", (80, 80)).save(folder / "a.png")
     refused(poses(f"images={folder}"), tmp_path, "holds only a.png. At least 3 photographs")
 
@@ -97,6 +99,76 @@ def test_pictures_that_cannot_be_used_are_named(poses, photographs, tmp_path):
     odd.unlink()
     odd.symlink_to(odd)
     refused(poses(f"images={photographs}"), tmp_path, "odd.png cannot be read", "Too many levels of symbolic links")
+
+
+def test_heic_among_other_photographs_is_named_and_beside_its_own_jpeg_it_is_passed_over(poses, photographs, tmp_path):
+    (photographs / "0.heic").touch()
+    (photographs / "IMG_1.HEIC").touch()
+    refused(poses(f"images={photographs}"), tmp_path, "holds IMG_1.HEIC. HEIC", "magick mogrify -format jpg")
+    (photographs / "IMG_1.HEIC").unlink()
+    refused(poses(f"images={photographs}"), tmp_path, "No camera could be placed")
+
+
+def test_panoramas_are_named(poses, photographs, tmp_path):
+    said = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    Image.new("RGB", (128, 64)).save(photographs / "around.jpg", xmp=said)
+    result = poses(f"images={photographs}")
+    refused(result, tmp_path, "holds panoramas", "among other photographs (around.jpg)", "camera_model EQUIRECTANGULAR")
+
+
+@pytest.mark.parametrize(("blur", "said"), [(6, "are blurred, although they are the sharpest"), (0, "share too few")])
+def test_a_film_that_nothing_can_be_made_of_says_why(poses, tmp_path, blur, said):
+    imageio = pytest.importorskip("imageio.v3")
+    frames = []
+    for number in range(4):  # nothing is seen twice
+        pixels = np.random.default_rng(number).integers(0, 255, (96, 96, 3), dtype=np.uint8)
+        frame = Image.fromarray(pixels).resize((192, 192), Image.Resampling.NEAREST)
+        frames.append(np.asarray(frame.filter(ImageFilter.GaussianBlur(blur))))
+    imageio.imwrite(tmp_path / "film.mp4", np.stack(frames), plugin="FFMPEG", fps=10, quality=9)
+    result = poses(f"video={tmp_path / 'film.mp4'}", "every=1")
+    refused(result, tmp_path, "no camera could be placed for the 4 frames", said, "Film again")
+
+
+@pytest.mark.slow
+def test_of_photographs_of_two_places_the_larger_part_is_taken_and_the_other_named(poses, tmp_path):
+    folder = tmp_path / "given"
+    write_corner(folder, count=5)
+    for number in range(4):  # another place, with other walls
+        picture = Image.fromarray(photograph(corner_poses(4)[number], first_wall=3))
+        picture.save(folder / f"elsewhere {number}.png")
+    result = poses(f"images={folder}", "num_features=600")
+    assert result.code == 0, result.err
+    assert "registered          5 of 9 photographs" in result.out
+    assert "elsewhere 3.png fit together and not to the rest: if they show another place, they belong in" in result.out
+    left = sorted(path.name for path in (tmp_path / "found" / "sparse").iterdir())
+    assert left == ["0"]
+
+
+@pytest.mark.slow
+def test_three_photographs_are_enough(poses, tmp_path):
+    write_corner(tmp_path / "given", count=6)
+    for number in (3, 4, 5):
+        (tmp_path / "given" / f"view {number}.png").unlink()
+    result = poses(f"images={tmp_path / 'given'}", "num_features=600")
+    assert result.code == 0, result.err
+    assert "registered          3 of 3 photographs" in result.out
+
+
+@pytest.mark.slow
+def test_photographs_that_were_turned_are_put_upright_and_found(poses, tmp_path):
+    write_corner(tmp_path / "given", count=4)
+    for number in (1, 2):
+        path = tmp_path / "given" / f"view {number}.png"
+        with Image.open(path) as upright:
+            turned = upright.transpose(Image.Transpose.ROTATE_90)
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        turned.save(path, exif=exif)
+    result = poses(f"images={tmp_path / 'given'}", "num_features=600")
+    assert result.code == 0, result.err
+    assert "registered          4 of 4 photographs (one camera" in result.out
+    with Image.open(tmp_path / "found" / "images" / "view 1.png") as written:
+        assert written.size == (320, 240)
 
 
 def test_photographs_of_several_sizes_are_no_single_camera(poses, photographs, tmp_path):

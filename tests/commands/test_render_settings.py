@@ -103,6 +103,8 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
         (["crop=[[0,0,0],[1,-1,1]]"], ["holds nothing", "smaller than"]),
         (["crop=[[-9,-9,-9],[9,9,9]]"], ["the camera of frame 0 stands inside the box (2 of 2 frames do)"]),
         (["crop=[[-1,-1,0],[1,1,1]]", "background=none"], ["crop: this model has no background", "background=white"]),
+        (["projection=round"], ["projection=round: choose one of perspective, equirectangular"]),
+        (["projection=equirectangular", "path.fov=60.0"], ["path.fov=60 with projection=equirectangular"]),
         (["labels=[a,b]"], ["labels=['a', 'b']", "one for each of the 1 checkpoints"]),
         (["path=photographs", "path.views=[nobody,0]"], ["path.views: the capture has no photograph nobody"]),
         (["path=keyframes"], ["path.file"]),
@@ -199,6 +201,20 @@ def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
         for number in range(6):
             place = f"{name}/frame_{number:04d}.png"
             assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
+
+
+def test_panoramas_show_what_their_faces_show(last, rendered):
+    """Ahead, the middle of a panorama is what a camera of 90 degrees sees."""
+    width = ("path.width=64", "outputs=[rgb]")
+    panorama = rendered(last, *width, "projection=equirectangular")["video"]
+    assert panorama.shape == (32, 64, 3)
+    face = rendered(last, *width, "path.height=64", "path.fov=90.0", name="face")["video"]
+    across, down = np.meshgrid(np.arange(24, 40), np.arange(8, 24))
+    azimuth, depression = 2 * np.pi * ((across + 0.5) / 64 - 0.5), np.pi * ((down + 0.5) / 32 - 0.5)
+    column, row = np.tan(azimuth), np.tan(depression) / np.cos(azimuth)
+    seen = (np.abs(column) < 1) & (np.abs(row) < 1)
+    column, row = ((32 * (1 + place[seen])).astype(int) for place in (column, row))
+    assert np.abs(face[row, column].astype(float) - panorama[down[seen], across[seen]]).mean() < 6
 
 
 def test_a_single_frame_is_a_film(last, rendered):

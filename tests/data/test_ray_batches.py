@@ -1,7 +1,10 @@
+import pytest
 import torch
 from support.scenes import ball_scene
 
+from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
 
@@ -111,8 +114,6 @@ def test_views_of_different_sizes_share_one_domain():
 def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog):
     from dataclasses import replace
 
-    from nerf_lightning.data.datamodule import RayDataModule
-
     scene = ball_scene(background="random")
     RayDataModule(scene, Progress(), seed=0)
     assert caplog.text == ""
@@ -122,3 +123,50 @@ def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog)
     RayDataModule(replace(scene, pixels=opaque), Progress(), seed=0)
     assert "pictures of ball have no transparent pixels" in caplog.text
     assert "scene.background=black" in caplog.text
+
+
+def squares(scene, patch=4, batch_rays=64):
+    return RayBatches(scene, Progress(), 0, batch_rays, patch=patch)
+
+
+def test_squares_are_whole_lie_in_one_view_and_an_epoch_shows_every_pixel():
+    scene = ball_scene()  # 3 views of 12 x 12 for training
+    loader = squares(scene, patch=5, batch_rays=75)
+    pixels = loader.pixels_at(0, 0)
+    for number in range(3):
+        view, x, y = (part[25 * number : 25 * (number + 1)].view(5, 5) for part in (pixels.view, pixels.x, pixels.y))
+        assert view.unique().numel() == 1
+        assert torch.equal(x - x[0, 0], torch.arange(5).expand(5, 5))
+        assert torch.equal(y - y[0, 0], torch.arange(5)[:, None].expand(5, 5))
+        assert 0 <= int(x[0, 0]) <= 7
+        assert 0 <= int(y[0, 0]) <= 7
+    for shift in range(5):
+        places = loader.whole.locate(torch.arange(len(loader.whole)), shift)
+        assert torch.equal(flat(scene, places).unique(), torch.arange(3 * 144))
+
+
+def test_squares_follow_from_the_place_alone_and_their_grid_moves_from_epoch_to_epoch():
+    scene = ball_scene()
+    loader = squares(scene)
+    everything = loader.pixels_at(0, 0, 640)
+    parts = [loader.pixels_at(0, 64 * step, 64) for step in range(10)]
+    for name in ("view", "x", "y"):
+        assert torch.equal(getattr(everything, name), torch.cat([getattr(part, name) for part in parts]))
+    corners = [set((loader.pixels_at(0, epoch * loader.whole.num_rays).x[::16] % 4).tolist()) for epoch in range(8)]
+    assert len(set(map(frozenset, corners))) > 1
+
+
+def test_the_crop_holds_whole_squares():
+    scene = ball_scene()
+    loader = squares(scene)
+    loader.crop_to(0.5, steps=3, restart_steps=3)
+    pixels = loader.pixels_at(0, 0)
+    assert int(pixels.x.min()) >= 3
+    assert int(pixels.x.max()) < 9
+
+
+def test_squares_that_fit_no_picture_or_no_batch_are_refused_with_a_cure():
+    with pytest.raises(InputError, match=r"loss\.patch=16 .* ball_0 of ball has 12 x 12"):
+        RayDataModule(ball_scene(), Progress(), 0, batch_rays=256, patch=16)
+    with pytest.raises(InputError, match=r"data\.batch_rays=100 is no multiple .* data\.batch_rays=96"):
+        RayDataModule(ball_scene(), Progress(), 0, batch_rays=100, patch=4)

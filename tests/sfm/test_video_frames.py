@@ -4,7 +4,7 @@ from PIL import Image, ImageFilter
 from support.corner import noise
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.sfm.video_frames import count_frames, frame_stride, sharpness, write_sharp_frames
+from nerf_lightning.sfm.video_frames import count_frames, frame_stride, is_blurred, sharpness, write_sharp_frames
 
 # imageio's reader of videos forgets its pipes.
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
@@ -48,6 +48,14 @@ def test_sharpness_falls_with_blur_and_scales_with_contrast_squared(size):
     values = [sharpness(frame) for frame in blurred]
     assert values == sorted(values, reverse=True)
     assert sharpness(blurred[0] // 2 * 2) == pytest.approx(4 * sharpness(blurred[0] // 2), rel=0.05)
+
+
+def test_frames_without_fine_details_are_blurred():
+    pixels = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    picture = Image.fromarray(pixels).resize((320, 240), Image.Resampling.NEAREST)
+    blurred = [is_blurred(np.asarray(picture.filter(ImageFilter.GaussianBlur(radius)))) for radius in (0, 3, 6)]
+    assert blurred == [False, True, True]
+    assert is_blurred(np.full((60, 80, 3), 90, np.uint8))
 
 
 def test_an_even_slope_has_contrast_but_is_not_sharp():

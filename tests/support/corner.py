@@ -29,8 +29,8 @@ def noise(side, seed):
     return (255 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
 
 
-def photograph(c2w):
-    """Return what a camera sees of the corner as (HEIGHT, WIDTH) grey levels."""
+def photograph(c2w, first_wall=0):
+    """Return what a camera sees of the corner as (HEIGHT, WIDTH) grey levels; other walls make another place."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     across, up = (columns - WIDTH / 2) / FOCAL, (HEIGHT / 2 - rows) / FOCAL
     directions = np.stack([across, up, -np.ones_like(up)], axis=-1) @ c2w[:, :3].T
@@ -40,7 +40,7 @@ def photograph(c2w):
         hit = c2w[:, 3] + distance[..., None] * directions
         row, column = np.moveaxis((hit[..., others] / WALL * TEXELS).clip(0, TEXELS - 1).astype(int), -1, 0)
         seen = (distance > 0) & (distance < nearest)
-        picture[seen] = noise(TEXELS, axis)[row, column][seen]
+        picture[seen] = noise(TEXELS, first_wall + axis)[row, column][seen]
         nearest[seen] = distance[seen]
     return picture
 

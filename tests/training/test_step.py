@@ -7,6 +7,8 @@ from support.steps import gradients, make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 
@@ -166,3 +168,44 @@ def test_fields_are_compiled_for_static_shapes_where_torch_can_see_into_them(mon
     model.levels["coarse"].field.compiles = False
     assert model.compile_fields() == ["fine"]
     assert compiled == [(model.levels["fine"].field, {"dynamic": False})]
+
+
+def robust_step(tile_points, patch=4):
+    step = make_step(tile_points)
+    step.loss = RobustLoss(MeanSquaredError(), patch=patch)
+    step.loss.threshold.fill_(0.05)  # leaves some out
+    return step
+
+
+@pytest.mark.parametrize("tile_points", [40, 300, 700])
+def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
+    scene, found = ball_scene(), []
+    for step in (robust_step(None), robust_step(tile_points)):
+        loader = RayBatches(scene, step.progress, 0, 64, patch=4)
+        seen = step(loader.at(0, 0), step.new_optimizer())
+        flat = torch.cat([p.grad.flatten() for p in step.model.parameters()])
+        found.append((flat, seen["losses"], step.loss.threshold))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
+    assert float(found[0][2]) != pytest.approx(0.05)
+    plain = make_step(None)
+    plain(RayBatches(scene, plain.progress, 0, 64, patch=4).at(0, 0), plain.new_optimizer())
+    assert not torch.allclose(found[0][0], torch.cat([p.grad.flatten() for p in plain.model.parameters()]))
+
+
+def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_a_restart_lets_it_forget():
+    step = robust_step(None)
+    loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 64, patch=4), step.new_optimizer()
+    with torch.no_grad():
+        step.model.levels["fine"].field.color_head.weight.fill_(float("nan"))
+    step(loader.at(0, 0), optimizer)
+    assert float(step.loss.threshold) == pytest.approx(0.05)
+    step.restart(optimizer)
+    assert float(step.loss.threshold) == 1.0
+
+
+def test_smaller_batches_hold_whole_squares():
+    step = make_step(None, sample_budget=8 * 40)
+    step.loss = RobustLoss(MeanSquaredError(), patch=4)
+    loader = RayBatches(ball_scene(), step.progress, 0, 64, patch=4)
+    step(loader.at(0, 0), step.new_optimizer())
+    assert step.progress.batch_rays == 16

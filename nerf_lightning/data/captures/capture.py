@@ -61,13 +61,17 @@ class Capture:
 
 
 def common_lens_model(kinds: set[LensModel]) -> LensModel | None:
-    """Return the model that holds all of these lenses, a scene having one; None where fisheyes are among others.
+    """Return the model that holds all of these lenses, a scene having one; None where none does.
+
+    A lens without distortion is one with coefficients of 0; fisheyes and panoramas stand alone.
 
     >>> common_lens_model({"pinhole", "radial_tangential"}), common_lens_model({"pinhole", "fisheye"})
     ('radial_tangential', None)
     """
-    if "fisheye" in kinds:
-        return "fisheye" if len(kinds) == 1 else None
+    if len(kinds) == 1:
+        return next(iter(kinds))
+    if kinds & {"fisheye", "equirectangular"}:
+        return None
     return "radial_tangential" if "radial_tangential" in kinds else "pinhole"
 
 

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.geometry.frames import (
     LARGEST_UNIT,
     LEAST_UNIT,
     average_pose,
-    focus_point,
+    middle_of_cameras,
     points_from_user,
     poses_from_user,
     similarity,
@@ -71,7 +71,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     _check_places(capture, cameras)
     if space == "ndc":
         return _forward_facing(capture, cameras, near, far)
-    focus = focus_point(cameras.c2w)
+    focus = middle_of_cameras(cameras)
     # The farthest camera stands at distance 1.
     unit = float((cameras.c2w[:, :, 3] - focus).norm(dim=-1).max())
     to_user = similarity(upright_rotation(up_direction(cameras.c2w)).mT, focus, unit)

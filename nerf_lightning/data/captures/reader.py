@@ -14,9 +14,9 @@ from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
-from nerf_lightning.data.pixels.images import ENDINGS, image_size
+from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.escaping import listed
 from nerf_lightning.files.links import is_there, require_inside
 from nerf_lightning.files.walk import walk
@@ -39,7 +39,8 @@ class CaptureReader(Reader):
         hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
         masks: a folder below root with a mask for each photograph, of the same name below it (or with .png added, or
-            with .png for its ending); white is kept. null: no masks, or those that the format names.
+            with .png for its ending). null: no masks, or those that the format names.
+        masks_keep: the colour of masks that counts, white or black; the other is left out.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content may begin, in the user's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
@@ -55,6 +56,7 @@ class CaptureReader(Reader):
     hold_every: int = 8
     frames: str | None = None
     masks: str | None = None
+    masks_keep: MaskColor = "white"
     space: Spaces = "auto"
     near: float | None = None
     far: float | None = None
@@ -83,9 +85,14 @@ class CaptureReader(Reader):
         capture = filtered(self.capture(), self.frames)
         check_capture(capture)
         splits = self._splits(capture)
+        if self.masks_keep == "black" and not any(view.photograph.mask for view in capture.views):
+            raise InputError(
+                f"scene.masks_keep=black, and no photograph of {capture.source} has a mask. Say where they are with "
+                "scene.masks=FOLDER, or leave masks_keep out."
+            )
         files = [image_size(view.photograph.path) for view in capture.views]
         pixels = read_photographs(
-            [view.photograph for view in capture.views],
+            [replace(view.photograph, mask_keeps=self.masks_keep) for view in capture.views],
             self.downscale,
             Path(self.cache_dir) if self.cache_dir else None,
             self.verify,
@@ -161,7 +168,7 @@ class CaptureReader(Reader):
                 return candidate
         raise InputError(
             f"scene.masks={self.masks} holds no mask for {name}: neither {listed(candidates)} exists. Add it "
-            "(all white keeps the whole photograph), or leave the view out with scene.frames."
+            f"(all {self.masks_keep} keeps the whole photograph), or leave the view out with scene.frames."
         )
 
     def _check_settings(self) -> None:
@@ -170,6 +177,7 @@ class CaptureReader(Reader):
             raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
         if self.space not in get_args(Spaces):
             raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
+        require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         near, far = self.near, self.far
         if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
             raise InputError(

@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 
 from nerf_lightning.data.captures.checks import check_step
 from nerf_lightning.data.pixels.images import (
+    MaskColor,
     area_downscale,
     crop_to_multiple,
     downscaled_size,
@@ -38,7 +39,8 @@ class Photograph:
 
     path: Path
     mask: Path | None = None
-    """A grey picture of the same size; brighter than 127 is kept."""
+    """A grey picture of the same size, white (brighter than 127) and black."""
+    mask_keeps: MaskColor = "white"
 
 
 def read_photographs(
@@ -85,6 +87,9 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
         for photograph in photographs
     ]
     settings = {"format": FORMAT, "downscale": downscale, "files": files}
+    kept = [photograph.mask_keeps for photograph in photographs]
+    if "black" in kept:
+        settings["masks_keep"] = kept
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -176,13 +181,15 @@ def _mask(
     width, height = size
     if photograph.mask is None:
         return np.ones((height, width), dtype=np.bool_)
-    kept = whole_blocks(read_mask(photograph.mask), downscale)
+    kept = whole_blocks(read_mask(photograph.mask, photograph.mask_keeps), downscale)
     _check_unchanged(kept.shape, size, photograph.mask)
     if not kept.any():
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""
+        white = photograph.mask_keeps == "white"
         raise InputError(
-            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is brighter than 127 of "
-            "255 is kept, so 0 and 1 are both black. Mend the mask, or leave this view out."
+            f"The mask {photograph.mask} leaves no pixel of {photograph.path}{shrunk}: what is "
+            f"{'brighter' if white else 'not brighter'} than 127 of 255 is kept, so 0 and 1 are both black. Mend the "
+            f"mask, leave this view out, or turn all masks round with scene.masks_keep={'black' if white else 'white'}."
         )
     return kept
 

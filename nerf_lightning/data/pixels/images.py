@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from io import BufferedReader
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -27,6 +28,7 @@ MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
+MaskColor = Literal["white", "black"]
 JPEG_BLOCK = 64
 """Pixels of a block."""
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
@@ -36,6 +38,11 @@ SOUND_SCANS, MOST_SCANS = 20, 100
 """Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
+HEIC_KINDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+HEIC_CURE = (
+    "HEIC, as phones save it, is not read here. Convert all of them to JPEG (`magick mogrify -format jpg *.heic`, or a "
+    "phone's own export as JPEG, its setting 'most compatible'), and give the folder of these."
+)
 CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
 DECODER_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error),
@@ -60,6 +67,16 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with _opened(path) as image:
         return image.size
+
+
+def is_heic(path: Path) -> bool:
+    """Tell whether a file begins as phones' HEIC photographs do, whatever its name."""
+    try:
+        with open_picture(path) as file:
+            start = file.read(12)
+    except (OSError, InputError):
+        return False
+    return start[4:8] == b"ftyp" and start[8:12] in HEIC_KINDS
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
@@ -88,8 +105,8 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
         return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
-def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels a grey picture keeps: those brighter than 127 of 255.
+def read_mask(path: Path, keep: MaskColor = "white") -> Bool[np.ndarray, "height width"]:
+    """Return which pixels a grey picture keeps: those brighter than 127 of 255 or, where black is kept, the others.
 
     Raises:
         InputError: what `read_rgba` refuses, and pictures with colour or transparency.
@@ -99,9 +116,9 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     if (rgba[..., 1] != grey).any() or (rgba[..., 2] != grey).any() or (rgba[..., 3] < 255).any():
         raise InputError(
             f"The mask {path} has colours or transparent pixels, so which pixels it keeps is not clear. Save it as a "
-            "grey picture without alpha: white is kept, black is left out."
+            f"grey picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
         )
-    return grey > KEEP_ABOVE
+    return grey > KEEP_ABOVE if keep == "white" else grey <= KEEP_ABOVE
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
@@ -265,6 +282,8 @@ def _unreadable(path: Path, error: Exception) -> str:
     """Say what is wrong with the file itself."""
     if path.is_file() and path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). {CURE}"
+    if is_heic(path):
+        return f"{path} is a photograph in the format HEIC. {HEIC_CURE}"
     if isinstance(error, UnidentifiedImageError):
         return f"{path} is not an image that can be read. {CURE}"
     return f"{path} cannot be read: {error}. It is damaged or was cut short. {CURE}"

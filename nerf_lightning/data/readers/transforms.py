@@ -15,7 +15,13 @@ from nerf_lightning.data.captures.checks import contents, pose_from_matrix
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
-from nerf_lightning.data.readers.transforms_intrinsics import focal_of, lens_of, number_of, size_of
+from nerf_lightning.data.readers.transforms_intrinsics import (
+    focal_of,
+    lens_of,
+    number_of,
+    panorama_focal_of,
+    size_of,
+)
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed, require_printable
 from nerf_lightning.files.json_files import keys_of, read_json
@@ -83,6 +89,7 @@ class TransformsReader(CaptureReader):
         settings = content | frame
         lens_model, lens = lens_of(settings, where)
         width, height = size_of(settings, where) or tuple(map(float, image_size(picture)))
+        focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
         mask = None if self.masks else _mask(path, where, frame)
         if mask is not None:
             self.require_inside(mask)
@@ -91,7 +98,7 @@ class TransformsReader(CaptureReader):
             name=named,
             photograph=Photograph(picture, self.mask_of(named) if self.masks else mask),
             c2w=pose_from_matrix(_four_rows(matrix), f"{where}: transform_matrix"),
-            focal=focal_of(settings, width, height, where),
+            focal=focal(settings, width, height, where),
             center=(
                 number_of(settings, "cx", where, width / 2),
                 number_of(settings, "cy", where, height / 2),
@@ -142,6 +149,7 @@ def _picture(path: Path, where: str, name: object) -> Path:
     named = path.parent / name.replace("\\", "/")
     found = [named] if named.suffix.lower() in ENDINGS else []
     found += [named.with_name(named.name + ending) for ending in ENDINGS]
+    found += [named]  # of another format, which is named where it is opened
     there = [candidate for candidate in found if is_there(candidate)]
     if there:
         return there[0]
@@ -176,7 +184,11 @@ def _four_rows(matrix: object) -> object:
 def _one_lens(kinds: set[LensModel], path: Path) -> LensModel:
     lens_model = common_lens_model(kinds)
     if lens_model is None:
-        raise InputError(f"{path} mixes fisheye lenses with others, and a scene has one kind. Split the capture.")
+        mixed = "panoramas (EQUIRECTANGULAR)" if "equirectangular" in kinds else "fisheye lenses"
+        raise InputError(
+            f"{path} mixes {mixed} with others, and a scene has one kind. Split the capture: one file for each kind, "
+            "whose frames may share the photographs' folder."
+        )
     return lens_model
 
 

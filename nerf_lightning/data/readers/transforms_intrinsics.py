@@ -15,6 +15,7 @@ LENSES: dict[str, LensModel] = {
     "RADIAL": "radial_tangential",
     "OPENCV": "radial_tangential",
     "OPENCV_FISHEYE": "fisheye",
+    "EQUIRECTANGULAR": "equirectangular",
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -73,6 +74,25 @@ def focal_of(settings: dict[str, Any], width: float, height: float, where: str) 
     )
 
 
+def panorama_focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
+    """Return pixels per radian of an equirectangular panorama.
+
+    nerfstudio's fl_x and fl_y count pixels per half turn: half the width and the height of a whole panorama, which
+    they are taken for where they are missing.
+
+    Raises:
+        InputError: one is no number, or shows some directions twice.
+    """
+    x, y = number_of(settings, "fl_x", where, width / 2), number_of(settings, "fl_y", where, height)
+    if not (x >= 0.495 * width and y >= 0.99 * height):
+        raise InputError(
+            f"{where} is a panorama (EQUIRECTANGULAR) with fl_x={x:g} and fl_y={y:g} for {width:g} x {height:g} "
+            "pixels, which would show some directions twice. For a whole panorama these are half the width and the "
+            "height: remove both, or export it again."
+        )
+    return max(x, width / 2) / math.pi, max(y, height) / math.pi
+
+
 def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[float, float, float, float, float, float]]:
     """Return the kind of lens, and k1, k2, k3, k4, p1, p2.
 
@@ -89,7 +109,7 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
             "export them as perspective pictures."
         )
     kind = LENSES[model]
-    if kind == "pinhole" and bent:
+    if kind in ("pinhole", "equirectangular") and bent:
         raise InputError(
             f"{where} has the camera_model {model} and distortion coefficients. Remove the one or the other."
         )

@@ -41,6 +41,13 @@ def pinhole_cameras(c2w: Float[Tensor, "views 3 4"], focal: float, width: int, h
     )
 
 
+def vertical_field_of_view(cameras: Cameras, view: int) -> float:
+    """Return what the height of a view's picture takes in, in radians; of a panorama, what a person would look at."""
+    if cameras.lens_model == "equirectangular":
+        return 0.5 * math.pi
+    return 2 * float(torch.atan(0.5 * cameras.height[view] / cameras.focal[view, 1]))
+
+
 def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, "*views"]) -> Cameras:
     """Return the same cameras for images of another size: focal length and principal point follow the pixels.
 

@@ -1,10 +1,12 @@
 """From which directions cameras look at the middle of what they see."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.frames import focus_point
+from nerf_lightning.nerf.geometry.frames import middle_of_cameras
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 
@@ -16,7 +18,7 @@ def middle_of(scene: SceneRecord) -> Float[Tensor, "3"]:
         return scene.points.median(dim=0).values
     if scene.space == "ndc":
         return torch.tensor([0.0, 0.0, -2.0])
-    return focus_point(scene.cameras.c2w.double()).float()
+    return middle_of_cameras(replace(scene.cameras, c2w=scene.cameras.c2w.double())).float()
 
 
 def directions_seen(scene: SceneRecord) -> tuple[Float[Tensor, "views"], Float[Tensor, "views"]]:

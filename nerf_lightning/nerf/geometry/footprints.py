@@ -6,6 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates, image_plane
 from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
+from nerf_lightning.nerf.geometry.panoramas import panorama_footprint
 from nerf_lightning.nerf.types.scene import Cameras
 
 
@@ -25,7 +26,10 @@ def footprint(
     if cameras.lens_model == "pinhole":
         return _through_pinhole(cameras, view, centers, half_diagonal)
     local = camera_coordinates(cameras, view, centers)
-    return _through_lens(cameras, view, local * local.new_tensor([1.0, -1.0, -1.0]), half_diagonal)
+    directions = local * local.new_tensor([1.0, -1.0, -1.0])
+    if cameras.lens_model == "equirectangular":
+        return panorama_footprint(cameras, view, directions, half_diagonal)
+    return _through_lens(cameras, view, directions, half_diagonal)
 
 
 def _through_pinhole(

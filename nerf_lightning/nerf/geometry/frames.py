@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.scene import Cameras
 
 # An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
 CLEAR = 0.05
@@ -30,6 +31,17 @@ def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     weak = 1e-6 * torch.eye(3).to(c2w)
     target = (across @ origins[..., None])[..., 0].mean(dim=0) + weak @ origins.mean(dim=0)
     return torch.linalg.solve(across.mean(dim=0) + weak, target)
+
+
+@own_precision
+def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
+    """Return what the cameras are said to be around: where their axes meet, or where they stand.
+
+    Panoramas look everywhere, and the axis of one means nothing: they are in the middle of what they show.
+    """
+    if cameras.lens_model == "equirectangular":
+        return cameras.c2w[:, :, 3].mean(dim=0)
+    return focus_point(cameras.c2w)
 
 
 @own_precision

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.geometry.panoramas import panorama_stretches, project_panorama, unproject_panorama
 from nerf_lightning.nerf.types.scene import LensModel
 
 NEWTON_STEPS = 8
@@ -29,11 +30,14 @@ def project_plane(
       + (2 p1 u v + p2 (r^2 + 2 u^2), p1 (r^2 + 2 v^2) + 2 p2 u v).
     * fisheye: theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) along (x, y), with theta the angle from the
       axis; directions behind the camera have their place too.
+    * equirectangular: azimuth and depression (`geometry.panoramas`).
 
     >>> lens = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     >>> project_plane(torch.tensor([2.0, 0.0, 2.0]), lens, "radial_tangential").tolist()
     [1.100000023841858, 0.0]
     """
+    if model == "equirectangular":
+        return project_panorama(directions)
     if model == "fisheye":
         angle, heading = off_axis(directions)
         return (angle * _even_polynomial(angle.square(), lens)[0])[..., None] * heading
@@ -48,6 +52,8 @@ def unproject(
 
     The inverse of `project_plane` wherever `geometry.lens_checks.require_invertible` has nothing to refuse.
     """
+    if model == "equirectangular":
+        return unproject_panorama(plane)
     if model == "fisheye":
         radius = _length(plane)
         return at_angle(_angle_at(radius, lens), plane / radius[..., None])
@@ -61,10 +67,12 @@ def stretches(
 ) -> Float[Tensor, "*rays 2"]:
     """Return by how much the lens stretches its surroundings at each direction: the least and the most.
 
-    For a fisheye, per radian: d theta_d / d theta along the radius and theta_d / sin(theta) around it. For the others,
-    against a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where the least is not above 0, the
-    lens folds back.
+    For a fisheye, per radian: d theta_d / d theta along the radius and theta_d / sin(theta) around it; for a panorama
+    per radian, too. For the others, against a pinhole: the eigenvalues of the Jacobian, which is symmetric. Where the
+    least is not above 0, the lens folds back.
     """
+    if model == "equirectangular":
+        return panorama_stretches(directions)
     if model == "fisheye":
         angle, _ = off_axis(directions)
         factor, slope = _even_polynomial(angle.square(), lens)

@@ -19,6 +19,9 @@ class Loss(nn.Module, ABC):
     every_level_is_a_picture: bool = True
     """Whether each level's number is a squared error of colour; else only the last one's is."""
 
+    patch: int = 1
+    """Side in pixels of the squares that it wants to see whole: batches hold one after the other, row by row."""
+
     @abstractmethod
     def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
         """Return one number per level, first level first; training minimises their sum.
@@ -27,3 +30,21 @@ class Loss(nn.Module, ABC):
             renderings: one per level.
             target: what the photographs show, how much each ray counts, and where in which photograph it lies.
         """
+
+    def learn(
+        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
+    ) -> None:
+        """Learn from what a step has seen, once it is taken; state that the next steps depend on is kept in buffers.
+
+        Args:
+            rgb: the last level's picture.
+            target: what the photographs show.
+            weight: 0 for masked pixels.
+        """
+
+    def measurements(self) -> list[Tensor]:
+        """Return the buffers that `learn` has changed, whose means the processes of a run must agree on."""
+        return []
+
+    def forget(self) -> None:
+        """Forget what was learnt, for a new attempt."""

@@ -12,21 +12,28 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
 from nerf_lightning.nerf.types.scene import Background
 
 
-def tiles(num_rays: int, tile_rays: int, multiple: int = 1) -> Iterator[slice]:
+def tiles(num_rays: int, tile_rays: int, together: int = 1, multiple: int = 1) -> Iterator[slice]:
     """Return the slices that cut a batch into tiles of at most `tile_rays`, of sizes as equal as can be.
 
-    Their number is a multiple of `multiple`, where there are so many rays: threads then have as many each.
+    Args:
+        num_rays: of the batch.
+        tile_rays: most rays of a tile.
+        together: so many rays in a row are never cut; a tile has as many at least.
+        multiple: the number of tiles is one of its multiples, where there are so many rays: threads have as many each.
 
     >>> [(part.start, part.stop) for part in tiles(10, 4)]
     [(0, 4), (4, 7), (7, 10)]
+    >>> [(part.start, part.stop) for part in tiles(12, 7, together=4)]
+    [(0, 4), (4, 8), (8, 12)]
     """
-    count = max(1, -(-num_rays // tile_rays))
-    count = max(1, min(num_rays, -(-count // multiple) * multiple))
-    size, rest = divmod(num_rays, count)
+    groups = -(-num_rays // together)
+    count = max(1, -(-groups // max(1, tile_rays // together)))
+    count = max(1, min(groups, -(-count // multiple) * multiple))
+    size, rest = divmod(groups, count)
     start = 0
     for number in range(count):
         stop = start + size + int(number < rest)
-        yield slice(start, stop)
+        yield slice(start * together, min(stop * together, num_rays))
         start = stop
 
 

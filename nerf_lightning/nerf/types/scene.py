@@ -13,8 +13,9 @@ Background = Literal["white", "black", "random", "none"]
 """What lies behind the scene. `none`: nothing. The last interval of a dense level takes all the light that is left;
 levels behind an occupancy grid have no such interval, and leave it black."""
 
-LensModel = Literal["pinhole", "radial_tangential", "fisheye"]
-"""How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`."""
+LensModel = Literal["pinhole", "radial_tangential", "fisheye", "equirectangular"]
+"""How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`, those of equirectangular
+panoramas, which show all directions, in `geometry.panoramas`."""
 
 Space = Literal["bounded", "ndc", "contracted"]
 """How much of the world is modelled: a box, all that lies in front of a near plane (normalised device coordinates), or
@@ -28,7 +29,7 @@ class Cameras(TensorStruct):
     c2w: Float[Tensor, "*views 3 4"]
     """Camera-to-world; the columns are right, up, back and the camera's centre."""
     focal: Float[Tensor, "*views 2"]
-    """Focal lengths in pixels along x and y."""
+    """Focal lengths in pixels along x and y; of panoramas, pixels per radian."""
     center: Float[Tensor, "*views 2"]
     """Principal point in pixels from the upper left corner of the image (x, y)."""
     lens: Float[Tensor, "*views 6"]

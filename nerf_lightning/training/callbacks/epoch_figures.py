@@ -36,11 +36,11 @@ class EpochFigures(Callback):
             self.steps.append(trainer.global_step)
             self.losses.append(float(outputs["losses"].cpu().sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
-        per_figure = self.every_epochs * len(batches.whole)
+        per_figure = self.every_epochs * batches.whole.num_rays
         progress = pl_module.step.progress
         seen = progress.rays_seen - batches.crop_rays(progress.restarts)
         if seen > 0 and seen // per_figure > (seen - batches.batch_rays) // per_figure:
-            self._draw(trainer, pl_module, epoch=seen // len(batches.whole))
+            self._draw(trainer, pl_module, epoch=seen // batches.whole.num_rays)
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Draw the whole curve."""

@@ -196,17 +196,20 @@ def frame_of(
     Forward-facing captures have no middle: theirs lies in front of the mean camera, a few times as far as the near
     plane, and up is the mean camera's.
 
-    Focal length and size are those of the first camera; its lens and principal point are left behind, for what is
-    rendered on a path is seen through a centred pinhole. The default `up` is the world's z axis.
+    Focal length and size are those of the first camera (of a panorama, 90 degrees across); its lens and principal
+    point are left behind, for what is rendered on a path is seen through a centred pinhole. The default `up` is the
+    world's z axis.
     """
     center = aabb.mean(dim=0).to(cameras.c2w)
     if cameras.ndc is not None:
         center, up = torch.tensor([0.0, 0.0, -NDC_FOCUS]).to(cameras.c2w), (0.0, 1.0, 0.0)
+    # Of panoramas a film shows what a person would look at: 90 degrees across.
+    panoramas = cameras.lens_model == "equirectangular"
     return PathFrame(
         center=center,
         up=torch.tensor(up).to(cameras.c2w),
         radius=float((cameras.c2w[:, :, 3] - center).norm(dim=-1).mean()),
-        focal=float(cameras.focal[0, 0]),
+        focal=0.5 * int(cameras.width[0]) if panoramas else float(cameras.focal[0, 0]),
         width=int(cameras.width[0]),
         height=int(cameras.height[0]),
         poses=cameras.c2w,

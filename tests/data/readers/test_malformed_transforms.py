@@ -161,9 +161,35 @@ def an_angle_in_degrees(root):
     edit_json(root, lambda content: {"camera_angle_x": 45.0, "frames": content["frames"]})
 
 
-@case("transforms", r"has the camera_model 'EQUIRECTANGULAR'; known are PINHOLE, .* export them as perspective")
-def a_panorama(root):
-    edit_json(root, lambda content: content | {"camera_model": "EQUIRECTANGULAR"})
+@case("transforms", r"p_1.heic is a photograph in the format HEIC. .* Convert all of them to JPEG")
+def a_photograph_as_phones_save_it(root):
+    edit_frame(root, 1, file_path="images/p_1.heic")
+    (root / "images" / "p_1.heic").write_bytes(b"\0\0\0\x18ftypheic" + 100 * b"\0")
+
+
+@case("transforms", r"scene.masks_keep=black, and no photograph of .* has a mask. Say where", masks_keep="black")
+def inverted_masks_that_are_not_there(root):
+    pass
+
+
+@case("transforms", r"has the camera_model 'VR180_L'; known are PINHOLE, .* export them as perspective")
+def half_a_panorama(root):
+    edit_json(root, lambda content: content | {"camera_model": "VR180_L"})
+
+
+@case("transforms", r"is a panorama \(EQUIRECTANGULAR\) with fl_x=5 and fl_y=12 for 16 x 12 pixels, .* remove both")
+def a_panorama_that_goes_around_more_than_once(root):
+    edit_json(root, lambda content: content | {"camera_model": "EQUIRECTANGULAR", "fl_x": 5.0, "fl_y": 12.0})
+
+
+@case("transforms", r"has the camera_model EQUIRECTANGULAR and distortion coefficients. Remove the one or the other")
+def a_panorama_with_distortion(root):
+    edit_json(root, lambda content: content | {"camera_model": "EQUIRECTANGULAR", "k1": 0.1})
+
+
+@case("transforms", r"mixes panoramas \(EQUIRECTANGULAR\) with others, and a scene has one kind. Split the capture")
+def a_panorama_among_other_photographs(root):
+    edit_frame(root, 1, camera_model="EQUIRECTANGULAR", fl_x=8.0, fl_y=12.0)
 
 
 @case("transforms", r"has the camera_model \['OPENCV'\]; known are")

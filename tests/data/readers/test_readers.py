@@ -26,6 +26,7 @@ from support.posed_captures import (
     write_transforms,
 )
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.frames import unit_of
 
 PLACES = [(0.0, 0.0), (0.99, 0.0), (0.5, 0.5), (0.2, 0.9)]
@@ -179,6 +180,36 @@ def test_masks_of_a_folder(tmp_path, naming):
         kept = scene.pixels.kept(view)
         assert not bool(kept[view].any())
         assert int(kept.sum()) == 11 * 16
+
+
+def test_masks_may_keep_black(tmp_path):
+    root = write_transforms(tmp_path / "c", Known())
+    (root / "masks" / "images").mkdir(parents=True)
+    for view, name in enumerate(Known().names):
+        mask = np.zeros((12, 16), np.uint8)
+        mask[view] = 255
+        Image.fromarray(mask).save(root / "masks" / "images" / name)
+    settings = {"masks": "masks", "masks_keep": "black"}
+    for scene in (read("transforms", root, **settings), read("transforms", root, **settings)):  # once from the cache
+        for view in range(9):
+            kept = scene.pixels.kept(view)
+            assert not bool(kept[view].any())
+            assert int(kept.sum()) == 11 * 16
+    white = read("transforms", root, masks="masks")
+    assert int(white.pixels.kept(0).sum()) == 16
+
+
+def test_three_photographs_with_poses_make_a_scene(tmp_path):
+    scene = read("colmap", write_colmap(tmp_path / "c", Known(c2w=ring(3))))
+    assert scene.splits == {"train": (1, 2), "val": (0,), "test": (0,)}
+
+
+def test_without_sparse_points_the_depth_that_ndc_needs_is_asked_for(tmp_path):
+    root = write_colmap(tmp_path / "c", Known(c2w=wall(), points=np.zeros((0, 3))))
+    assert read("colmap", root).space == "contracted"
+    with pytest.raises(InputError, match=r"space=ndc needs the depth .* neither bounds nor enough sparse points.*near"):
+        read("colmap", root, space="ndc")
+    assert read("colmap", root, space="ndc", near=2.0).space == "ndc"
 
 
 def test_a_frames_own_mask_and_a_folder_that_overrules_it(tmp_path):

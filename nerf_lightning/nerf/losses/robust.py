@@ -1,0 +1,106 @@
+"""A trimmed loss against what only some photographs show: people, cars, shadows, reflections.
+
+RobustNeRF (Sabour et al., 2023, arXiv 2302.00833): what the scene cannot explain has large residuals that lie together,
+whereas fine detail has large residuals among small ones.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.types.rays import Target
+
+LEAST_NEAR, LEAST_AROUND = 0.5, 0.6
+"""Shares of good pixels from which on a pixel is kept for its neighbours' sake: in 3 x 3, and in the whole square."""
+MEMORY = 0.9
+"""Of the threshold, what is left of it after a step; a single batch may show hardly anything but people."""
+FIRST_THRESHOLD = 1.0
+"""No colour in [0, 1] is farther off than that: at first nothing is left out."""
+RANGES = {"share": (0.01, 1.0), "times": (0.1, 1000.0), "patch": (4, 256)}
+
+
+class RobustLoss(Loss):
+    """Leave the pixels that the scene does not explain out of another loss.
+
+    The threshold is learnt: a multiple of a quantile of the last picture's residuals, averaged over the steps. Rays
+    come in squares of pixels; those beyond the last whole square are all kept.
+
+    The paper's threshold is the median itself, which keeps detail away for the hundred thousands of steps that it
+    trains, and its squares have 16 pixels a side. Shorter trainings need a threshold that most of the scene stays
+    below at any time, and steps that see more places.
+
+    Args:
+        of: the loss that the others count in, for all its levels.
+        share: of the pixels that surely show the scene, at least: which quantile.
+        times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
+        patch: side of the squares in pixels.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    def __init__(self, of: Loss, share: int | float = 0.8, times: int | float = 4.0, patch: int = 8):
+        super().__init__()
+        require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
+        self.of, self.share, self.times, self.patch = of, share, times, patch
+        self.every_level_is_a_picture = of.every_level_is_a_picture
+        self.register_buffer("threshold", torch.tensor(FIRST_THRESHOLD))
+
+    threshold: Tensor
+    """Greatest residual of a pixel that is kept for itself."""
+
+    def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
+        """Return what the other loss does for the rays that are kept; the others weigh 0."""
+        error = residuals(renderings[-1].rgb.detach(), target.rgb)
+        # What a mask leaves out speaks against no neighbour.
+        kept = kept_pixels((error <= self.threshold) | (target.weight == 0), self.patch)
+        return self.of(renderings, replace(target, weight=target.weight * kept))
+
+    @torch.no_grad()
+    def learn(
+        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
+    ) -> None:
+        """Move the threshold towards that of a step's residuals; masked pixels have none."""
+        known = torch.where(weight > 0, residuals(rgb, target), torch.nan)
+        wanted = self.times * torch.nanquantile(known, float(self.share))
+        moved = MEMORY * self.threshold + (1.0 - MEMORY) * wanted
+        self.threshold.copy_(torch.where(torch.isfinite(moved), moved, self.threshold))
+
+    def measurements(self) -> list[Tensor]:
+        """Return the threshold, on which the processes of a run must agree."""
+        return [self.threshold]
+
+    def forget(self) -> None:
+        """Leave nothing out again."""
+        self.threshold.fill_(FIRST_THRESHOLD)
+
+
+def residuals(rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays"]:
+    """Return the mean squared error of each ray's colour."""
+    return (rgb - target).square().mean(dim=-1)
+
+
+def kept_pixels(good: Bool[Tensor, "rays"], patch: int) -> Bool[Tensor, "rays"]:
+    """Return which pixels are trained on: the good ones, and others that most of their surroundings vouch for.
+
+    Eq. 8 to 10 of arXiv 2302.00833: a pixel is kept where it is good, or at least half of its neighbours of 3 x 3 are
+    (those within the square), or it lies in the inner half of a square (8 x 8 of 16 x 16) of which 60 % are kept so.
+
+    Args:
+        good: squares of pixels one after the other, row by row.
+        patch: side of the squares.
+    """
+    whole = len(good) // patch**2 * patch**2
+    squares = good[:whole].view(-1, 1, patch, patch)
+    near = avg_pool2d(squares.float(), 3, stride=1, padding=1, count_include_pad=False) >= LEAST_NEAR
+    kept = squares | near
+    around = kept.float().mean(dim=(2, 3), keepdim=True) >= LEAST_AROUND
+    inner = torch.zeros_like(kept[:1])
+    inner[..., patch // 4 : patch - patch // 4, patch // 4 : patch - patch // 4] = True
+    return torch.cat([(kept | (around & inner)).flatten(), torch.ones_like(good[whole:])])

@@ -1,0 +1,87 @@
+"""`loss=robust` through the command line: what it learns is part of a run, and of its checkpoints."""
+
+import signal
+import time
+
+import pytest
+import torch
+from support.configs import composed
+from support.running import FAST, said, start
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.proposal import ProposalLoss
+from nerf_lightning.nerf.losses.robust import RobustLoss
+
+ROBUST = ("loss=robust", "loss.patch=4")
+
+
+def arguments(capture, folder, *more):
+    return (
+        "train", "scene=npz", f"scene.path={capture}", *FAST, *ROBUST, "trainer.num_threads=1", "trainer.max_steps=60",
+        "final.evaluate=false", "final.video=false", "resume=auto", "callbacks.validation_pictures.every_steps=1000",
+        "callbacks.checkpoints.every_steps=5", f"paths.output_dir={folder}", *more,
+    )  # fmt: skip
+
+
+def saved(folder):
+    last = folder / "checkpoints" / "last.ckpt"
+    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
+
+
+@pytest.fixture(scope="module")
+def run(capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robust") / "run"
+    process = start(*arguments(capture, folder))
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("model", "of"), [("nerf", MeanSquaredError), ("fast", MeanSquaredError), ("fast_proposal", ProposalLoss)]
+)
+def test_it_weighs_the_loss_of_each_model(model, of):
+    loss = build(composed("train", f"model={model}", "loss=robust").loss)
+    assert isinstance(loss, RobustLoss)
+    assert type(loss.of) is of
+    assert loss.every_level_is_a_picture is of.every_level_is_a_picture
+
+
+def test_a_run_that_was_killed_and_goes_on_ends_with_the_same_bits(capture, run, tmp_path):
+    folder = tmp_path / "run"
+    process = start(*arguments(capture, folder))
+    while process.poll() is None and saved(folder)["global_step"] < 10:
+        time.sleep(0.02)
+    if process.poll() is None:
+        process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=300)
+    process = start(*arguments(capture, folder))
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    ours, theirs = saved(folder)["state_dict"], saved(run)["state_dict"]
+    assert 0 < float(theirs["loss.threshold"]) < 1
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_its_checkpoint_is_used_without_it(nerf, capture, run, tmp_path):
+    last = run / "checkpoints" / "last.ckpt"
+    result = nerf("eval", f"ckpt={last}", "evaluation.max_views=1", f"paths.output_dir={tmp_path / 'eval'}")
+    assert result.code == 0, result.err
+    plain = ("train", "scene=npz", f"scene.path={capture}", *FAST, "final.evaluate=false", "final.video=false")
+    result = nerf(*plain, f"init_from={last}", "trainer.max_steps=2", f"paths.output_dir={tmp_path / 'new'}")
+    assert result.code == 0, result.err
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["loss.patch=32", "data.batch_rays=1024"], "loss.patch=32 draws squares of 32 x 32 pixels"),
+        (["data.batch_rays=40"], "data.batch_rays=40 is no multiple of that. Give data.batch_rays=32"),
+        (["loss.share=0"], "share=0: give 0.01 to 1.0"),
+    ],
+)
+def test_bad_settings_are_one_paragraph(nerf, capture, tmp_path, settings, words):
+    result = nerf(*arguments(capture, tmp_path / "run", *settings))
+    said(result, words)
+    assert not (tmp_path / "run").exists()

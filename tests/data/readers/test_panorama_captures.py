@@ -1,0 +1,159 @@
+"""Panoramas as nerfstudio writes them: read, examined, learnt, exported and read again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.panoramas import near_the_bricks, write_panoramas
+from support.scenes import tiny_model
+from support.steps import rays_of
+
+from nerf_lightning.checkpoints.reading import make_record, scene_record
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.doctor.examine import examine
+from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.export.cameras import CamerasExport
+from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.step import TrainStep
+from nerf_lightning.video.paths.photograph_path import PhotographPath
+from nerf_lightning.video.shots import Subject, lay_path, make_shots
+
+
+def read(root, **settings):
+    return TransformsReader(root=str(root), cache_dir=str(root.parent / "cache"), **settings).read()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return write_panoramas(tmp_path_factory.mktemp("panoramas") / "capture")
+
+
+@pytest.fixture(scope="module")
+def scene(root):
+    return read(root)
+
+
+def in_user_frame(scene, rays):
+    to_user = scene.to_user.double()
+    return points_to_user(rays.origins.double(), to_user), directions_to_user(rays.directions.double(), to_user)
+
+
+def test_rays_are_those_that_nerfstudio_makes_of_the_same_file(scene):
+    assert scene.cameras.lens_model == "equirectangular"
+    assert scene.space == "contracted"
+    index = all_pixels(scene.cameras, 3)
+    origins, directions = in_user_frame(scene, rays_of(scene)(index))
+    pose = near_the_bricks(8)[3]
+    # From its documentation: u to the right and v upwards in [-1, 1], half a turn either way.
+    theta, phi = np.pi * ((index.x + 0.5).double() - 32) / 32, np.pi * (0.5 + ((index.y + 0.5).double() - 16) / 32)
+    local = torch.stack([theta.sin() * phi.sin(), phi.cos(), -theta.cos() * phi.sin()], dim=-1)
+    torch.testing.assert_close(directions, local @ pose[:, :3].mT, atol=1e-5, rtol=0)
+    torch.testing.assert_close(origins, pose[:, 3].expand_as(origins), atol=1e-5, rtol=0)
+
+
+def test_focal_lengths_may_be_left_out_and_pictures_may_be_shrunk(root, scene, tmp_path):
+    content = json.loads((root / "transforms.json").read_text())
+    for key in ("fl_x", "fl_y", "w", "h"):
+        del content[key]
+    (root / "bare.json").write_text(json.dumps(content))
+    bare = read(root, file="bare.json")
+    torch.testing.assert_close(bare.cameras.focal, scene.cameras.focal)
+    torch.testing.assert_close(read(root, downscale=2).cameras.focal, 0.5 * scene.cameras.focal)
+
+
+def test_the_working_frame_is_among_the_cameras_whichever_way_they_are_turned(scene):
+    centers = scene.cameras.c2w[:, :, 3]
+    torch.testing.assert_close(centers.mean(dim=0), torch.zeros(3), atol=1e-5, rtol=0)
+    assert float(centers.norm(dim=-1).max()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_the_doctor_examines_them_and_finds_nothing_wrong(scene):
+    _, checks = examine(scene)
+    assert not [check for check in checks if check.verdict == "wrong"]
+
+
+def test_in_a_box_they_are_carved_and_near_and_far_hold_it(root):
+    bounded = read(root, space="bounded")
+    assert bool((bounded.near < bounded.far).all())
+
+
+def test_ndc_is_refused(root):
+    with pytest.raises(Exception, match=r"scene\.space=ndc needs cameras that all look the same way"):
+        read(root, space="ndc")
+
+
+def test_cameras_that_were_exported_give_the_same_rays(scene, tmp_path, caplog):
+    CamerasExport(images="images").export(tiny_model(), scene_record(scene), tmp_path, 4096)
+    assert "COLMAP has no model for panoramas" in caplog.text
+    for name in scene.view_names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 32)).save(tmp_path / "images" / name)
+    back = read(tmp_path)
+    for mine, theirs in zip(
+        in_user_frame(scene, rays_of(scene)(all_pixels(scene.cameras, 2))),
+        in_user_frame(back, rays_of(back)(all_pixels(back.cameras, 2))),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0)
+
+
+def test_panoramas_that_were_rendered_and_read_again_have_the_rays_they_were_rendered_with(scene, tmp_path):
+    subject = Subject(tiny_model(), scene_record(scene), "black")
+    (shot,) = make_shots([subject], PhotographPath(3, width=48), 4096, projection="equirectangular")
+    assert (int(shot.cameras.width[0]), int(shot.cameras.height[0])) == (48, 24)
+    record = replace(scene_record(scene), cameras=shot.cameras, view_names=("0.png", "1.png", "2.png"), splits={})
+    CamerasExport().export(tiny_model(), record, tmp_path, 4096)
+    for name in record.view_names:
+        Image.new("RGB", (48, 24)).save(tmp_path / name)
+    back = read(tmp_path)
+    for mine, theirs in zip(
+        in_user_frame(scene, shot.rays(all_pixels(shot.cameras, 1))),
+        in_user_frame(back, rays_of(back)(all_pixels(back.cameras, 1))),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0)
+
+
+def test_films_of_them_show_what_a_person_would_look_at_and_checkpoints_keep_them(scene):
+    cameras = lay_path(PhotographPath(3), scene)
+    assert cameras.lens_model == "pinhole"
+    assert float(cameras.focal[0, 0]) == pytest.approx(32.0)  # 90 degrees across 64 pixels
+    assert make_record(scene, "", {})["scene"]["cameras"]["lens_model"] == "equirectangular"
+
+
+def test_some_steps_of_training_on_panoramas_make_them_better(scene):
+    progress = Progress()
+    step = TrainStep(
+        model=tiny_model(),
+        rays=rays_of(scene),
+        loss=MeanSquaredError(),
+        optimizer=lambda groups: torch.optim.Adam(groups, lr=5e-3),
+        schedule=ExponentialDecay(decay_rate=1.0, decay_steps=1),
+        progress=progress,
+        num_steps=40,
+        seed=0,
+        background="black",
+    )
+    step.model.fit_to(scene)
+    batches, optimizer = RayBatches(scene, progress, 0, 128), step.new_optimizer()
+
+    def psnr():
+        errors = RayErrors()
+        with torch.no_grad():
+            for batch in FixedRays(scene, "val", 256, 256):
+                step.validate(batch, errors)
+        return errors.summary()["val/psnr"]
+
+    before = psnr()
+    for _ in range(40):
+        step(batches.at(0, progress.rays_seen), optimizer)
+    assert psnr() > before + 3.0

@@ -1,0 +1,130 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support.panoramas import Panorama, near_the_bricks, traced
+
+from nerf_lightning.data.bricks.tracer import Pinhole
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels, resized
+from nerf_lightning.nerf.geometry.footprints import footprint
+from nerf_lightning.nerf.geometry.lens_checks import require_invertible
+from nerf_lightning.nerf.geometry.lenses import project_plane, stretches, unproject
+from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+
+NOTHING = torch.zeros(1, 6, dtype=torch.float64)
+
+
+def at_origin(cameras):
+    return replace(cameras, c2w=torch.cat([cameras.c2w[..., :3], torch.zeros_like(cameras.c2w[..., 3:])], dim=-1))
+
+
+def all_rays(cameras, view=0):
+    bounds = torch.zeros(len(cameras.c2w)).to(cameras.c2w)
+    return rays_through_pixels(cameras, all_pixels(cameras, view), bounds, bounds + 1)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-4)])
+def test_every_pixel_comes_back_from_its_ray_and_every_ray_from_its_pixel(dtype, tolerance):
+    cameras = at_origin(panorama_cameras(near_the_bricks(1).to(dtype), 64, 33))
+    index, rays = all_pixels(cameras, 0), all_rays(cameras)
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(33, 64, dtype=dtype))
+    place = project(cameras, 0, 3.0 * rays.directions)
+    expected = torch.stack([index.x, index.y], dim=-1) + 0.5
+    torch.testing.assert_close(place, expected.to(dtype), atol=tolerance, rtol=0)
+    require_invertible(cameras, ["pano"])
+
+
+def test_the_middle_looks_ahead_a_quarter_to_the_right_and_the_top_up():
+    cameras = panorama_cameras(torch.eye(4, dtype=torch.float64)[:3][None], 4, 2)
+    ahead, right, up, behind = (
+        project(cameras, 0, torch.tensor(point, dtype=torch.float64)).tolist()
+        for point in ((0.0, 0, -5), (7.0, 0, 0), (0.0, 2, 0), (-1e-9, 0, 1))
+    )
+    assert ahead == pytest.approx([2.0, 1.0])
+    assert right == pytest.approx([3.0, 1.0])
+    assert up[1] == pytest.approx(0.0)
+    assert behind == pytest.approx([0.0, 1.0], abs=1e-6)
+
+
+def test_other_sizes_show_the_same_directions():
+    cameras = panorama_cameras(near_the_bricks(1), 64, 32)
+    double = resized(cameras, 2 * cameras.width, 2 * cameras.height)
+    point = torch.tensor([[0.3, -0.2, 0.7]], dtype=torch.float64)
+    torch.testing.assert_close(project(double, 0, point), 2 * project(cameras, 0, point))
+
+
+def test_stretches_are_those_of_finite_differences():
+    angles = 0.9 * (torch.rand(50, 2, dtype=torch.float64) - 0.5) * torch.tensor([2 * math.pi, math.pi])
+    directions = unproject(angles, NOTHING, "equirectangular")
+    least, most = stretches(directions, NOTHING, "equirectangular").unbind(dim=-1)
+    step = 1e-6
+    sideways = torch.linalg.cross(
+        directions, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64).expand_as(directions)
+    )
+    sideways = sideways / sideways.norm(dim=-1, keepdim=True)
+    upwards = torch.linalg.cross(directions, sideways)
+    for along, expected in ((sideways, most), (upwards, least)):
+        moved = project_plane(directions + step * along, NOTHING, "equirectangular")
+        torch.testing.assert_close((moved - angles).norm(dim=-1) / step, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_discs_hold_the_small_spheres_that_they_stand_for():
+    generator = torch.Generator().manual_seed(0)
+    cameras = panorama_cameras(torch.eye(4)[:3][None], 128, 64)
+    centers = 2.0 * torch.randn(400, 3, generator=generator)
+    radius = 0.2
+    x, y, reach = footprint(cameras, 0, centers, radius)
+    on_sphere = torch.nn.functional.normalize(torch.randn(400, 60, 3, generator=generator), dim=-1)
+    places = project(cameras, 0, centers[:, None] + radius * on_sphere)
+    missed = (places - torch.stack([x, y], dim=-1)[:, None]).norm(dim=-1).amax(dim=1)
+    # Whoever is said to lie within the picture really does.
+    whole = (x - reach >= 0) & (x + reach <= 128) & (y - reach >= 0) & (y + reach <= 64) & (reach > 0)
+    assert int(whole.sum()) > 150
+    off_diagonal = 2**0.5  # a disc of pixels against a box of angles
+    assert bool((missed[whole] <= off_diagonal * reach[whole] + 1e-3).all())
+    assert bool((reach[centers.norm(dim=-1) < 2 * radius] == 0).all())
+
+
+FACES = torch.tensor(
+    [
+        [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+        [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]],
+        [[0.0, 0, -1], [0, 1, 0], [1, 0, 0]],
+        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]],
+        [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]],
+    ],
+    dtype=torch.float64,
+)
+"""Rotations of six cameras that look ahead, to both sides, back, up and down."""
+
+
+def test_a_panorama_of_the_bricks_agrees_with_the_six_faces_of_a_cube():
+    """Through our cameras the one is looked up in the others; each was traced by formulas of its own."""
+    size, face = 96, 128
+    pose = near_the_bricks(1)
+    picture = traced([Panorama(pose[0].numpy(), 1.0, size)])[0]
+    centers = pose[:, :, 3:].expand(6, 3, 1)
+    cube = torch.cat([pose[:, :, :3] @ FACES, centers], dim=-1)
+    faces = torch.from_numpy(traced([Pinhole(each.numpy(), 0.5 * face, face) for each in cube]))
+    points = all_rays(panorama_cameras(pose, size, size)).directions + pose[0, :, 3]
+    cameras = pinhole_cameras(cube, 0.5 * face, face, face)
+    found, holders = torch.zeros(size, size, 3, dtype=torch.float64), torch.zeros(size, size)
+    for number in range(6):
+        ahead = (points - cube[number, :, 3]) @ cube[number, :, 2] < 0
+        place = project(cameras, number, points)
+        within = ahead & ((place >= 0) & (place <= face)).all(dim=-1)
+        grid = (2 * place / face - 1)[None]
+        looked_up = torch.nn.functional.grid_sample(
+            faces[number].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border"
+        )[0].permute(1, 2, 0)
+        found[within] = looked_up[within]
+        holders += within
+    assert bool((holders >= 1).all())
+    assert float((torch.from_numpy(picture) < 0.99).double().mean()) > 0.02  # there is something to see
+    error = (torch.from_numpy(picture) - found).square().mean()
+    shifted = (torch.from_numpy(np.roll(picture, 2, axis=1)) - found).square().mean()
+    assert -10 * math.log10(float(error)) > 30.0
+    assert float(error) < 0.3 * float(shifted)  # two pixels off would be seen
