@@ -15,7 +15,7 @@ from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import doctor_picture
 from nerf_lightning.doctor.proof_picture import proof_picture
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png

@@ -7,11 +7,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.clear_pairs import clear_pairs
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.doctor.proofs import Proof, strongest_proof
-from nerf_lightning.doctor.second_opinion import CONVINCING, BetterPose, better_pose, is_vouched_for, with_pose
+from nerf_lightning.doctor.refit import with_pose
+from nerf_lightning.doctor.second_opinion import CONVINCING, BetterPose, better_pose, is_vouched_for
 
 FEWEST = 200
 """Matches below which nothing is said of the whole capture."""
@@ -30,6 +32,9 @@ OFF, FAR_OFF = 1.15, 1.35
 CLEARER = 0.01
 # Contradicted views of which a better pose is looked for, and told of.
 MOST_REFITTED, MOST_TOLD = 20, 3
+# Pairs of photographs that must be clear before all poses are wrong, and the share of them that contradicts the poses.
+FEWEST_CLEAR, MOST_AGAINST = 4, 0.8
+DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; more or larger photographs help to tell."
 NOT_JUDGED = "not judged: too few details could be found again from one photograph to another"
 
 
@@ -60,7 +65,13 @@ def poses_and_pixels(evidence: Evidence) -> Check:
     cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
     if share >= HOPELESS:
         return Check(name, "look", message, cure)
-    return Check(name, "wrong", message, cure, strongest_proof(matches, ~evidence.agrees, None))
+    clear = clear_pairs(matches, evidence.scene.cameras)
+    against = [pair for pair in clear if pair.contradicts]
+    if len(against) < max(FEWEST_CLEAR, MOST_AGAINST * len(clear)):
+        reason = f"only {len(clear)} pairs of photographs" if len(clear) < FEWEST_CLEAR else "too few photographs"
+        return Check(name, "look", f"{message}; but {reason} share details that prove it", DOUBTFUL)
+    message += f"; {len(against)} of {len(clear)} pairs whose details fit each other contradict the poses"
+    return Check(name, "wrong", message, cure, (against[0].proof,))
 
 
 def focal_length(evidence: Evidence) -> Check:
@@ -119,8 +130,8 @@ def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[in
         f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items() if b is not None
     ]
     turned = [
-        f"{evidence.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % of "
-        f"its details lie where that one says, {100 * pose.before:.0f} % where the given one does)"
+        f"{evidence.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % "
+        f"of its details lie where that one says, {100 * pose.before:.0f} % where the given one does)"
         for pose in better
         if fits[pose.view] is None
     ]

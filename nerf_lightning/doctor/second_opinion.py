@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from nerf_lightning.doctor.check import Evidence
-from nerf_lightning.doctor.epipolar import agreeing, rays_of
+from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import shrunk_cameras
 from nerf_lightning.doctor.matches import Matches, matched_pairs
+from nerf_lightning.doctor.refit import refitted, with_pose
 
 # The other pose must explain so many details that the given one does not, of so many from each of two other views.
 FEWEST, FEWEST_OF_A_PAIR = 24, 8
@@ -23,9 +23,7 @@ CONVINCING = 0.6
 # The views nearest by the given poses speak for a pose with as many details and this share of the usual.
 NEAREST, FEWEST_FOR, SPEAKS_FOR = 4, 20, 0.7
 # From where the search begins: the poses of the view and of so many suspects, and of so many views that share most.
-MOST_MIXED, STARTS, ROUNDS = 8, 4, 25
-# Pixels beyond which a match counts less and less, at the first round and at the last.
-WIDE, NARROW = 16.0, 1.0
+MOST_MIXED, STARTS = 8, 4
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPos
     if len(own.view) < FEWEST or len(partner.unique()) < 2:
         return None
     before = agreeing(own, c2w)
-    poses = _refitted(own, c2w, _starts(own, c2w, suspects))
+    poses = refitted(own, c2w, _starts(own, c2w, suspects))
     explained = torch.stack([agreeing(own, with_pose(c2w, view, pose)) for pose in poses])
     best = int(explained.sum(dim=1).argmax())
     gained = explained[best] & ~before
@@ -112,52 +110,3 @@ def _starts(own: Matches, c2w: Float[Tensor, "views 3 4"], suspects: list[int]) 
     # Poses that were mixed up are those of other suspects; the view itself is one.
     mixed = [view, *(suspect for suspect in suspects[:MOST_MIXED] if suspect != view)]
     return torch.cat([c2w[mixed], beside])
-
-
-def _refitted(
-    own: Matches, c2w: Float[Tensor, "views 3 4"], starts: Float[Tensor, "starts 3 4"]
-) -> Float[Tensor, "starts 3 4"]:
-    """Return each start after Gauss-Newton steps on the distances of the matches to their planes (in pixels).
-
-    Large distances count less and less (Cauchy's weights, ever narrower), since a part of the matches is mistaken.
-    """
-    rays, _ = rays_of(own, c2w)
-    there, focal = rays[:, 1], own.focal[:, 0].double()
-    eyes = c2w[own.view[:, 1], :, 3].double()
-    local = torch.cat([own.plane[:, 0] * own.plane.new_tensor([1.0, -1.0]), -torch.ones(len(eyes), 1)], dim=-1).double()
-    local = functional.normalize(local, dim=-1)
-    unit = float((eyes - eyes.mean(dim=0)).norm(dim=-1).mean().clamp(min=1e-9))
-    rotation, center = starts[:, :, :3].double(), starts[:, :, 3].double()
-
-    def off(step: Float[Tensor, "starts 6"]) -> Float[Tensor, "starts matches"]:
-        turned = torch.matrix_exp(_cross(step[:, :3])) @ rotation
-        between = eyes - (center + unit * step[:, 3:])[:, None]
-        normal = functional.normalize(torch.linalg.cross(between, there.expand_as(between)), dim=-1)
-        return focal * (normal * torch.einsum("sij,mj->smi", turned, local)).sum(dim=-1)
-
-    nothing, tiny = torch.zeros(len(starts), 6).double(), 1e-5
-    for number in range(ROUNDS):
-        width = WIDE * (NARROW / WIDE) ** (number / (ROUNDS - 1))
-        here = off(nothing)
-        slopes = torch.stack([(off(nothing + tiny * axis) - here) / tiny for axis in torch.eye(6).double()], dim=-1)
-        weighted = slopes / (1 + (here / width).square())[..., None]
-        system = weighted.mT @ slopes
-        system = system + (1e-3 * system.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-9)[:, None, None] * torch.eye(6)
-        step = -torch.linalg.solve(system, (weighted.mT @ here[..., None])[..., 0])
-        step = step * (0.3 / step.norm(dim=1, keepdim=True).clamp(min=0.3))
-        rotation = torch.matrix_exp(_cross(step[:, :3])) @ rotation
-        center = center + unit * step[:, 3:]
-    return torch.cat([rotation, center[:, :, None]], dim=-1).to(starts)
-
-
-def _cross(turn: Float[Tensor, "starts 3"]) -> Float[Tensor, "starts 3 3"]:
-    x, y, z = turn.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
-
-
-def with_pose(c2w: Float[Tensor, "views 3 4"], view: int, pose: Float[Tensor, "3 4"]) -> Float[Tensor, "views 3 4"]:
-    """Return the poses with one of them changed."""
-    changed = c2w.clone()
-    changed[view] = pose
-    return changed

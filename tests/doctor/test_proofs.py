@@ -7,10 +7,10 @@ import torch
 from support.doctor_scene import VIEWS, corner_evidence, corner_scene, with_poses
 from support.planted_poses import rotation_about
 
+from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
 from nerf_lightning.doctor.features import Corners
 from nerf_lightning.doctor.poses import axes_convention, single_poses
-from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.proof_picture import MOST_DETAILS, proof_picture, spread_out
 from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 
