@@ -3,8 +3,8 @@
     python tests/doctor_rates.py [SEEDS]
 
 Examines the real captures at hand and, of every kind of support.brick_captures, SEEDS captures (25: 200 in all) whose
-poses are exact; then plants faults in all of them. Prints two tables in Markdown, and every `wrong` of a sound capture.
-Ends with 1 where a capture of bricks with exact poses is called wrong.
+poses are exact; plants faults in the real ones and in some of bricks. Prints two tables in Markdown, and every `wrong`
+of a sound capture. Ends with 1 where a capture of bricks with exact poses is called wrong.
 """
 
 import sys
@@ -26,8 +26,8 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.nerf.types.scene import Scene
 
 SEEDS = 25
-# Single views are drawn so often in each real capture.
-DRAWN = 8
+# Single views are drawn so often in each real capture; and of bricks, captures of so many seeds get faults.
+DRAWN, PLANTED = 4, 3
 
 
 def real_captures() -> Iterator[Scene]:
@@ -45,9 +45,10 @@ def real_captures() -> Iterator[Scene]:
 
 
 def captures(seeds: int) -> Iterator[tuple[str, int, Scene]]:
-    """Yield the kind of a capture, how often single views are drawn in it, and the capture."""
+    """Yield the kind of a capture, how often single views are drawn in it to be spoilt, and the capture."""
     yield from (("real", DRAWN, scene) for scene in real_captures())
-    yield from ((kind, 1, brick_capture(kind, seed)) for seed in range(seeds) for kind in KINDS)
+    for seed in range(seeds):
+        yield from ((kind, int(seed < PLANTED), brick_capture(kind, seed)) for kind in KINDS)
 
 
 def main() -> int:
@@ -68,7 +69,7 @@ def main() -> int:
                 false += kind != "real"
                 print(f"wrong on exact poses: {scene.name}: {check.name}: {check.message}", flush=True)
         for fault in FAULTS:
-            times = drawn if fault.startswith(("one", "two")) else 1
+            times = drawn if fault.startswith(("one", "two")) else min(drawn, 1)
             found += [(kind, plant(evidence, fault, seed)) for seed in range(times)]
     print_false_alarms(alarms, examined)
     print_found(found)
