@@ -62,15 +62,22 @@ def poses_and_pixels(evidence: Evidence) -> Check:
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
     if share >= SOUND:
         return Check(name, "ok", message)
+    return _by_clear_pairs(evidence, message)
+
+
+def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
+    """Judge all poses by pairs of photographs whose details are no mistakes, since most matches do not agree."""
+    name, pairs = "poses and pixels", clear_pairs(evidence.matches, evidence.scene.cameras)
+    against = [pair for pair in pairs if pair.contradicts]
+    if len(pairs) < FEWEST_CLEAR:
+        return Check(name, "look", f"{message}; too few photographs share enough details to tell", DOUBTFUL)
+    share = len(against) / len(pairs)
+    message += f"; {len(against)} of {len(pairs)} pairs whose details fit each other contradict the poses"
+    if share <= 1 - MOST_AGAINST:
+        return Check(name, "ok", message)
     cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
-    if share >= HOPELESS:
+    if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
         return Check(name, "look", message, cure)
-    clear = clear_pairs(matches, evidence.scene.cameras)
-    against = [pair for pair in clear if pair.contradicts]
-    if len(against) < max(FEWEST_CLEAR, MOST_AGAINST * len(clear)):
-        reason = f"only {len(clear)} pairs of photographs" if len(clear) < FEWEST_CLEAR else "too few photographs"
-        return Check(name, "look", f"{message}; but {reason} share details that prove it", DOUBTFUL)
-    message += f"; {len(against)} of {len(clear)} pairs whose details fit each other contradict the poses"
     return Check(name, "wrong", message, cure, (against[0].proof,))
 
 

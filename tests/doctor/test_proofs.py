@@ -10,7 +10,7 @@ from support.planted_poses import rotation_about
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
 from nerf_lightning.doctor.features import Corners
-from nerf_lightning.doctor.poses import axes_convention, single_poses
+from nerf_lightning.doctor.poses import axes_convention, poses_and_pixels, single_poses
 from nerf_lightning.doctor.proof_picture import MOST_DETAILS, proof_picture, spread_out
 from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 
@@ -84,6 +84,35 @@ def test_another_convention_is_proved_with_cameras_that_fit():
     (proof,) = axes_convention(evidence).proofs
     assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
     assert not bool(agreeing(proof.matches, evidence.scene.cameras.c2w).any())
+
+
+def with_mistaken_pairs(evidence, share):
+    """Of so many pairs of photographs, the details were taken for others that look the same."""
+    _, pair = evidence.matches.view.unique(dim=0, return_inverse=True)
+    random = torch.Generator().manual_seed(4)
+    plane = evidence.matches.plane.clone()
+    for number in torch.randperm(int(pair.max()) + 1, generator=random)[: int(share * (int(pair.max()) + 1))].tolist():
+        rows = (pair == number).nonzero()[:, 0]
+        plane[rows, 1] = plane[rows[torch.randperm(len(rows), generator=random)], 1]
+    matches = replace(evidence.matches, plane=plane)
+    return replace(evidence, matches=matches, agrees=agreeing(matches, evidence.scene.cameras.c2w))
+
+
+def test_mistakes_do_not_make_all_poses_wrong():
+    evidence = with_mistaken_pairs(corner_evidence(), 1.0)
+    assert evidence.agreement < 0.3
+    assert poses_and_pixels(evidence).verdict == "look"
+
+
+def test_a_few_clear_pairs_tell_whether_all_poses_are_right():
+    right = with_mistaken_pairs(corner_evidence(), 0.7)
+    assert right.agreement < 0.4
+    assert poses_and_pixels(right).verdict == "ok"
+    order = torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3))
+    wrong = with_mistaken_pairs(with_poses(corner_scene().cameras.c2w[order]), 0.7)
+    check = poses_and_pixels(wrong)
+    assert check.verdict == "wrong"
+    assert bool((line_distances(check.proofs[0].matches, check.proofs[0].fits.c2w) < 1.5).all())
 
 
 def test_the_picture_has_a_row_for_each_proof():
