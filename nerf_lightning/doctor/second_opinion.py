@@ -18,8 +18,9 @@ from nerf_lightning.doctor.refit import refitted, with_pose
 
 # The other pose must explain so many details that the given one does not, of so many from each of two other views.
 FEWEST, FEWEST_OF_A_PAIR = 24, 8
-# It must explain this share of what right poses of this capture usually explain.
-CONVINCING = 0.6
+# It must explain this share of what right poses of this capture usually explain, and most of the matches: less may be
+# the other side of a thing whose sides look alike.
+CONVINCING, MOST = 0.6, 0.55
 # The views nearest by the given poses speak for a pose with as many details and this share of the usual.
 NEAREST, FEWEST_FOR, SPEAKS_FOR = 4, 20, 0.7
 # From where the search begins: the poses of the view and of so many suspects, and of so many views that share most.
@@ -82,7 +83,7 @@ def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPos
     speaking, counts = partner[gained].unique(return_counts=True)
     strong = speaking[counts >= FEWEST_OF_A_PAIR][counts[counts >= FEWEST_OF_A_PAIR].argsort(descending=True)]
     share = float(explained[best].float().mean())
-    if int(gained.sum()) < FEWEST or len(strong) < 2 or share < CONVINCING * evidence.agreement:
+    if int(gained.sum()) < FEWEST or len(strong) < 2 or share < max(CONVINCING * evidence.agreement, MOST):
         return None
     turn = poses[best, :, :3].T @ c2w[view, :, :3]
     degrees = float((0.5 * (turn.diagonal().sum() - 1)).clamp(-1, 1).acos().rad2deg())
