@@ -7,6 +7,8 @@ XLA_VENV := .venv-xla
 ARGS ?=
 # How long make soak lasts.
 SECONDS ?= 1800
+# How many captures of each kind the doctor is tried on.
+SEEDS ?= 25
 # How many times as many cases as in make test make fuzz tries.
 TIMES ?= 200
 # How many tests run at a time.
@@ -30,7 +32,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak fuzz clean
+.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -104,6 +106,9 @@ bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 
 soak: setup ## Train, evaluate, render and resume in a loop for SECONDS; memory and open files must stay flat
 	@$(VENV)/bin/python tests/soak.py $(SECONDS)
+
+doctor-rates: setup ## How often each check of the doctor raises a false alarm, over SEEDS captures of 8 kinds; ten minutes
+	@$(VENV)/bin/python tests/doctor_rates.py $(SEEDS)
 
 fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each time
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_*.py

@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 
@@ -15,7 +14,8 @@ from nerf_lightning.console import StdoutConsole, say
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import doctor_picture
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.doctor.proof_picture import proof_picture
+from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
@@ -30,12 +30,18 @@ def run(config: DictConfig) -> int:
     default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
-    write_json(folder / "doctor.json", {"scene": scene.name, "checks": [asdict(check) for check in checks]})
+    rows = [{key: getattr(check, key) for key in ("name", "verdict", "message", "cure")} for check in checks]
+    write_json(folder / "doctor.json", {"scene": scene.name, "checks": rows})
     save_png(folder / "doctor.png", doctor_picture(evidence, checks))
+    written = [folder / "doctor.json", folder / "doctor.png"]
+    proofs = [proof for check in checks for proof in check.proofs]
+    if proofs:
+        written.append(folder / "doctor_proof.png")
+        save_png(written[-1], proof_picture(scene, proofs))
     print_checks(checks)
     seconds = time.monotonic() - started
     say(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
-    say(f"written to  {folder / 'doctor.json'} and {folder / 'doctor.png'}")
+    say(f"written to  {listed(map(str, written), cap=len(written))}")
     return sum(check.verdict == "wrong" for check in checks)
 
 

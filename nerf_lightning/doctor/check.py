@@ -1,13 +1,15 @@
 """What a check says, and what it may look at."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from jaxtyping import Bool
 from torch import Tensor
 
+from nerf_lightning.doctor.features import Corners
 from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.doctor.proofs import Proof
 from nerf_lightning.doctor.view_statistics import Looks
 from nerf_lightning.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
@@ -27,6 +29,8 @@ class Check:
     """What was found, in numbers."""
     cure: str = ""
     """What to do about it; empty where all is well."""
+    proofs: tuple[Proof, ...] = field(default=(), compare=False, repr=False)
+    """What can be shown for it, in a picture."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Evidence:
     """Places that photographs have in common, found without their poses."""
     agrees: Bool[Tensor, "matches"]
     """Which of them lie where the cameras say."""
+    corners: Mapping[int, Corners]
+    """What was found in each view that was looked at, for pairs that were not compared."""
 
     @property
     def agreement(self) -> float:

@@ -14,26 +14,32 @@ TOLERANCE = 1.5
 def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:
     """Tell which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
 
-    With D, E the rays and b the way between the centres, the plane of b and E cuts the other picture in a line (the
-    epipolar line); counted is the distance to it in pixels, both ways. Hartley and Zisserman, "Multiple View
-    Geometry", 2004, chapter 9.
-
     Args:
         matches: places in both pictures.
         c2w: the poses to judge.
         zoom: what the focal lengths are multiplied by.
     """
-    rays, between = _rays(matches, c2w, zoom)
-    good = (_nearest(rays, between) > 0).all(dim=-1)
+    ahead = (_nearest(*rays_of(matches, c2w, zoom)) > 0).all(dim=-1)
+    return ahead & (line_distances(matches, c2w, zoom) < TOLERANCE).all(dim=-1)
+
+
+def line_distances(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Float[Tensor, "matches 2"]:
+    """Return how far each place lies from the line that the other's ray draws, in pixels of the shrunk pictures.
+
+    With D, E the rays and b the way between the centres, the plane of b and E cuts the other picture in a line (the
+    epipolar line). Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9. Arguments as in `agreeing`.
+    """
+    rays, between = rays_of(matches, c2w, zoom)
+    off = []
     for here, there in ((0, 1), (1, 0)):
         normal = functional.normalize(torch.linalg.cross(between, rays[:, there]), dim=-1)
         # The line in the axes of the picture: its first two numbers lie along the picture.
         right, up, back = c2w[matches.view[:, here], :, :3].double().unbind(dim=-1)
         slope = ((normal * right).sum(dim=-1).square() + (normal * up).sum(dim=-1).square()).sqrt()
         depth = -(rays[:, here] * back).sum(dim=-1)
-        off = (normal * rays[:, here]).sum(dim=-1).abs() / (depth * slope).clamp(min=1e-6)
-        good &= off * matches.focal[:, here] * zoom < TOLERANCE
-    return good
+        apart = (normal * rays[:, here]).sum(dim=-1).abs() / (depth * slope).clamp(min=1e-6)
+        off.append(apart * matches.focal[:, here] * zoom)
+    return torch.stack(off, dim=-1)
 
 
 def distances(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 2"]:
@@ -41,26 +47,26 @@ def distances(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor
 
     Worth little where the rays are nearly parallel: see `parallax`.
     """
-    return _nearest(*_rays(matches, c2w)).float()
+    return _nearest(*rays_of(matches, c2w)).float()
 
 
 def places(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches 3"]:
     """Return where in the world each match lies, on the first ray (scene units)."""
-    rays, between = _rays(matches, c2w)
+    rays, between = rays_of(matches, c2w)
     first = c2w[matches.view[:, 0], :, 3].double()
     return (first + _nearest(rays, between)[:, :1] * rays[:, 0]).float()
 
 
 def parallax(matches: Matches, c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "matches"]:
     """Return the angle between both rays of each match, in radians."""
-    rays, _ = _rays(matches, c2w)
+    rays, _ = rays_of(matches, c2w)
     return torch.linalg.cross(rays[:, 0], rays[:, 1]).norm(dim=-1).clamp(max=1).asin().float()
 
 
-def _rays(
+def rays_of(
     matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0
 ) -> tuple[Float[Tensor, "matches 2 3"], Float[Tensor, "matches 3"]]:
-    # Unit rays of both ends, and the way from the first camera to the second.
+    """Return unit rays of both ends, and the way from the first camera to the second (scene units)."""
     plane = matches.plane.double() / zoom
     local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
     poses = c2w[matches.view].double()

@@ -62,4 +62,4 @@ def gather_evidence(scene: Scene) -> Evidence:
 
     rows = in_threads(look, total, "Looking at photographs", shown=total > NOTICEABLE)
     matches = find_matches(cameras, corners, shown=total > NOTICEABLE)
-    return Evidence(scene, stacked(rows), matches, agreeing(matches, scene.cameras.c2w))
+    return Evidence(scene, stacked(rows), matches, agreeing(matches, scene.cameras.c2w), corners)

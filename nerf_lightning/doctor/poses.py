@@ -1,13 +1,19 @@
 """Checks of the poses against the pixels: places that photographs share must lie where the cameras say."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.clear_pairs import clear_pairs
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.doctor.proofs import Proof, strongest_proof
+from nerf_lightning.doctor.refit import with_pose
+from nerf_lightning.doctor.second_opinion import CONVINCING, BetterPose, better_pose, is_vouched_for
 
 FEWEST = 200
 """Matches below which nothing is said of the whole capture."""
@@ -24,6 +30,11 @@ ZOOMS = (0.25, 0.33, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.4, 1
 # By which the focal length may be off before it is noted, and before it is wrong.
 OFF, FAR_OFF = 1.15, 1.35
 CLEARER = 0.01
+# Contradicted views of which a better pose is looked for, and told of.
+MOST_REFITTED, MOST_TOLD = 20, 3
+# Pairs of photographs that must be clear before all poses are wrong, and the share of them that contradicts the poses.
+FEWEST_CLEAR, MOST_AGAINST = 4, 0.8
+DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; more or larger photographs help to tell."
 NOT_JUDGED = "not judged: too few details could be found again from one photograph to another"
 
 
@@ -51,21 +62,38 @@ def poses_and_pixels(evidence: Evidence) -> Check:
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
     if share >= SOUND:
         return Check(name, "ok", message)
+    return _by_clear_pairs(evidence, message)
+
+
+def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
+    """Judge all poses by pairs of photographs whose details are no mistakes, since most matches do not agree."""
+    name, pairs = "poses and pixels", clear_pairs(evidence.matches, evidence.scene.cameras)
+    against = [pair for pair in pairs if pair.contradicts]
+    if len(pairs) < FEWEST_CLEAR:
+        return Check(name, "look", f"{message}; too few photographs share enough details to tell", DOUBTFUL)
+    share = len(against) / len(pairs)
+    message += f"; {len(against)} of {len(pairs)} pairs whose details fit each other contradict the poses"
+    if share <= 1 - MOST_AGAINST:
+        return Check(name, "ok", message)
     cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
-    return Check(name, "wrong" if share < HOPELESS else "look", message, cure)
+    if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
+        return Check(name, "look", message, cure)
+    return Check(name, "wrong", message, cure, (against[0].proof,))
 
 
 def focal_length(evidence: Evidence) -> Check:
     """Judge whether another focal length explains the pixels better."""
-    name, matches, c2w = "focal length", thinned(evidence.matches, ENOUGH), evidence.scene.cameras.c2w
+    name, matches, cameras = "focal length", thinned(evidence.matches, ENOUGH), evidence.scene.cameras
+    c2w = cameras.c2w
     shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
     if len(matches.view) < FEWEST or max(shares.values()) < HOPELESS:
         return Check(name, "ok", NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
     best = max(shares, key=lambda zoom: shares[zoom])
     off = max(best, 1 / best)
-    focal = float(evidence.scene.cameras.focal.median())
+    focal = float(cameras.focal.median())
     if off < OFF or shares[best] < shares[1.0] + CLEARER:
         return Check(name, "ok", f"{focal:.0f} pixels (median) fits the poses and the pixels best")
+    against = agreeing(evidence.matches, c2w, best) & ~evidence.agrees
     return Check(
         name,
         "wrong" if off >= FAR_OFF else "look",
@@ -73,6 +101,7 @@ def focal_length(evidence: Evidence) -> Check:
         f"details agree instead of {100 * shares[1.0]:.0f} %",
         f"Set the focal length to about {best * focal:.0f} pixels (it is {focal:.0f}); often it belongs to photographs "
         "of another size, or the field of view is that of the other side.",
+        strongest_proof(evidence.matches, against, replace(cameras, focal=best * cameras.focal)),
     )
 
 
@@ -83,19 +112,56 @@ def single_poses(evidence: Evidence) -> Check:
         reason = "too few details" if len(matches.view) < FEWEST else "the poses as a whole do not fit"
         return Check(name, "ok", f"not judged: {reason}")
     bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
+    found = f"{judged} views could be judged"
     if not bad:
-        return Check(name, "ok", f"{judged} views could be judged, and agree with their neighbours (least {least:.0%})")
-    usual = evidence.agreement
-    fits = {view: fit for view in bad[:10] if (fit := fitting_pose(matches, c2w, view, 0.6 * usual)) is not None}
-    swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items()]
+        return Check(name, "ok", f"{found}, and agree with their neighbours (least {least:.0%})")
+    others = [view for view in range(len(c2w)) if view not in bad]
+    doubted = [view for view in bad if not is_vouched_for(evidence, view, others)]
+    if not doubted:
+        return Check(name, "ok", f"{found}; {evidence.named(bad)} agree with the views that stand nearest")
+    better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(evidence, view, bad))]
+    if not better:
+        message = f"few details that {evidence.named(doubted)} share with others lie where the cameras say"
+        cure = (
+            "No other pose fits better, so it may be details that repeat or shine. See whether they come out blurred."
+        )
+        return Check(name, "look", message, cure)
+    return _wrong_poses(evidence, better, bad)
+
+
+def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[int]) -> Check:
+    c2w = evidence.scene.cameras.c2w
+    least, views = CONVINCING * evidence.agreement, [pose.view for pose in better]
+    fits = {view: fitting_pose(evidence.matches, c2w, view, suspects, least) for view in views}
+    swapped = [
+        f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items() if b is not None
+    ]
+    turned = [
+        f"{evidence.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % "
+        f"of its details lie where that one says, {100 * pose.before:.0f} % where the given one does)"
+        for pose in better
+        if fits[pose.view] is None
+    ]
     return Check(
-        name,
+        "single poses",
         "wrong",
-        f"the pose of {evidence.named(bad)} contradicts what its photograph shares with others"
-        + (f"; {'; '.join(swapped)}" if swapped else ""),
+        f"the pose of {evidence.named(views)} contradicts what its photograph shares with others; "
+        + "; ".join([*swapped, *turned][:MOST_TOLD]),
         "Give each photograph its own pose (swap them back), or remove these views (scene.frames, or from the file)."
         if swapped
         else "Remove these views (scene.frames, or from the file), or estimate their poses anew.",
+        tuple(proof for pose in better for proof in _proof_of(evidence, pose)),
+    )
+
+
+def _proof_of(evidence: Evidence, pose: BetterPose) -> tuple[Proof, ...]:
+    matches, cameras = evidence.matches, evidence.scene.cameras
+    c2w = with_pose(cameras.c2w, pose.view, pose.pose)
+    against = (
+        agreeing(matches, c2w) & ~evidence.agrees & torch.isin(matches.view, torch.tensor(pose.neighbors)).any(dim=1)
+    )
+    return strongest_proof(
+        matches, against & (matches.view == pose.view).any(dim=1), replace(cameras, c2w=c2w), pose.view
     )
 
 
@@ -154,12 +220,14 @@ def thinned(matches: Matches, most: int) -> Matches:
     return matches.where(slice(None, None, step))
 
 
-def fitting_pose(matches: Matches, c2w: Float[Tensor, "views 3 4"], view: int, least: float) -> int | None:
-    """Return the view whose camera fits this view's photograph, if one does."""
+def fitting_pose(
+    matches: Matches, c2w: Float[Tensor, "views 3 4"], view: int, suspects: list[int], least: float
+) -> int | None:
+    """Return the suspect whose camera fits this view's photograph, if one does: the two were mixed up."""
     rows = (matches.view == view).any(dim=1)
     own = matches.where(rows)
     best, best_share = None, least
-    for other in range(len(c2w)):
+    for other in suspects:
         if other == view:
             continue
         tried = c2w.clone()
@@ -186,12 +254,17 @@ def _best_reading(name: str, evidence: Evidence, readings: tuple[Reading, ...], 
     if shares[best] < max(given + BETTER, HOPELESS):
         # Where nothing fits, poses_and_pixels says so.
         return Check(name, "ok", f"{fine}: no other reading fits the pixels better")
+    poses, changed = readings[best].change(scene, evidence.matches)
+    same_pictures = changed is evidence.matches
+    fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if same_pictures else None
+    against = agreeing(changed, poses) & ~evidence.agrees
     return Check(
         name,
         "wrong",
         f"the poses look {readings[best].says}: {100 * shares[best]:.0f} % of matched details then agree, instead of "
         f"{100 * given:.0f} %",
         readings[best].cure,
+        strongest_proof(evidence.matches, against, fits),
     )
 
 

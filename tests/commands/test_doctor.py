@@ -49,13 +49,18 @@ def test_a_good_capture(corner, doctor, tmp_path):
     assert json.loads((tmp_path / "examined" / "doctor.json").read_text())["scene"] == "transforms"
     with Image.open(tmp_path / "examined" / "doctor.png") as picture:
         assert picture.size == (1500, 1150)
+    assert not (tmp_path / "examined" / "doctor_proof.png").exists()
     lines = result.out.splitlines()
     assert sum(line.startswith(("ok ", "look ", "wrong ")) for line in lines) == len(checks)
     assert "0 wrong; 10 views examined in" in result.out
 
 
-def test_opencv_axes_are_printed_with_their_cure(corner, doctor):
+def test_opencv_axes_are_printed_with_their_cure(corner, doctor, tmp_path):
     result, checks = doctor(corner(lambda poses: poses * [1.0, -1.0, -1.0, 1.0]))
+    # What a person can check: the details, and the lines that they should lie on.
+    assert "doctor_proof.png" in result.out
+    with Image.open(tmp_path / "examined" / "doctor_proof.png") as picture:
+        assert picture.size[0] == 1440
     assert result.code == 0
     assert checks["axes"]["verdict"] == "wrong"
     assert "OpenCV" in checks["axes"]["message"]

@@ -154,6 +154,12 @@ def test_a_principal_point_of_another_size_is_named():
     assert "photographs of 0.5 times the size" in check.message
 
 
+def test_photographs_that_were_cropped_elsewhere_each_are_not_wrong():
+    center = corner_scene().cameras.center.clone()
+    center[::3] *= 0.5
+    judged(with_cameras(center=center), "principal point", "look", "cropped is fine")
+
+
 def test_fields_of_view_that_no_lens_has_are_wrong():
     focal = corner_scene().cameras.focal
     judged(with_cameras(focal=focal * 30), "field of view", "wrong")

@@ -4,12 +4,12 @@ from dataclasses import replace
 from functools import cache
 
 import torch
+from support import planted_poses
 from support.corner import FOCAL, HEIGHT, WIDTH, corner_poses, photograph
 
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.doctor import poses
 from nerf_lightning.doctor.check import Check, Evidence
-from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.examine import CHECKS, gather_evidence
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
@@ -52,9 +52,7 @@ def corner_evidence() -> Evidence:
 
 def with_poses(c2w: torch.Tensor) -> Evidence:
     """The same photographs, so the same matches, with other poses."""
-    sound = corner_evidence()
-    cameras = replace(sound.scene.cameras, c2w=c2w)
-    return replace(sound, scene=replace(sound.scene, cameras=cameras), agrees=agreeing(sound.matches, c2w))
+    return planted_poses.with_poses(corner_evidence(), c2w)
 
 
 def with_scene(**changes) -> Evidence:

@@ -1,0 +1,139 @@
+"""A pose is called wrong only with a proof that a person can check: another pose that fits, and a picture of both."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from support.doctor_scene import VIEWS, corner_evidence, corner_scene, with_poses
+from support.planted_poses import rotation_about
+
+from nerf_lightning.doctor.conventions import FLIP_YZ, axes
+from nerf_lightning.doctor.epipolar import agreeing, line_distances
+from nerf_lightning.doctor.features import Corners
+from nerf_lightning.doctor.poses import axes_convention, poses_and_pixels, single_poses
+from nerf_lightning.doctor.proof_picture import MOST_DETAILS, proof_picture, spread_out
+from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
+
+VIEW = 5
+
+
+def with_mistaken_matches(evidence, share=1.0, view=VIEW):
+    """A part of one photograph's details were taken for others that look the same."""
+    random = torch.Generator().manual_seed(2)
+    rows = (evidence.matches.view == view).any(dim=1).nonzero()[:, 0]
+    rows = rows[torch.rand(len(rows), generator=random) < share]
+    plane = evidence.matches.plane.clone()
+    plane[rows, 1] = plane[rows[torch.randperm(len(rows), generator=random)], 1]
+    matches = replace(evidence.matches, plane=plane)
+    return replace(evidence, matches=matches, agrees=agreeing(matches, evidence.scene.cameras.c2w))
+
+
+def without_corners(evidence, view=VIEW):
+    """Nothing can be found again in one photograph."""
+    blank = Corners(torch.zeros(0, 2), evidence.corners[view].descriptor[:0], torch.zeros(0, 3))
+    return replace(evidence, corners={**evidence.corners, view: blank})
+
+
+def turned(degrees, view=VIEW):
+    c2w = corner_scene().cameras.c2w.clone()
+    c2w[view, :, :3] = rotation_about(torch.tensor([1.0, 0.5, 0.0]), degrees) @ c2w[view, :, :3]
+    return with_poses(c2w)
+
+
+def test_a_pose_that_the_nearest_views_confirm_is_right_whatever_others_say():
+    check = single_poses(with_mistaken_matches(corner_evidence()))
+    assert check.verdict == "ok"
+    assert "view 5.png agree with the views that stand nearest" in check.message
+
+
+def test_matches_that_no_pose_explains_prove_nothing():
+    evidence = without_corners(with_mistaken_matches(corner_evidence()))
+    others = [view for view in range(VIEWS) if view != VIEW]
+    assert not is_vouched_for(evidence, VIEW, others)
+    assert better_pose(evidence, VIEW, [VIEW]) is None
+    check = single_poses(evidence)
+    assert check.verdict == "look"
+    assert "No other pose fits better" in check.cure
+
+
+def test_a_pose_that_explains_less_than_most_of_the_matches_proves_nothing():
+    """It may belong to the other side of a thing whose sides look alike."""
+    evidence = with_mistaken_matches(turned(10.0), 0.5)
+    assert better_pose(turned(10.0), VIEW, [VIEW]) is not None
+    assert better_pose(evidence, VIEW, [VIEW]) is None
+    assert single_poses(evidence).verdict == "look"
+
+
+@pytest.mark.parametrize("degrees", [3.0, 10.0])
+def test_the_pose_that_fits_is_the_one_before_the_camera_was_turned(degrees):
+    evidence = turned(degrees)
+    found = better_pose(evidence, VIEW, [VIEW])
+    assert found.degrees == pytest.approx(degrees, abs=0.4)
+    right = corner_scene().cameras.c2w
+    apart = float((found.pose[:, 3] - right[VIEW, :, 3]).norm())
+    assert apart < 0.05 * float((right[0, :, 3] - right[-1, :, 3]).norm())
+    check = single_poses(evidence)
+    assert check.verdict == "wrong"
+    assert "the pose of view 5.png contradicts" in check.message
+    assert "degrees away" in check.message
+
+
+def test_a_proof_holds_details_off_the_given_lines_and_on_those_that_fit():
+    (proof,) = single_poses(turned(5.0)).proofs
+    given = with_poses(turned(5.0).scene.cameras.c2w).scene.cameras.c2w
+    assert len(proof.matches.view) >= 8
+    assert set(proof.matches.view[:, 0].tolist()) == {VIEW}
+    assert float(line_distances(proof.matches, given).median()) > 4.0
+    assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
+
+
+def test_another_convention_is_proved_with_cameras_that_fit():
+    evidence = with_poses(axes(corner_scene().cameras.c2w, FLIP_YZ))
+    (proof,) = axes_convention(evidence).proofs
+    assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
+    assert not bool(agreeing(proof.matches, evidence.scene.cameras.c2w).any())
+
+
+def with_mistaken_pairs(evidence, share):
+    """Of so many pairs of photographs, the details were taken for others that look the same."""
+    _, pair = evidence.matches.view.unique(dim=0, return_inverse=True)
+    random = torch.Generator().manual_seed(4)
+    plane = evidence.matches.plane.clone()
+    for number in torch.randperm(int(pair.max()) + 1, generator=random)[: int(share * (int(pair.max()) + 1))].tolist():
+        rows = (pair == number).nonzero()[:, 0]
+        plane[rows, 1] = plane[rows[torch.randperm(len(rows), generator=random)], 1]
+    matches = replace(evidence.matches, plane=plane)
+    return replace(evidence, matches=matches, agrees=agreeing(matches, evidence.scene.cameras.c2w))
+
+
+def test_mistakes_do_not_make_all_poses_wrong():
+    evidence = with_mistaken_pairs(corner_evidence(), 1.0)
+    assert evidence.agreement < 0.3
+    assert poses_and_pixels(evidence).verdict == "look"
+
+
+def test_a_few_clear_pairs_tell_whether_all_poses_are_right():
+    right = with_mistaken_pairs(corner_evidence(), 0.7)
+    assert right.agreement < 0.4
+    assert poses_and_pixels(right).verdict == "ok"
+    order = torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3))
+    wrong = with_mistaken_pairs(with_poses(corner_scene().cameras.c2w[order]), 0.7)
+    check = poses_and_pixels(wrong)
+    assert check.verdict == "wrong"
+    assert bool((line_distances(check.proofs[0].matches, check.proofs[0].fits.c2w) < 1.5).all())
+
+
+def test_the_picture_has_a_row_for_each_proof():
+    evidence = turned(5.0)
+    proofs = single_poses(evidence).proofs
+    one, two = (proof_picture(evidence.scene, proofs * count) for count in (1, 2))
+    assert one.shape[1] == two.shape[1]
+    assert two.shape[0] > 1.8 * one.shape[0]
+    assert int(one.float().std()) > 10
+
+
+def test_details_that_are_shown_lie_apart():
+    (proof,) = single_poses(turned(5.0)).proofs
+    shown = spread_out(proof.matches, MOST_DETAILS)
+    assert len(shown.view) == MOST_DETAILS
+    assert float(torch.pdist(shown.plane[:, 0]).min()) > 2.0 * float(torch.pdist(proof.matches.plane[:, 0]).min())

@@ -1,0 +1,122 @@
+"""Faults planted in captures whose poses are right, one at a time, and whether they were found."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.conventions import FLIP_YZ, axes, inverted
+from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.poses import CHECKS
+from nerf_lightning.nerf.geometry.frames import focus_point
+
+
+@dataclass(frozen=True)
+class Found:
+    """What became of one planted fault."""
+
+    fault: str
+    wrong: bool
+    """Some check of the poses says `wrong`."""
+    said: bool
+    """Some check says `wrong` or `look`."""
+    named: bool
+    """The views with wrong poses are named, each of them."""
+    accused: int
+    """Innocent views that are called wrong."""
+    text: str
+
+
+def with_poses(evidence: Evidence, c2w: torch.Tensor) -> Evidence:
+    """The same photographs, so the same matches, with other poses."""
+    cameras = replace(evidence.scene.cameras, c2w=c2w)
+    return replace(evidence, scene=replace(evidence.scene, cameras=cameras), agrees=agreeing(evidence.matches, c2w))
+
+
+def with_focal(evidence: Evidence, factor: float) -> Evidence:
+    """The same photographs with another focal length (lenses aside)."""
+    cameras = replace(evidence.scene.cameras, focal=factor * evidence.scene.cameras.focal)
+    matches = replace(evidence.matches, plane=evidence.matches.plane / factor, focal=evidence.matches.focal * factor)
+    scene = replace(evidence.scene, cameras=cameras)
+    return replace(evidence, scene=scene, matches=matches, agrees=agreeing(matches, cameras.c2w))
+
+
+def rotation_about(axis: torch.Tensor, degrees: float) -> torch.Tensor:
+    """Return the rotation about an axis of any length."""
+    x, y, z = torch.nn.functional.normalize(axis, dim=0).tolist()
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return torch.matrix_exp(cross * torch.deg2rad(torch.tensor(degrees)))
+
+
+def turned(evidence: Evidence, degrees: float, random: torch.Generator) -> tuple[Evidence, list[int]]:
+    """One camera turned on the spot about any axis."""
+    c2w, view = evidence.scene.cameras.c2w.clone(), _any_view(evidence, random)
+    c2w[view, :, :3] = rotation_about(torch.randn(3, generator=random), degrees) @ c2w[view, :, :3]
+    return with_poses(evidence, c2w), [view]
+
+
+def moved(evidence: Evidence, share: float, random: torch.Generator) -> tuple[Evidence, list[int]]:
+    """One camera moved by a share of the usual distance to where cameras look."""
+    c2w, view = evidence.scene.cameras.c2w.clone(), _any_view(evidence, random)
+    middle = focus_point(c2w.double()).float()
+    away = float((c2w[:, :, 3] - middle).norm(dim=-1).median())
+    c2w[view, :, 3] += share * away * torch.nn.functional.normalize(torch.randn(3, generator=random), dim=0)
+    return with_poses(evidence, c2w), [view]
+
+
+def swapped(evidence: Evidence, random: torch.Generator) -> tuple[Evidence, list[int]]:
+    """Two poses swapped."""
+    first = _any_view(evidence, random)
+    others = [view for view in evidence.matches.views if view != first]
+    second = others[int(torch.randint(len(others), (), generator=random))]
+    order = list(range(len(evidence.scene.view_names)))
+    order[first], order[second] = second, first
+    return with_poses(evidence, evidence.scene.cameras.c2w[order]), [first, second]
+
+
+def _any_view(evidence: Evidence, random: torch.Generator) -> int:
+    views = evidence.matches.views
+    return views[int(torch.randint(len(views), (), generator=random))]
+
+
+Fault = Callable[[Evidence, torch.Generator], tuple[Evidence, list[int]]]
+
+
+def _whole(change: Callable[[torch.Tensor], torch.Tensor]) -> Fault:
+    return lambda evidence, random: (with_poses(evidence, change(evidence.scene.cameras.c2w)), [])
+
+
+def _focal(factor: float) -> Fault:
+    return lambda evidence, random: (with_focal(evidence, factor), [])
+
+
+FAULTS: dict[str, Fault] = {
+    "one camera turned by 3 degrees": lambda evidence, random: turned(evidence, 3.0, random),
+    "one camera turned by 5 degrees": lambda evidence, random: turned(evidence, 5.0, random),
+    "one camera turned by 10 degrees": lambda evidence, random: turned(evidence, 10.0, random),
+    "one camera moved by a fifth of its distance": lambda evidence, random: moved(evidence, 0.2, random),
+    "two poses swapped": swapped,
+    "OpenCV's axes": _whole(lambda c2w: axes(c2w, FLIP_YZ)),
+    "world to camera": _whole(inverted),
+    "axes x and y mirrored": _whole(lambda c2w: axes(c2w, (-1.0, -1.0, 1.0))),
+    "each with the pose of the next": _whole(lambda c2w: c2w.roll(1, 0)),
+    "focal length halved": _focal(0.5),
+    "focal length 1.5 times": _focal(1.5),
+    "focal length doubled": _focal(2.0),
+}
+
+
+def plant(evidence: Evidence, fault: str, seed: int) -> Found:
+    """Plant a fault in a sound capture and examine it again."""
+    spoilt, bad = FAULTS[fault](evidence, torch.Generator().manual_seed(seed))
+    checks: list[Check] = [check(spoilt) for check in CHECKS]
+    wrong = [check for check in checks if check.verdict == "wrong"]
+    single = next((check.message for check in checks if check.name == "single poses" and check.verdict == "wrong"), "")
+    accused = single.split("the pose of ")[-1].split(" contradict")[0]
+    names = [evidence.scene.view_names[view] for view in bad]
+    named = all(name in accused for name in names) if bad else bool(wrong)
+    total = accused.count(",") + accused.count(" and ") + 1 if accused else 0
+    innocent = max(0, total - sum(name in accused for name in names)) if bad or accused else 0
+    text = "; ".join(f"{check.name}: {check.message}" for check in wrong)
+    return Found(fault, bool(wrong), any(check.verdict != "ok" for check in checks), named, innocent, text)
