@@ -1,14 +1,55 @@
 """A level that only proposes where to look: density without colour."""
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.samplers.base import Sampler
 from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.renderings import FieldOutput
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
 
 class ProposalLevel(DenseLevel):
-    """Sample, ask the field for density alone, and hand the weights on; its picture is black."""
+    """Sample, ask the field for density alone, and hand the weights on; its picture is black.
+
+    Where to look changes slower than what is seen there, so after the first steps it need not learn in each of them:
+    the time is better spent on more steps.
+
+    Args:
+        sampler: where the field is asked.
+        field: its density is all that is used.
+        learn_every: steps from one in which it learns to the next.
+        learn_always: so many steps at first, it learns in each.
+    """
 
     has_color = False
+
+    def __init__(self, sampler: Sampler, field: Field, learn_every: int = 1, learn_always: int = 100):
+        super().__init__(sampler, field)
+        require_ranges(locals(), {"learn_every": (1, 1 << 20), "learn_always": (0, 1 << 31)})
+        self.learn_every, self.learn_always = learn_every, learn_always
+        self._learns = True
+
+    def update(self, step: int, key: int) -> None:
+        """Decide whether the next step is one to learn in."""
+        super().update(step, key)
+        self._learns = step < self.learn_always or step % self.learn_every == 0
+
+    def forward(
+        self,
+        rays: RayBundle,
+        background: Float[Tensor, "*rays 3"] | None,
+        history: list[DenseRendering],
+        random: RayRandom | None,
+    ) -> DenseRendering:
+        """Sample, ask the field for its density, and return the weights; without gradients where it does not learn."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and self._learns):
+            return super().forward(rays, background, history, random)
 
     def look(self, points: Points) -> FieldOutput:
         """Return the density, and black."""

@@ -1,11 +1,14 @@
+import pytest
 import torch
-from support.scenes import ball_scene, some_rays, tiny_model
+from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from support.steps import rays_of
 
+from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
 
 def test_levels_run_in_order_and_the_fine_one_sees_the_union():
@@ -41,3 +44,14 @@ def test_a_picture_is_the_same_whatever_its_tiles():
     assert pictures[0].rgb.shape == (12, 12, 3)
     torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
     torch.testing.assert_close(pictures[0].depth, pictures[1].depth)
+
+
+@pytest.mark.parametrize(("step", "learns"), [(0, True), (9, True), (10, False), (11, False), (12, True), (13, False)])
+def test_after_the_first_steps_proposals_learn_now_and_then(step, learns):
+    proposal = ProposalLevel(StratifiedSampler(8), tiny_field(), learn_every=4, learn_always=10)
+    rays = some_rays(5)
+    proposal.update(step, key=0)
+    rendering = proposal(rays, None, [], batch_random(0, 5, rays.near.device))
+    assert rendering.weights.requires_grad == learns
+    again = ProposalLevel(StratifiedSampler(8), proposal.field)
+    assert torch.equal(again(rays, None, [], batch_random(0, 5, rays.near.device)).weights, rendering.weights)
