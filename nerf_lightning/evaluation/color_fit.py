@@ -4,12 +4,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 
 FEWEST = 8
 """Pixels from which twelve numbers are not fitted."""
 
 
+@own_precision
 def color_corrected(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],

@@ -20,7 +20,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from support.configs import composed, loaded, options
-from support.scenes import ball_scene, some_rays
+from support.scenes import ball_scene, some_rays, tiny_model
 from torch import Tensor, nn
 
 import nerf_lightning
@@ -142,6 +142,9 @@ def known() -> dict[str, Any]:
         "within": torch.rand(64, 3, generator=drawn), "occupied": torch.rand(1, 1, 1, 1, generator=drawn) > 2,
         "before": 8, "lower": (-0.3, -0.2, -0.1), "upper": (0.7, 0.9, 1.1),
         "name": "target", "longest": 12, "given": [0.31, 0.17, -0.93],
+        "one": scene.cameras.c2w, "other": 1.3 * scene.cameras.c2w.flip(0), "by": to_user.double(),
+        "angles": torch.rand(RAYS, 2, generator=drawn), "vector": 0.3 * points, "light": background,
+        "gain": background + 0.5, "tile_points": 500, "fitted": picture[..., 0] > 0.3, "whole_from": 3.0,
     }  # fmt: skip
 
 
@@ -159,6 +162,10 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "video.paths.base.frame_of": {"up": (0.1, 0.2, 0.97)},
     "video.paths.base.PathFrame.direction": {"given": (0.31, 0.17, -0.93)},
     "video.paths.base.PathFrame.size": {"width": 24, "height": None},
+    "nerf.geometry.panoramas.panorama_cameras": {"width": 24, "height": 12},
+    "nerf.rendering.near_gradients.soften_near_gradients": {"distance": torch.rand(40, 8)},
+    "evaluation.camera_fit.fitted_camera": {"model": tiny_model().eval(), "background": "white"},
+    "evaluation.color_fit.exposure_fitted": {"opacity": torch.ones(48, 48)},
     "nerf.rendering.blending.background_colors": {"background": "random"},
     "nerf.rendering.blending.photograph": {"background": "white"},
     "nerf.rendering.packed.composite_packed": {"output": Known("packed output"), "samples": Known("packed samples")},

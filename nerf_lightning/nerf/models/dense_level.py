@@ -3,21 +3,36 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.ranges import require_ranges
+from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.sample_points import points_along
-from nerf_lightning.nerf.samplers.base import DenseSampler
+from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
 
 
 class DenseLevel(Level):
-    """A level in which every ray has the same number of samples."""
+    """A level in which every ray has the same number of samples.
+
+    Args:
+        sampler: where the field is asked.
+        field: density and colour.
+        whole_gradients_from: from this distance on (scene units) gradients are whole, nearer to the camera they are
+            smaller, against floaters (`soften_near_gradients`); 0: whole everywhere.
+    """
 
     sampler: DenseSampler
     sampler_kind = DenseSampler
+
+    def __init__(self, sampler: Sampler, field: Field, whole_gradients_from: float = 0.0):
+        super().__init__(sampler, field)
+        require_ranges(locals(), {"whole_gradients_from": (0, float("inf"))})
+        self.whole_gradients_from = whole_gradients_from
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
@@ -38,7 +53,10 @@ class DenseLevel(Level):
     ) -> DenseRendering:
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
-        return composite(self.look(points_along(rays, samples, random)), samples, rays, background)
+        seen = self.look(points_along(rays, samples, random))
+        if random is not None:
+            seen = soften_near_gradients(seen, samples.midpoints, self.whole_gradients_from)
+        return composite(seen, samples, rays, background)
 
     def look(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""

@@ -25,12 +25,20 @@ class ProposalLevel(DenseLevel):
         field: its density is all that is used.
         learn_every: steps from one in which it learns to the next.
         learn_always: so many steps at first, it learns in each.
+        whole_gradients_from: as in `DenseLevel`.
     """
 
     has_color = False
 
-    def __init__(self, sampler: Sampler, field: Field, learn_every: int = 1, learn_always: int = 100):
-        super().__init__(sampler, field)
+    def __init__(
+        self,
+        sampler: Sampler,
+        field: Field,
+        learn_every: int = 1,
+        learn_always: int = 100,
+        whole_gradients_from: float = 0.0,
+    ):
+        super().__init__(sampler, field, whole_gradients_from)
         require_ranges(locals(), {"learn_every": (1, 1 << 20), "learn_always": (0, 1 << 31)})
         self.learn_every, self.learn_always = learn_every, learn_always
         self._learns = True

@@ -133,7 +133,8 @@ def test_psnr_is_that_of_unmasked_pixels_and_ssim_sees_no_other_difference():
     kept = torch.zeros(16, 16, dtype=torch.bool)
     kept[:, :4] = True
     render = truth + torch.where(kept[..., None], 0.0, 0.9)
-    assert image_metrics(render, truth, kept) == {"psnr": pytest.approx(100.0), "ssim": pytest.approx(1.0)}
+    perfect = {"psnr": pytest.approx(100.0), "cc_psnr": pytest.approx(100.0), "ssim": pytest.approx(1.0)}
+    assert image_metrics(render, truth, kept) == perfect
     truth = torch.full((16, 16, 3), 0.3)
     off = truth + 0.1
     assert image_metrics(off, truth, kept)["psnr"] == pytest.approx(20.0, abs=1e-3)

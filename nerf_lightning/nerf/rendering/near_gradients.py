@@ -1,0 +1,41 @@
+"""Gradients made smaller near cameras, against floaters (Philip and Deschaintre, EGSR 2023, arXiv 2305.02756)."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.types.renderings import FieldOutput
+
+
+def soften_near_gradients(
+    output: FieldOutput, distance: Float[Tensor, "*rays samples"], whole_from: float
+) -> FieldOutput:
+    """Return the same values, whose gradients are multiplied by min(1, (distance / whole_from)^2).
+
+    The volume that a camera's pixels share is small near it, so points there receive as many gradients from one
+    photograph as those farther away do from all: matter grows before a camera, which no other photograph contradicts.
+
+    Args:
+        output: density and colour of samples.
+        distance: from the camera, scene units.
+        whole_from: from this distance on gradients are whole; 0: everywhere.
+    """
+    if whole_from == 0:
+        return output
+    share = (distance.detach() / whole_from).square().clamp(max=1.0)
+    return FieldOutput(_Scaled.apply(output.density, share), _Scaled.apply(output.rgb, share[..., None]))
+
+
+class _Scaled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, share: Tensor) -> Tensor:
+        ctx.save_for_backward(share)
+        return values.view_as(values)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (share,) = ctx.saved_tensors
+        return grad * share, None
