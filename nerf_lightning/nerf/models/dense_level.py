@@ -14,6 +14,7 @@ from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput
+from nerf_lightning.nerf.types.scene import Scene
 
 
 class DenseLevel(Level):
@@ -23,7 +24,8 @@ class DenseLevel(Level):
         sampler: where the field is asked.
         field: density and colour.
         whole_gradients_from: from this distance on (scene units) gradients are whole, nearer to the camera they are
-            smaller, against floaters (`soften_near_gradients`); 0: whole everywhere.
+            smaller, against floaters (`soften_near_gradients`); 0: whole everywhere, as where rays are normalised
+            device coordinates, in which no distance is one.
     """
 
     sampler: DenseSampler
@@ -37,6 +39,12 @@ class DenseLevel(Level):
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
         return float(self.sampler.num_samples_after(int(before)))
+
+    def fit_to(self, scene: Scene) -> None:
+        """Take note of where the scene's content lies, and whether its distances are any."""
+        super().fit_to(scene)
+        if scene.cameras.ndc is not None:
+            self.whole_gradients_from = 0.0
 
     def compile_field(self) -> bool:
         """Compile the field, for static shapes: dynamic ones may be specialised otherwise after a resume."""

@@ -1,6 +1,8 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from support.scenes import some_rays, tiny_field
+from support.scenes import ball_scene, some_rays, tiny_field
 
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.randomness import batch_random
@@ -33,3 +35,12 @@ def test_a_level_softens_them_in_training_alone(training):
     whole = gradient(0.0)
     assert torch.equal(gradient(1e-6), whole)
     assert torch.equal(gradient(100.0), whole) != training
+
+
+@pytest.mark.parametrize("ndc", [False, True])
+def test_in_normalised_device_coordinates_no_distance_is_one(ndc):
+    scene = ball_scene()
+    scale = torch.ones(len(scene.cameras.c2w), 2) if ndc else None
+    level = DenseLevel(StratifiedSampler(8), tiny_field(), 2.0)
+    level.fit_to(replace(scene, cameras=replace(scene.cameras, ndc=scale)))
+    assert level.whole_gradients_from == (0.0 if ndc else 2.0)
