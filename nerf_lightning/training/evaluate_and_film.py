@@ -118,7 +118,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Return the lines that a person reads at the end."""
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
-    halves = "" if protocol["colors"] == COLORS["raw"] else f" ({protocol['colors']})"
+    halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
         f"({metrics['num_images']} views, {protocol['background']} background)",

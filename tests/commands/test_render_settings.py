@@ -247,7 +247,7 @@ def test_a_killed_render_goes_on_to_a_video(nerf, last, tmp_path):
         f"paths.output_dir={tmp_path}",
     ]
     process = start(*arguments)
-    while process.poll() is None and len(list(tmp_path.glob(".frames/depth/*.png"))) < 3:
+    while process.poll() is None and len(list(tmp_path.glob(".frames/depth/frame_*.png"))) < 3:
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=60)

@@ -138,8 +138,8 @@ def blending_weights(num_levels: int, share: float) -> list[float]:
 
     w_l = (1 - cos(pi a)) / 2 with a = share (L - 1) - (l - 1), held within 0 and 1 (Eq. 14, arXiv 2104.06405).
 
-    >>> blending_weights(3, 0.0), blending_weights(3, 0.75), blending_weights(3, 1.0)
-    ([1.0, 0.0, 0.0], [1.0, 1.0, 0.5], [1.0, 1.0, 1.0])
+    >>> [[round(weight, 3) for weight in blending_weights(3, share)] for share in (0.0, 0.75, 1.0)]
+    [[1.0, 0.0, 0.0], [1.0, 1.0, 0.5], [1.0, 1.0, 1.0]]
     """
     risen = [min(1.0, max(0.0, share * (num_levels - 1) - (level - 1))) for level in range(1, num_levels)]
     return [1.0, *(0.5 - 0.5 * math.cos(math.pi * part) for part in risen)]

@@ -43,8 +43,9 @@ def rotation_from_vector(vector: Float[Tensor, "*views 3"]) -> Float[Tensor, "*v
     exp(K) = I + (sin a / a) K + ((1 - cos a) / a^2) K^2 (Rodrigues), where a is the length and K x = vector cross x.
     Near zero both coefficients are their Taylor series in a^2, so that gradients are finite at zero, too.
 
-    >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round().tolist()  # a quarter turn around z
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    >>> quarter_turn = rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2]))  # around z
+    >>> (quarter_turn @ torch.tensor([1.0, 2.0, 3.0])).round().tolist()
+    [-2.0, 1.0, 3.0]
     """
     square = vector.square().sum(dim=-1)
     is_small = square < SMALL_ANGLE**2
