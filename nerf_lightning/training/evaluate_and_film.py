@@ -119,12 +119,14 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     protocol = metrics["protocol"]
     ssim = "not computed" if metrics["ssim"] is None else f"{metrics['ssim']:.4f}"
     halves = "" if protocol.get("colors", COLORS["raw"]) == COLORS["raw"] else f" ({protocol['colors']})"
+    fitted = (
+        "" if metrics["cc_psnr"] is None else f"; {metrics['cc_psnr']:.2f} dB once each picture's colours are fitted"
+    )
     lines = [
         f"{protocol['split']} PSNR    {metrics['psnr']:.2f} dB   SSIM {ssim}   "
         f"({metrics['num_images']} views, {protocol['background']} background)",
-        f"               {metrics['cc_psnr']:.2f} dB once the colours of each picture are fitted{halves}",
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
-        f"({metrics['worst']['psnr']['name']})",
+        f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]
     if metrics["depth_error"] is not None:
         normal = metrics["normal_error"]
