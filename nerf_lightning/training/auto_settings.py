@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.console import spoken
+from nerf_lightning.doctor.check import Check
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -52,6 +53,29 @@ def settled(
         if of_photos:
             log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
     return config, chosen(choices)
+
+
+def corrected(
+    config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], checks: Sequence[Check] | None
+) -> tuple[DictConfig, dict[str, str]]:
+    """Return the config and the names picked from each group, with the correction that the photographs want.
+
+    Args:
+        config: with its model chosen.
+        choices: the names picked from each group.
+        overrides: what it was composed with.
+        checks: what the doctor says of the scene; None where it was not asked.
+    """
+    picked = chosen(choices)
+    if picked.get("correction") != AUTO:
+        return config, picked
+    found = [check for check in checks or () if check.name == "exposure" and check.verdict == "look"]
+    picked["correction"] = "exposure" if found else "none"
+    if found:
+        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", found[0].message)
+        config = copy.deepcopy(config)
+        config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
+    return config, picked
 
 
 def model_for(scene: Scene) -> tuple[str, str]:

@@ -24,7 +24,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
-from nerf_lightning.training.auto_settings import settled
+from nerf_lightning.training.auto_settings import corrected, settled
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
@@ -92,6 +92,7 @@ def build_run(*overrides: str) -> Run:
     settings.prepare_machine()
     scene: Scene = build(config.scene).read()
     config, choices = settled(config, choices, overrides, scene)
+    config, choices = corrected(config, choices, overrides, checks=None)
     run = _run(config, choices, settings, scene)
     settings.prepare(run.system.model)
     run.system.record["precision"] = settings.precision
@@ -124,6 +125,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
+    config, choices = corrected(config, choices, overrides, checks)
     run = _run(config, choices, settings, scene)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)

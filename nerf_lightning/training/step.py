@@ -30,12 +30,15 @@ from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex, Target
+from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
+# Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less.
+LEAST_OPACITY = 1e-2
 
 log = logging.getLogger(__name__)
 
@@ -297,14 +300,14 @@ class TrainStep:
         behind = background_colors(self.background, num_rays, device, random)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
-        target = Target(blend(batch.rgba, self._photographed(behind, batch.pixels)), weight, batch.pixels)
+        target = Target(blend(batch.rgba, behind), weight, batch.pixels)
 
         def lose(tile: slice) -> TileLoss:
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
             renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
-            shown = [replace(each, rgb=self.correction(each.rgb, pixels)) for each in renderings]
+            shown = [replace(each, rgb=self._photographed(each, pixels)) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile])))
             levels = levels * ((tile.stop - tile.start) / share.num_rays)
             return TileLoss(levels, renderings[-1].foreground, shown[-1].rgb)
@@ -320,10 +323,11 @@ class TrainStep:
         seen |= {"target": target.rgb, "weight": batch.weight}
         return {"losses": torch.stack([each.levels for each in lost]).sum(0)} | seen
 
-    @torch.no_grad()
-    def _photographed(self, background: Tensor | None, pixels: PixelIndex) -> Tensor | None:
-        # No camera saw it: where nothing stands before it, the correction has nothing to learn.
-        return None if background is None else self.correction(background, pixels)
+    def _photographed(self, rendering: Rendering, pixels: PixelIndex) -> Tensor:
+        # The scene's own light reached the camera. The background behind it did not: it looks the same to all.
+        opacity = rendering.opacity[:, None]
+        straight = rendering.foreground / opacity.clamp(min=LEAST_OPACITY)
+        return rendering.rgb + opacity * (self.correction(straight, pixels) - straight)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:

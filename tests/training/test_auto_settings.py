@@ -3,11 +3,15 @@
 from dataclasses import replace
 
 import pytest
+from support.configs import composed
+from support.running import FAST
 from support.scenes import ball_scene
 
 from nerf_lightning.config.compose import compose_config
+from nerf_lightning.doctor.check import Check
 from nerf_lightning.errors import InputError
-from nerf_lightning.training.auto_settings import settled
+from nerf_lightning.training.auto_settings import corrected, settled
+from nerf_lightning.training.build import build_parts
 
 IN_A_BOX = ball_scene()
 PHOTOGRAPHS = replace(IN_A_BOX, space="contracted")
@@ -60,3 +64,47 @@ def test_photographs_alone_are_examined_trained_for_minutes_and_reported():
 def test_what_is_neither_a_switch_nor_auto_is_refused():
     with pytest.raises(InputError, match="doctor=maybe does not fit"):
         chosen_for(PHOTOGRAPHS, "doctor=maybe")
+
+
+def corrected_for(verdict, *overrides):
+    config, choices = compose_config("train", overrides)
+    said = "2 of 20 differ in brightness"
+    checks = [Check("sharpness", "look", "blurred"), Check("exposure", verdict, said)] if verdict else None
+    return corrected(config, choices, overrides, checks)
+
+
+@pytest.mark.parametrize("overrides", [(), ("correction=auto",)])
+def test_photographs_whose_exposures_differ_are_corrected_and_it_is_said(caplog, overrides):
+    caplog.set_level("INFO")
+    config, choices = corrected_for("look", "model=fast_small", "field.width=32", *overrides)
+    assert (choices["correction"], choices["model"]) == ("exposure", "fast_small")
+    assert (config.correction, config.field.width) == (composed("train", "correction=exposure").correction, 32)
+    assert "correction: exposure, since 2 of 20 differ in brightness (correction=none " in caplog.text
+
+
+@pytest.mark.parametrize("verdict", ["ok", None])
+def test_other_photographs_are_taken_as_they_are(caplog, verdict):
+    caplog.set_level("INFO")
+    config, choices = corrected_for(verdict)
+    assert choices["correction"] == "none"
+    assert config.correction == composed("train", "correction=none").correction
+    assert "correction:" not in caplog.text
+
+
+def test_a_correction_that_is_named_stays():
+    for named in ("none", "exposure"):
+        for verdict in ("ok", "look"):
+            config, choices = corrected_for(verdict, f"correction={named}")
+            assert choices["correction"] == named
+            assert config.correction == composed("train", f"correction={named}").correction
+
+
+def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
+    found = [Check("exposure", "look", "one differs")]
+    monkeypatch.setattr("nerf_lightning.training.build.require_sound", lambda scene: found)
+    monkeypatch.setattr("nerf_lightning.data.bricks.reader.BricksReader.read", lambda reader: IN_A_BOX)
+    for doctor, learnt in (("on", True), ("off", False)):
+        overrides = [*FAST, f"doctor={doctor}", "trainer.precision=32-true"]
+        parts = build_parts(*compose_config("train", overrides), overrides)
+        assert bool(list(parts.system.step.correction.parameters())) == learnt
+        assert parts.system.record["choices"]["correction"] == ("exposure" if learnt else "none")

@@ -17,6 +17,15 @@ from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 
+SAME_CAMERA = ("focal", "center", "lens", "width", "height")
+"""Photographs that agree in all of these were taken with one camera."""
+
+
+def which_camera(cameras: Cameras) -> Int[Tensor, "views"]:
+    """Return the number of the camera that took each photograph, from 0."""
+    kinds = [getattr(cameras, name).double().view(len(cameras.width), -1) for name in SAME_CAMERA]
+    return torch.unique(torch.cat(kinds, dim=1), dim=0, return_inverse=True)[1]
+
 
 def focal_from_fov(width: int | float, fov: float) -> float:
     """Return the focal length in pixels of a camera that sees `fov` radians across `width` pixels.

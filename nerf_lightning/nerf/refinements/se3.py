@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import which_camera
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.ranges import require_ranges
@@ -14,8 +15,6 @@ from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 FEWEST_PHOTOGRAPHS = 2
-SAME_CAMERA = ("focal", "center", "lens", "width", "height")
-"""Photographs that agree in all of these were taken with one camera."""
 
 
 class SmallMotions(Refinement):
@@ -91,8 +90,7 @@ class SmallMotions(Refinement):
         views = len(cameras.width)
         extent = (aabb[1] - aabb[0]).norm() / 2.0
         ahead = -((aabb.mean(dim=0) - cameras.c2w[:, :, 3]) * cameras.c2w[:, :, 2]).sum(dim=1)
-        kinds = torch.cat([getattr(cameras, name).double().view(views, -1) for name in SAME_CAMERA], dim=1)
-        camera = torch.unique(kinds, dim=0, return_inverse=True)[1]
+        camera = which_camera(cameras)
         self.photographs = photographs
         self.register_buffer("extent", extent, persistent=False)
         self.register_buffer("distance", torch.maximum(ahead, extent / 2.0), persistent=False)

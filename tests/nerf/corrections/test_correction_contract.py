@@ -1,6 +1,7 @@
 """What every correction of conf/ keeps to."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -73,6 +74,23 @@ def test_gradients_are_finite_for_whatever_colours(option):
     shown.sum().backward()
     for tensor in (shown, rgb.grad, *(parameter.grad for parameter in correction.parameters())):
         assert bool(torch.isfinite(tensor).all())
+
+
+@pytest.mark.parametrize("option", LEARNT)
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_the_background_looks_the_same_to_all(option, background):
+    """No camera saw it: where nothing is, a correction changes neither what is shown nor what is asked for."""
+    scene = ball_scene()
+    scene = replace(scene, pixels=replace(scene.pixels, rgba=torch.zeros_like(scene.pixels.rgba)))
+    step = make_step(None, tiny_model(density_bias=-30.0), background)
+    step.correction = correction_of(option, scene)
+    with torch.no_grad():
+        for parameter in step.correction.parameters():
+            parameter.uniform_(-1, 1)
+    seen = step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
+    torch.testing.assert_close(seen["rgb"], seen["target"])
+    behind = seen["target"]
+    assert background == "random" or torch.equal(behind, torch.full_like(behind, float(background == "white")))
 
 
 @pytest.mark.parametrize("option", LEARNT)
