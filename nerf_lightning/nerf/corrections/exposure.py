@@ -14,8 +14,9 @@ from nerf_lightning.nerf.types.scene import Scene
 class Exposure(Correction):
     """Per photograph one exposure, and the gains of red and blue against it, all in stops of linear light.
 
-    The exposure is the mean of the three channels: green gains what red and blue lose. So a channel that a scene hardly
-    has, and of which little can be known, spoils neither of the others.
+    The exposure is the mean of the three channels: green gains what red and blue lose. How well they are found depends
+    on how sharp the model is: planted on bricks and learnt beside a small model at 27 dB, exposures of +-1 EV come back
+    with a correlation of 0.97, the gains of single channels with 0.95.
 
     The light of all photographs can be scaled together, and the model's the other way: a penalty on the three means
     over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
