@@ -60,9 +60,13 @@ def fastest(tiles: Sequence[int], seconds: Callable[[int], float]) -> int:
 def _rays_in_time(settings: TrainerSettings, step: TrainStep, batch: Batch) -> int:
     _seconds(settings, step, batch, FEW_RAYS, CPU_TILES[0])  # compiles kernels, fills caches
     step.model.update(0, 0)  # how many samples rays have is known from here on
-    few = min(batch.num_rays, 4 * FEW_RAYS)
-    per_ray = _seconds(settings, step, batch, few, CPU_TILES[0]) / few
-    return max(FEW_RAYS, min(batch.num_rays, int(LONGEST_SECONDS / per_ray)))
+    # Grown, not extrapolated: a tile of few rays says little of one of many, and too few rays make all tiles alike.
+    rays = min(batch.num_rays, 4 * FEW_RAYS)
+    seconds = _seconds(settings, step, batch, rays, CPU_TILES[0])
+    while rays < batch.num_rays and 4.0 * seconds <= LONGEST_SECONDS:
+        rays = min(batch.num_rays, 4 * rays)
+        seconds = _seconds(settings, step, batch, rays, CPU_TILES[0])
+    return max(FEW_RAYS, min(rays, int(rays * LONGEST_SECONDS / seconds)))
 
 
 def _seconds(settings: TrainerSettings, step: TrainStep, batch: Batch, num_rays: int, tile: int) -> float:
