@@ -147,8 +147,8 @@ def _check_patch(scene: Scene, patch: int, batch_rays: int) -> None:
             f"loss.patch={patch} draws squares of {together} pixels, and data.batch_rays={batch_rays} is no multiple "
             f"of that. Give data.batch_rays={fitting}, or a smaller loss.patch."
         )
-    train = scene.splits.get("train", ())
-    small = [view for view in train if min(scene.pixels.width[view], scene.pixels.height[view]) < patch]
+    train = torch.tensor(scene.splits.get("train", ()), dtype=torch.int64)
+    small = train[torch.minimum(scene.pixels.width, scene.pixels.height)[train] < patch].tolist()
     if small:
         view = small[0]
         raise InputError(

@@ -20,6 +20,7 @@ from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.corrections.none import NoCorrection
 from nerf_lightning.nerf.encoders.base import follow_run, tables_of
+from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
@@ -29,16 +30,13 @@ from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.rays import Batch, PixelIndex, Target
-from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
-# Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less.
-LEAST_OPACITY = 1e-2
 
 log = logging.getLogger(__name__)
 
@@ -307,13 +305,13 @@ class TrainStep:
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
             renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
-            shown = [replace(each, rgb=self._photographed(each, pixels)) for each in renderings]
+            shown = [self.correction.photographed(each, pixels) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile])))
             levels = levels * ((tile.stop - tile.start) / share.num_rays)
             return TileLoss(levels, renderings[-1].foreground, shown[-1].rgb)
 
         tile_rays, together = self._tile_rays(num_rays, training=True), self.rays_together
-        threads = torch.get_num_threads() if device.type == "cpu" and self.tile_points is not None else 1
+        threads = 1 if self.tile_points is None else threads_on(device)
         if threads > 1:
             parts = list(tiles(num_rays, tile_rays, together, multiple=threads))
             lost = side_by_side(lose, parts, backward, self._parameters())
@@ -322,12 +320,6 @@ class TrainStep:
         seen = {name: torch.cat([getattr(each, name) for each in lost]) for name in ("foreground", "rgb")}
         seen |= {"target": target.rgb, "weight": batch.weight}
         return {"losses": torch.stack([each.levels for each in lost]).sum(0)} | seen
-
-    def _photographed(self, rendering: Rendering, pixels: PixelIndex) -> Tensor:
-        # The scene's own light reached the camera. The background behind it did not: it looks the same to all.
-        opacity = rendering.opacity[:, None]
-        straight = rendering.foreground / opacity.clamp(min=LEAST_OPACITY)
-        return rendering.rgb + opacity * (self.correction(straight, pixels) - straight)
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:

@@ -71,6 +71,16 @@ def kept(trainer):
     return trainer.checkpoint_callback.best_model_path
 
 
+def whole_and_resumed(make, trainer, stop, steps):
+    """A run that was never stopped, one that goes on from where a third has stopped, and the file of that."""
+    whole, begun, rest = make(), make(), make()
+    trainer(max_steps=steps).fit(whole.system, whole.data)
+    first = trainer(max_steps=stop)
+    first.fit(begun.system, begun.data)
+    trainer(max_steps=steps).fit(rest.system, rest.data, ckpt_path=kept(first))
+    return whole, rest, kept(first)
+
+
 def assert_equal(ours, theirs):
     ours, theirs = ours.system, theirs.system
     for name, value in theirs.state_dict().items():
@@ -218,13 +228,8 @@ def test_lightnings_defaults_are_enough(run, tmp_path, monkeypatch):
 
 
 def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer):
-    whole = run("scheduler=constant")
-    trainer(max_steps=12).fit(whole.system, whole.data)
-    begun, rest = run("scheduler=constant"), run("scheduler=constant")
-    first = trainer(max_steps=5)
-    first.fit(begun.system, begun.data)
-    assert kept(first).endswith("step=5.ckpt")
-    trainer(max_steps=12).fit(rest.system, rest.data, ckpt_path=kept(first))
+    whole, rest, found = whole_and_resumed(lambda: run("scheduler=constant"), trainer, stop=5, steps=12)
+    assert found.endswith("step=5.ckpt")
     assert rest.system.step.progress.step == 12
     assert_equal(rest, whole)
 
@@ -264,27 +269,20 @@ def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
 def test_the_fast_path_goes_on_too(run, trainer):
     from support.running import FAST_PATH
 
-    fast = (*FAST_PATH, "scheduler=constant")
-    whole, begun, rest = run(*fast), run(*fast), run(*fast)
-    trainer(max_steps=40).fit(whole.system, whole.data)
-    first = trainer(max_steps=20)
-    first.fit(begun.system, begun.data)
-    trainer(max_steps=40).fit(rest.system, rest.data, ckpt_path=kept(first))
+    whole, rest, _ = whole_and_resumed(lambda: run(*FAST_PATH, "scheduler=constant"), trainer, stop=20, steps=40)
     assert_equal(rest, whole)
 
 
 @pytest.mark.parametrize("option", [each for each in options("correction") if each != "auto"])
 def test_a_run_with_a_correction_goes_on_to_the_bit(run, trainer, option):
-    settings = (f"correction={option}", "scheduler=constant")
-    whole, begun, rest = run(*settings), run(*settings), run(*settings)
-    trainer(max_steps=8).fit(whole.system, whole.data)
-    first = trainer(max_steps=4)
-    first.fit(begun.system, begun.data)
-    trainer(max_steps=8).fit(rest.system, rest.data, ckpt_path=kept(first))
+    def corrected():
+        return run(f"correction={option}", "scheduler=constant")
+
+    whole, rest, found = whole_and_resumed(corrected, trainer, stop=4, steps=8)
     assert_equal(rest, whole)
     names = [name for name in whole.system.state_dict() if name.startswith("correction.")]
     assert bool(names) == (option != "none")
-    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
+    loaded = RadianceFieldSystem.load_from_checkpoint(found)
     assert not [name for name in loaded.state_dict() if name.startswith("correction.")]
 
 
@@ -295,17 +293,13 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
         made.system.rays = made.system.step.rays = LearntShifts(*cameras, learning_rate=1e-3, weight=0.1)
         return made
 
-    whole, begun, rest, other = with_learnt_cameras(), with_learnt_cameras(), with_learnt_cameras(), run()
-    trainer(max_steps=12).fit(whole.system, whole.data)
-    first = trainer(max_steps=5)
-    first.fit(begun.system, begun.data)
-    trainer(max_steps=12).fit(rest.system, rest.data, ckpt_path=kept(first))
+    whole, rest, found = whole_and_resumed(with_learnt_cameras, trainer, stop=5, steps=12)
     assert float(whole.system.rays.shift.detach().abs().max()) > 0
     assert_equal(rest, whole)
-    assert not [name for name in read_checkpoint(kept(first)).weights if "shift" in name]
-    goes_on = trainer(max_steps=12)
+    assert not [name for name in read_checkpoint(found).weights if "shift" in name]
+    goes_on, other = trainer(max_steps=12), run()
     with pytest.raises(InputError, match=r"state_dict\.rays\.shift belongs to no part"):
-        goes_on.fit(other.system, other.data, ckpt_path=kept(first))
+        goes_on.fit(other.system, other.data, ckpt_path=found)
 
 
 def test_a_checkpoint_of_another_run_is_refused(run, trainer):

@@ -1,6 +1,7 @@
 """The contract of a correction: what a photograph made of the light that reached its camera."""
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,7 +9,11 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Scene
+
+LEAST_OPACITY = 1e-2
+"""Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less."""
 
 
 class Correction(LearntPart, ABC):
@@ -30,6 +35,19 @@ class Correction(LearntPart, ABC):
                 f"The scene {scene.name} trains on one photograph, and a correction learns how the colours of several "
                 "differ: add correction=none, or give more photographs."
             )
+
+    def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
+        """Return a rendering whose colours are those that photographs show.
+
+        The scene's own light reached the camera. The background behind it did not: it looks the same to all.
+
+        Args:
+            rendering: of one ray for each pixel.
+            pixels: where in which photograph each ray stands.
+        """
+        opacity = rendering.opacity[:, None]
+        straight = rendering.foreground / opacity.clamp(min=LEAST_OPACITY)
+        return replace(rendering, rgb=rendering.rgb + opacity * (self(straight, pixels) - straight))
 
     @abstractmethod
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.types.rays import PixelIndex
+from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
@@ -13,6 +14,10 @@ class NoCorrection(Correction):
 
     def fit_to(self, scene: Scene) -> None:
         """Take any scene."""
+
+    def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
+        """Return the rendering itself."""
+        return rendering
 
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:
         """Return the colours themselves."""

@@ -41,6 +41,11 @@ def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[R
     return list(_pool(threads).map(alone, parts))
 
 
+def threads_on(device: torch.device) -> int:
+    """Return how many parts of the work on a device run beside each other: on the CPU as many as torch has threads."""
+    return torch.get_num_threads() if device.type == "cpu" else 1
+
+
 def over_rows(kernel: Callable[..., Any], rows: int, *arrays: Any) -> None:
     """Call kernel(first, last, *arrays) for parts of the rows that together are all of them."""
     in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, torch.get_num_threads()))
