@@ -66,6 +66,11 @@ def _no_server_is_left():
     fork_server.stop()
 
 
+@pytest.fixture(autouse=True)
+def _the_same_numbers_whatever_ran_before():
+    torch.manual_seed(0)
+
+
 @pytest.fixture
 def generator():
     return torch.Generator().manual_seed(20260101)
