@@ -33,12 +33,12 @@ class SmallMotions(Refinement):
     them from drifting that way.
 
     Args:
-        poses: learn w and t.
-        focal: learn g.
-        learning_rate: of all three, at the beginning; the run's schedule scales it.
+        poses: learn how each camera turns and shifts (w and t).
+        focal: learn the focal length of each camera (g).
+        learning_rate: of all of them, at the beginning; the run's schedule scales it.
         hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
             would only wander.
-        weight: of the penalty, the sum of |w|^2, |t|^2 and g^2 over the number of photographs.
+        weight: factor on the penalty, the sum of |w|^2, |t|^2 and g^2 over the number of photographs.
     """
 
     extent: Tensor
