@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.cli.broken_pipe import ends_quietly
-from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.errors import InputError
@@ -31,6 +31,9 @@ OF_ITSELF = {
     "help": "Tell all of a setting, of a group or of an option: nerf help scene=colmap.",
 }
 """Commands that explain the others."""
+VERBOSE = ("-v", "--verbose")
+DETAILS = "hydra.verbose=[nerf_lightning]"
+"""What they stand for: the details that our own modules log."""
 USAGE_ERROR = 2
 MOST_LETTERS = 5000
 
@@ -93,7 +96,7 @@ def _help(commands: dict[str, str]) -> str:
         [
             "nerf: learn a radiance field from photographs with known cameras, and render new views.",
             "",
-            "usage: nerf COMMAND [-m] [key=value ...]",
+            "usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details",
             "",
             *lines,
             "",
@@ -106,6 +109,7 @@ def _help(commands: dict[str, str]) -> str:
 
 def _run(command: str, arguments: list[str]) -> None:
     """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    announce_start(command, arguments)
     # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
     # Read by GNU's OpenMP when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -133,7 +137,7 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first
 
-        arguments = options_first(arguments)
+        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
         allow_as_typed(arguments)
         sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
