@@ -161,9 +161,11 @@ def test_a_loose_checkpoint_is_evaluated_beside_itself(finished_run, nerf, tmp_p
 def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture, tmp_path):
     result = nerf(
         "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7",
-        f"init_from={finished_run}", f"paths.output_dir={tmp_path}/run", "final.video=false",
+        f"init_from={finished_run}", "resume=auto", f"paths.output_dir={tmp_path}/run", "final.video=false",
     )  # fmt: skip
     assert result.code == 0, result.err
+    assert f"begins with the weights of {finished_run}/checkpoints/last.ckpt, of step 4" in result.err
+    assert "resume=auto: there is no unfinished run of this config to go on with" in result.err
     ours = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     theirs = torch.load(finished_run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
