@@ -27,10 +27,10 @@ def unknown_name(message: str, command: str) -> str | None:
     return None if key is None else _no_setting(key["key"], key["value"], asked)
 
 
-def _no_option(group: str, name: str) -> str:
+def _no_option(group: str, name: str) -> str | None:
     options = option_names(group)
-    if not options:
-        return f"There is no group {group}, of which {name} could be an option."
+    if not options:  # not ours: of a folder that hydra.searchpath names, or of a plugin
+        return None
     cure = did_you_mean(name, options, f"{group}=") or f" Its options are {', '.join(options)}."
     return f"There is no {group}={name}.{cure} nerf help {group} tells of each."
 
