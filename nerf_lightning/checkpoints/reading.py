@@ -82,12 +82,14 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint onto the CPU.
+    """Read a checkpoint onto the CPU; of a run folder the newest that is whole.
 
     Raises:
         InputError: the file is missing, damaged, not a checkpoint of this program, or of another format.
     """
     path = Path(path)
+    if path.is_dir():
+        return _newest_of_run(path)
     content = read_content(path, resumable=False)
     record, prefix = content[KEY], "model."
     scene = record["scene"]
@@ -168,6 +170,17 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
             raise error from None
     reason = "is damaged" if last.exists() else "is missing"
     log.warning("%s %s; the one before is used instead: %s, of step %d.", last, reason, previous, found.step)
+    return found
+
+
+def _newest_of_run(folder: Path) -> Checkpoint:
+    below = folder / "checkpoints"
+    found = newest_checkpoint(below if below.is_dir() else folder)
+    if found is None:
+        raise InputError(
+            f"There is no checkpoint in the folder {folder}: neither checkpoints/{LAST} nor checkpoints/{PREVIOUS}. "
+            "Give a run folder, or a checkpoint."
+        )
     return found
 
 

@@ -14,16 +14,26 @@ from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.cli.broken_pipe import ends_quietly
-from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
+from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.manual.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 PACKAGE = Path(__file__).parents[1]
+OF_ITSELF = {
+    "completion": "Print the script with which bash, zsh or fish completes what is typed: nerf completion bash.",
+    "help": "Tell all of a setting, of a group or of an option: nerf help scene=colmap.",
+}
+"""Commands that explain the others."""
+VERBOSE = ("-v", "--verbose")
+DETAILS = "hydra.verbose=[nerf_lightning]"
+"""What they stand for: the details that our own modules log."""
 USAGE_ERROR = 2
 MOST_LETTERS = 5000
 
@@ -44,9 +54,27 @@ def _answer(arguments: list[str]) -> None:
 
         print(__version__)
         return
-    if arguments[0] not in commands:
-        _complain(f"There is no command '{arguments[0]}'.{_near(arguments[0], list(commands))} See nerf --help.")
-    _run(arguments[0], arguments[1:])
+    command, rest = arguments[0], arguments[1:]
+    if command == "help":
+        from nerf_lightning.cli.help import help_on_anything
+
+        print(help_on_anything(rest, list(commands)) if rest else _help(commands))
+        return
+    if command == "completion":
+        from nerf_lightning.cli.completion import completion
+
+        print(completion(rest, [*commands, *OF_ITSELF]))
+        return
+    if command not in commands:
+        raise InputError(
+            f"There is no command '{command}'.{did_you_mean(command, [*commands, *OF_ITSELF])} See nerf --help."
+        )
+    if {"-h", "--help"} & set(rest):
+        from nerf_lightning.cli.help import help_on
+
+        print(help_on(command, rest))
+        return
+    _run(command, rest)
 
 
 def find_commands() -> dict[str, str]:
@@ -62,17 +90,18 @@ def _summary(file: Path) -> str:
 
 
 def _help(commands: dict[str, str]) -> str:
-    width = max(map(len, commands))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in commands.items()]
+    width = max(map(len, [*commands, *OF_ITSELF]))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in (commands | OF_ITSELF).items()]
     return "\n".join(
         [
             "nerf: learn a radiance field from photographs with known cameras, and render new views.",
             "",
-            "usage: nerf COMMAND [-m] [key=value ...]",
+            "usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details",
             "",
             *lines,
             "",
             "nerf COMMAND --help lists the groups, the settings and examples of a command.",
+            "nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene, nerf help scene=colmap.",
             "python -m nerf_lightning is the same.",
         ]
     )
@@ -80,6 +109,7 @@ def _help(commands: dict[str, str]) -> str:
 
 def _run(command: str, arguments: list[str]) -> None:
     """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    announce_start(command, arguments)
     # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
     # Read by GNU's OpenMP when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -107,7 +137,7 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first
 
-        arguments = options_first(arguments)
+        arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
         allow_as_typed(arguments)
         sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
@@ -138,17 +168,10 @@ def explained(command: str) -> Iterator[None]:
     except Exception as error:
         from nerf_lightning.config.messages import paragraph
 
-        message = paragraph(error, command, conf_folder())
+        message = paragraph(error, command)
         if message is None:
             raise
         _complain(message)
-
-
-def _near(word: str, known: list[str]) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(word, known, n=3)
-    return f" Did you mean {' or '.join(close)}?" if close else ""
 
 
 def _complain(message: str) -> None:

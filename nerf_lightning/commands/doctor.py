@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from rich.text import Text
 
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.console import StdoutConsole, say
+from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import doctor_picture
@@ -40,7 +40,7 @@ def run(config: DictConfig) -> int:
         save_png(written[-1], proof_picture(scene, proofs))
     print_checks(checks)
     seconds = time.monotonic() - started
-    say(f"{summary(checks)}; {len(scene.view_names)} views examined in {seconds:.1f} s")
+    say(f"{summary(checks)}; {len(scene.view_names)} views examined in {spoken(seconds)}")
     say(f"written to  {listed(map(str, written), cap=len(written))}")
     return sum(check.verdict == "wrong" for check in checks)
 

@@ -7,7 +7,7 @@ from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.evaluation.protocol import measured_of
-from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.evaluate_and_film import metric_lines
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoint
@@ -26,11 +26,11 @@ def evaluate(config: DictConfig) -> float:
     """
     opened = open_checkpoint(config)
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation"))
-    scene = as_trained(build(config.scene).read(), checkpoint)
-    origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
-    scoring = build(config.evaluation)
-    with torch.no_grad():
-        metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)
+    with filled_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation")) as folder:
+        scene = as_trained(build(config.scene).read(), checkpoint)
+        origin = measured_of(model, checkpoint.config, checkpoint.choices, settings.device, settings.precision)
+        scoring = build(config.evaluation)
+        with torch.no_grad():
+            metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)
     say(*metric_lines(metrics, folder))
     return float(metrics["psnr"])

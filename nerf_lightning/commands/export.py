@@ -7,7 +7,7 @@ from nerf_lightning import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.export.base import Export
-from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoint
 
@@ -24,8 +24,8 @@ def export(config: DictConfig) -> None:
     what: Export = build(config.what)
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "export"))
-    with torch.no_grad():
+    default = beside_checkpoint(opened.checkpoint.path, "export")
+    with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are those that training refined (refinement=...), not those that were read")

@@ -12,7 +12,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.output_folder import beside_checkpoint, output_folder
+from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoints
 from nerf_lightning.video.film import film
@@ -42,9 +42,9 @@ def render(config: DictConfig) -> None:
         for each, label in zip(opened, labels, strict=True)
     ]
     first = opened[0]
-    folder = output_folder(config.paths.output_dir, beside_checkpoint(first.checkpoint.path, "render"))
-    with torch.no_grad():
-        shown = replace(shown, precision=first.settings.precision)
+    shown = replace(shown, precision=first.settings.precision)
+    default = beside_checkpoint(first.checkpoint.path, "render")
+    with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = film(subjects, path, first.tile_points, folder, shown)
     say(*map(str, written))
 

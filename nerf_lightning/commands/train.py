@@ -105,6 +105,8 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | N
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
     trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
     _announce(parts, folder, former)
+    if former is None and parts.config.resume == "auto":
+        log.info("resume=auto: there is no unfinished run of this config to go on with; this one begins anew")
     if former is None:
         describe_run(trainer.loggers, config)
     checkpoint = None if former is None else former.checkpoint

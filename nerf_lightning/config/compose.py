@@ -31,7 +31,7 @@ def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, 
         assert isinstance(primary, DictConfig)
         require_sections(config, primary)
     except Exception as error:
-        message = paragraph(error, command, conf_folder())
+        message = paragraph(error, command)
         if message is None:
             raise
         raise InputError(message) from error

@@ -1,36 +1,33 @@
 """Hydra's and OmegaConf's errors as one paragraph, with near matches for a mistyped key."""
 
-import difflib
 import os
 import re
 from pathlib import Path
 from traceback import extract_tb
 
-from hydra import compose
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, InstantiationException
-from hydra.initialize import initialize_config_dir
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerf_lightning.config.overrides import flatten, to_type
+from nerf_lightning.config.overrides import to_type
+from nerf_lightning.config.unknown_names import unknown_name
 from nerf_lightning.errors import InputError
 
+ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
 
 
-def paragraph(error: BaseException, command: str, conf_folder: Path) -> str | None:
+def paragraph(error: BaseException, command: str) -> str | None:
     """Return what a person is told of an error that bad input causes, or None for any other."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        return _missing_plugin(str(error)) or explain(error, command, conf_folder)
+        return _missing_plugin(str(error)) or explain(error, command)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
     if isinstance(error, (ValueError, TypeError)) and _while_choosing(error):
         return (
-            f"A group was given something else than the name of one of its options: {error}. nerf {command} --help "
-            "lists the groups and what they offer."
+            f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
     if isinstance(error, RuntimeError) and _is_out_of_memory(error):
         reason = " ".join(str(error).split()).partition(". ")[0]
@@ -70,7 +67,7 @@ def _missing_plugin(message: str) -> str | None:
     return f"This {kind} needs {name}, which is not installed: pip install 'nerf-lightning[{extra}]'."
 
 
-def explain(error: BaseException, command: str, conf_folder: Path) -> str:
+def explain(error: BaseException, command: str) -> str:
     """Return what to tell the user about a bad override, an unknown name or a missing value."""
     chain = list(_chain(error))
     for link in chain:
@@ -92,10 +89,7 @@ def explain(error: BaseException, command: str, conf_folder: Path) -> str:
             f"{key}={value} cannot be read: spaces, brackets and other special characters need quotes for Hydra and "
             f"for the shell. Type {to_type(key, value)}."
         )
-    key = _mistyped_key([str(link) for link in chain])
-    close = difflib.get_close_matches(key, _known_keys(command, conf_folder), n=3, cutoff=0.6) if key else []
-    hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    return f"{message}{hint} nerf {command} --help lists the groups, --cfg job the settings."
+    return unknown_name(message, command) or f"{message} {ALL_OF.format(command)}"
 
 
 def _chain(error: BaseException | None) -> list[BaseException]:
@@ -104,20 +98,3 @@ def _chain(error: BaseException | None) -> list[BaseException]:
         links.append(error)
         error = error.__cause__ or error.__context__
     return links
-
-
-def _mistyped_key(messages: list[str]) -> str | None:
-    for pattern in (r"full_key: (\S+)", r"Could not override '([^']+)'", r"Could not find '([^']+)'"):
-        for message in messages:
-            if found := re.search(pattern, message):
-                return found.group(1)
-    return None
-
-
-def _known_keys(command: str, conf_folder: Path) -> list[str]:
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(conf_folder), version_base="1.3"):
-        config = compose(command)
-    return list(flatten(config)) + [
-        f"{group.name}/{option.stem}" for group in conf_folder.iterdir() for option in group.glob("*.yaml")
-    ]

@@ -37,7 +37,7 @@ class ImagesExport(Export):
     """Write folders of pictures: `depth` (16-bit PNG, and float32 .npy), `opacity`, `normals`, and `images.json`.
 
     Args:
-        split: the views.
+        split: whose views are shown.
         max_views: most of them, spread over all; None: all.
         depth: `distance` along the pixel's ray, or `z` along the camera's axis.
     """

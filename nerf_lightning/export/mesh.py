@@ -36,11 +36,11 @@ class MeshExport(Export):
     Args:
         resolution: cells along the longest side of the box.
         threshold: density per scene unit at the surface; None: where rendering sees it (`surface_level`).
-        colors: seen from the nearest cameras, or along the surface's normal.
+        colors: colour of a vertex, as seen from the nearest cameras, or along the surface's normal.
         min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
         seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
         faces: most faces, reached by decimation; None keeps all.
-        format: of the file.
+        format: of the file; PLY and OBJ open everywhere, GLB is one file for browsers.
     """
 
     def __init__(

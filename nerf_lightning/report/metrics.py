@@ -26,6 +26,7 @@ LABELS = {
     "depth_error": "depth error, scene units",
     "normal_error": "normal error",
 }
+WITHOUT_LPIPS = "not computed: it needs weights (evaluation.lpips_weights); metrics.json says where they come from"
 MOST_VIEWS = 12
 MOST_ROWS = 5000
 MOST_PAIRS = 60
@@ -65,7 +66,10 @@ def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     """Return protocol, origin and environment as pairs of texts."""
     titles = {"protocol": "Protocol", "origin": "Whose numbers these are", "environment": "Environment"}
-    return [(title, _pairs(_mapping(metrics.get(key)))) for key, title in titles.items()]
+    pairs = {key: _pairs(_mapping(metrics.get(key))) for key in titles}
+    if pairs["protocol"] and metrics.get("lpips") is None:
+        pairs["protocol"] = [*pairs["protocol"], ("LPIPS", WITHOUT_LPIPS)]
+    return [(title, pairs[key]) for key, title in titles.items()]
 
 
 def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPage], list[ViewOnPage], list[str]]:

@@ -1,8 +1,10 @@
 """Where a command that does not train writes: as the user says, or beside the checkpoint."""
 
+import contextlib
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
@@ -61,3 +63,20 @@ def output_folder(given: str | None, default: Path) -> Path:
             f"The output folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
         ) from error
     return folder
+
+
+@contextmanager
+def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
+    """Lend the folder that `output_folder` returns; what was made of it and is empty at the end is removed again.
+
+    Raises:
+        InputError: as `output_folder`.
+    """
+    wanted = chosen_folder(given, default).absolute()
+    made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
+    try:
+        yield output_folder(given, default)
+    finally:
+        with contextlib.suppress(OSError):  # the first that holds something ends it
+            for folder in made:
+                folder.rmdir()

@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.config.messages import paragraph
-from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.summary import folders_of_runs, read_note
@@ -72,7 +71,7 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
             return _skip(record, former, sweep_folder)
         value = run(config)
     except Exception as error:
-        _failed(record, error, paragraph(error, command, conf_folder())).write(sweep_folder)
+        _failed(record, error, paragraph(error, command)).write(sweep_folder)
         return None
     except (SystemExit, KeyboardInterrupt) as stop:
         if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started

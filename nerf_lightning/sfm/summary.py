@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from nerf_lightning.console import spoken
 from nerf_lightning.escaping import listed
 from nerf_lightning.sfm.reconstruction import SparseModel
 
@@ -26,7 +27,7 @@ def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Pat
         f"registered          {found} of {total} {what} ({cameras}, {matching} matching)",
         f"reprojection error  {model.reprojection_error:.2f} px",
         f"points              {model.num_points}",
-        f"time                {seconds:.0f} s",
+        f"time                {spoken(seconds)}",
         f"written to          {folder}",
     ]
     if model.left_out:

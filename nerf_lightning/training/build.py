@@ -1,5 +1,6 @@
 """What a run is made of, from its config: scene, data, system; and for `nerf train` callbacks, and what follows."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -48,6 +49,8 @@ OF_LIGHTNINGS_TRAINER = {
     "resume": "Trainer.fit(..., ckpt_path=...)",
 }
 """Settings of `nerf train` that are given to Lightning's own Trainer in a notebook."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -155,6 +158,7 @@ def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettin
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
+        log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step = build_step(config, settings, scene, progress, start)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)

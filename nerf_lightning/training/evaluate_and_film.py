@@ -132,9 +132,7 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         normal = metrics["normal_error"]
         angle = "" if normal is None else f"   normal error {normal:.1f} degrees"
         lines.append(f"depth error  {metrics['depth_error']:.4f} scene units{angle}")
-    if metrics["lpips"] is None:
-        lines.append(f"LPIPS        not computed: {metrics['lpips_hint']}")
-    else:
+    if metrics["lpips"] is not None:
         lines.append(f"LPIPS        {metrics['lpips']:.4f}")
     lines.append(
         f"speed        {metrics['frames_per_second']:.3g} frames per second, "

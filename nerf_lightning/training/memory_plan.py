@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
-from nerf_lightning.machine import free_memory
+from nerf_lightning.machine import free_memory, held_memory
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -20,6 +20,8 @@ GAPS = 0.25
 COMPILED_PER_MATRIX = 3 * 2 * 700_000
 # Smaller shortages are within what a plan can know.
 NOTICEABLE = 1.05
+# A run that takes a smaller share of what is free needs no word.
+SMALL = 0.1
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +59,11 @@ class MemoryPlan:
 
         lines = [line(row.what, row.num_bytes, row.where) for row in [*self.rows, *self.instead]]
         return "\n".join(
-            ["memory plan:", *lines, line("at most", self.total, f"{self.free / GIGABYTE:.1f} GB are free")]
+            [
+                "memory plan:",
+                *lines,
+                line("at most, beside what is held", self.total, f"{self.free / GIGABYTE:.1f} GB are free"),
+            ]
         )
 
     @property
@@ -116,10 +122,17 @@ def _compiled(step: TrainStep) -> int:
 
 
 def announce_memory(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> None:
-    """Log the plan; warn where the room is short."""
+    """Log one line of the plan where it is not small, its rows for who asks for details (-v), and where it is short."""
     plan = memory_plan(settings, step, data)
     for line in str(plan).splitlines():
-        log.info("%s", line)
+        log.debug("%s", line)
+    if plan.total > SMALL * plan.free:
+        log.info(
+            "memory: at most about %.1f GB beside the %.1f GB that the process holds now; %.1f GB are free (-v: more)",
+            plan.total / GIGABYTE,
+            held_memory(settings.device) / GIGABYTE,
+            plan.free / GIGABYTE,
+        )
     if plan.warning is not None:
         log.warning(plan.warning)
 

@@ -5,9 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from support.budget import budget
+from support.planted import write_checkpoint
+from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
+from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.errors import InputError
 
 FISHEYE = (0.1, -0.02, 0.01, 0.0, 0.0, 0.0)
@@ -112,3 +115,13 @@ def test_two_damaged_ones_are_refused(tmp_path):
 def test_the_last_good_one_was_not_saved_amid_steps_that_were_left_out(tmp_path, bad_steps, good):
     keep_two(tmp_path, bad_steps)
     assert last_good_checkpoint(tmp_path) == (good and tmp_path / f"{good}.ckpt")
+
+
+def test_a_run_folder_stands_for_its_newest_checkpoint(tmp_path):
+    folder = tmp_path / "run" / "checkpoints"
+    folder.mkdir(parents=True)
+    refused(read_checkpoint, tmp_path / "run", parts=("There is no checkpoint in the folder", "checkpoints/last.ckpt"))
+    write_checkpoint(folder / "last.ckpt")
+    assert read_checkpoint(tmp_path / "run").path == folder / "last.ckpt"
+    assert read_checkpoint(folder).path == folder / "last.ckpt"
+    assert scene_overrides(str(tmp_path / "run"))[0] == "scene=bricks"

@@ -4,11 +4,15 @@ import gc
 import subprocess
 import sys
 
-from nerf_lightning.cli.loading import quick_imports
+import pytest
+
+from nerf_lightning.cli.loading import announce_start, quick_imports
 
 LOADING = """
 import gc
-from nerf_lightning.cli.loading import quick_imports
+import pytest
+
+from nerf_lightning.cli.loading import announce_start, quick_imports
 with quick_imports():
     print(gc.isenabled())
     import nerf_lightning.commands.train
@@ -30,3 +34,14 @@ def test_later_jobs_of_a_sweep_leave_nothing_behind():
     with quick_imports():
         assert gc.isenabled()
     assert gc.get_freeze_count() <= before
+
+
+@pytest.mark.parametrize(
+    ("terminal", "arguments", "lines"),
+    [(True, ["seed=1", "-m"], 1), (False, ["seed=1"], 0), (True, ["--cfg", "job"], 0)],
+)
+def test_a_terminal_is_told_at_once_that_a_command_starts(monkeypatch, capsys, terminal, arguments, lines):
+    monkeypatch.delitem(sys.modules, "torch", raising=False)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    announce_start("train", arguments)
+    assert capsys.readouterr().err.splitlines() == ["nerf train starts; loading PyTorch takes a few seconds"] * lines

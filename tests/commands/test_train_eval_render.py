@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 from support.captures import real_capture
-from support.running import FAST
+from support.running import FAST, said
 from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -39,6 +39,7 @@ def test_the_end_says_psnr_ssim_video_and_tensorboard(finished_run):
     metrics = json.loads((finished_run / "metrics.json").read_text())
     assert f"test PSNR    {metrics['psnr']:.2f} dB   SSIM {metrics['ssim']:.4f}" in output
     assert str(finished_run / "video.mp4") in output
+    assert "LPIPS" not in output  # the report says what it needs
     assert f"tensorboard --logdir {finished_run / 'tensorboard'}" in output
 
 
@@ -128,9 +129,17 @@ def test_render_needs_nothing_but_the_file(finished_run, nerf, tmp_path):
     assert result.code == 0, result.err
     _, frames = read_video(tmp_path / "video.mp4")
     assert frames.shape == (3, 22, 22, 3)  # 21 is odd: one pixel more, nothing rescaled
+    arguments[0] = f"ckpt={finished_run}"  # the run folder will do
     result = nerf("render", *arguments, f"paths.output_dir={tmp_path}", "format=frames")
     assert result.code == 0, result.err
     assert iio.imread(tmp_path / "video" / "frame_0002.png").shape == (21, 21, 3)
+
+
+def test_a_refused_command_leaves_no_folder(finished_run, nerf, tmp_path):
+    new = tmp_path / "new" / "film"
+    wish = ["path=photographs", "path.views=[99999]", f"paths.output_dir={new}"]
+    said(nerf("render", f"ckpt={finished_run}", *wish), "has no photograph 99999")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
@@ -153,9 +162,11 @@ def test_a_loose_checkpoint_is_evaluated_beside_itself(finished_run, nerf, tmp_p
 def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture, tmp_path):
     result = nerf(
         "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7",
-        f"init_from={finished_run}/checkpoints/last.ckpt", f"paths.output_dir={tmp_path}/run", "final.video=false",
+        f"init_from={finished_run}", "resume=auto", f"paths.output_dir={tmp_path}/run", "final.video=false",
     )  # fmt: skip
     assert result.code == 0, result.err
+    assert f"begins with the weights of {finished_run}/checkpoints/last.ckpt, of step " in result.err
+    assert "resume=auto: there is no unfinished run of this config to go on with" in result.err
     ours = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     theirs = torch.load(finished_run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)

@@ -169,12 +169,29 @@ def test_a_shortage_is_said_with_its_cure():
     assert "7.0 GB are free" in str(plan(4 * 10**9, 7 * 10**9).warning)
 
 
-def test_a_plan_is_logged_row_by_row(monkeypatch, caplog):
-    """What is logged is escaped, ends of lines too."""
-    plan = MemoryPlan([Row("pixels", 10, "memory")], [Row("a step", 20, "memory")], free=1000)
+def announced(monkeypatch, caplog, level, free):
+    plan = MemoryPlan([Row("pixels", 10**9, "memory")], [Row("a step", 2 * 10**9, "memory")], free=free)
     monkeypatch.setattr(memory_plan, "memory_plan", lambda *parts: plan)
-    parts = (kind.__new__(kind) for kind in (TrainerSettings, TrainStep, RayDataModule))
-    with caplog.at_level(logging.INFO):
-        memory_plan.announce_memory(*parts)
-    assert caplog.messages == str(plan).splitlines()
-    assert len(caplog.messages) == 4
+    settings, step, data = (kind.__new__(kind) for kind in (TrainerSettings, TrainStep, RayDataModule))
+    settings.device_type = "cpu"
+    with caplog.at_level(level, "nerf_lightning"):
+        memory_plan.announce_memory(settings, step, data)
+    return str(plan).splitlines(), caplog.messages
+
+
+def test_a_plan_is_logged_row_by_row_for_who_asks(monkeypatch, caplog):
+    """What is logged is escaped, ends of lines too."""
+    rows, messages = announced(monkeypatch, caplog, logging.DEBUG, free=10**12)
+    assert messages == rows
+    assert len(messages) == 4
+
+
+def test_else_it_is_one_line_that_says_what_is_counted(monkeypatch, caplog):
+    _, messages = announced(monkeypatch, caplog, logging.INFO, free=10**10)
+    assert len(messages) == 1
+    assert messages[0].startswith("memory: at most about 3.0 GB beside the ")
+    assert "10.0 GB are free" in messages[0]
+
+
+def test_a_small_one_is_not_mentioned(monkeypatch, caplog):
+    assert announced(monkeypatch, caplog, logging.INFO, free=10**12)[1] == []

@@ -44,7 +44,7 @@ class CaptureReader(Reader):
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content may begin, in the user's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
-        background: what lies behind transparent pixels or the end of the scene.
+        background: what lies behind transparent pixels or the end of the scene: white, black, random or none.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         verify: compare the contents of all files with what was decoded, not their times alone.

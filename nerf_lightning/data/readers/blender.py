@@ -108,7 +108,8 @@ class BlenderReader(Reader):
         far: distance at which content ends.
         background: what the transparent pixels lie on: white, black, random or none.
         downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
-        skip: per split, take every k-th frame, such as {"test": 8}; splits not named are taken whole.
+        skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; splits not named are
+            taken whole.
         aabb_half: half the side of the box around the origin that holds the content, scene units.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         name: what the scene is called in reports.

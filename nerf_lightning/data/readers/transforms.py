@@ -40,7 +40,7 @@ class TransformsReader(CaptureReader):
     """Read a transforms.json; intrinsics may stand at the top, for all views, or in a frame.
 
     Args:
-        file: the json below root.
+        file: the json below root; the paths in it are relative to where it lies.
     """
 
     name: str = "transforms"

@@ -20,7 +20,7 @@ class FrequencyEncoder(Encoder):
     fits into one period of the lowest frequency. L = 10 for positions and 4 for directions.
 
     Args:
-        num_frequencies: L.
+        num_frequencies: L, the number of octaves.
         include_input: whether x itself comes first.
         with_pi: whether the frequencies carry the paper's factor pi.
     """

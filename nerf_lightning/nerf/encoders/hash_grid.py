@@ -33,11 +33,11 @@ class HashGridEncoder(Encoder):
     place, and geometry its rough shape. Levels that are not on yet are not computed.
 
     Args:
-        num_levels: grids.
-        features_per_level: features of a vertex.
+        num_levels: number of grids.
+        features_per_level: numbers that a vertex of a grid holds.
         log2_table_size: most entries of a level, as a power of two.
         min_resolution: cells along a side of the coarsest grid.
-        max_resolution: of the finest; about the scene's size over its smallest detail.
+        max_resolution: cells along a side of the finest grid; about the scene's size over its smallest detail.
         blend_in: share of the run after which all levels are on; 0: they are from the start.
 
     Raises:

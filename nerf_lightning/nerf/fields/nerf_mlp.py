@@ -26,8 +26,8 @@ class NerfMLP(Field):
     """Eight layers of 256 with one skip; density before the direction enters; a 128-wide colour head.
 
     Args:
-        position_encoder: gamma(x).
-        direction_encoder: gamma(d).
+        position_encoder: features of positions, gamma(x).
+        direction_encoder: features of directions, gamma(d).
         depth: number of trunk layers.
         width: width of the trunk and of the feature; the colour head has half of it.
         skip: index of the trunk layer (counted from 0) whose input is joined by the encoded position again; the

@@ -37,7 +37,8 @@ class RobustLoss(Loss):
 
     Args:
         of: the loss that the others count in, for all its levels.
-        share: of the pixels that surely show the scene, at least: which quantile.
+        share: least share of the pixels that surely show the scene. Less trims more: passers-by faster, fine detail
+            later.
         times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
         patch: side of the squares in pixels.
 

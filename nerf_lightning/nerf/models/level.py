@@ -16,7 +16,12 @@ from nerf_lightning.nerf.types.scene import Scene
 
 
 class Level(nn.Module):
-    """The contract of a level: one round of sampling and rendering."""
+    """The contract of a level: one round of sampling and rendering.
+
+    Args:
+        sampler: where the field is asked.
+        field: density and colour.
+    """
 
     sampler: Sampler
     field: Field

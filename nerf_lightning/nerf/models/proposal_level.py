@@ -25,7 +25,8 @@ class ProposalLevel(DenseLevel):
         field: its density is all that is used.
         learn_every: steps from one in which it learns to the next.
         learn_always: so many steps at first, it learns in each.
-        whole_gradients_from: as in `DenseLevel`.
+        whole_gradients_from: from this distance on (scene units) gradients are whole, nearer to the camera they are
+            smaller, against floaters; 0: whole everywhere, as in `DenseLevel`.
     """
 
     has_color = False

@@ -20,8 +20,8 @@ class ExponentialDecay(Schedule):
     The paper decays from 5e-4 to 5e-5 over the run; decay_rate=1 keeps the rate constant.
 
     Args:
-        decay_rate: the factor after `decay_steps`.
-        decay_steps: None for the length of the run.
+        decay_rate: what the learning rate is multiplied by after `decay_steps`.
+        decay_steps: steps over which the rate falls by that; None: the length of the run.
         warmup_steps: steps of the linear rise.
 
     >>> ExponentialDecay(decay_rate=0.1)(50, num_steps=100) == 0.1**0.5

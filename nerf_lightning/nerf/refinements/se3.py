@@ -35,13 +35,13 @@ class SmallMotions(Refinement):
     them from drifting that way.
 
     Args:
-        poses: learn w and t.
-        focal: learn g.
-        lens: learn h1 and h2.
-        learning_rate: of all, at the beginning; the run's schedule scales it.
+        poses: learn how each camera turns and shifts (w and t).
+        focal: learn the focal length of each camera (g).
+        lens: learn the radial coefficients of each camera's lens (h1 and h2).
+        learning_rate: of all of them, at the beginning; the run's schedule scales it.
         hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
             would only wander.
-        weight: of the penalty, the sum of the squares of all of these over the number of photographs.
+        weight: factor on the penalty, the sum of the squares of all of these over the number of photographs.
     """
 
     extent: Tensor

@@ -26,7 +26,7 @@ class NanGuard(Callback):
     already taken are not given back. Rate and attempt are part of the checkpoints that follow.
 
     Args:
-        on_nan: what is done.
+        on_nan: stop ends the run; rollback goes back to the last good checkpoint, and on at a lower rate.
         patience: so many bad steps in a row are too many.
         factor: what a rollback multiplies the learning rate by.
         max_rollbacks: how often it rolls back before it stops.

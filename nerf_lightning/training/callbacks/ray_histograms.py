@@ -26,7 +26,7 @@ class RayHistograms(Watcher):
 
     Args:
         every_steps: steps between two looks.
-        num_rays: how many rays.
+        num_rays: how many of the rays of a step are looked along.
     """
 
     def __init__(self, every_steps: int = 250, num_rays: int = 256):

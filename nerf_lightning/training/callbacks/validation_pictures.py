@@ -14,7 +14,7 @@ class ValidationPictures(Watcher):
 
     Args:
         every_steps: steps between two pictures; the first comes at step `every_steps`.
-        view: which view of the split.
+        view: which view of the validation split, by its number from 0.
     """
 
     def __init__(self, every_steps: int = 1000, view: int = 0):

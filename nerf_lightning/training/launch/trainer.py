@@ -45,9 +45,9 @@ class TrainerSettings:
     """How and for how long to train.
 
     Args:
-        max_steps: steps in all.
+        max_steps: steps of the training in all.
         max_epochs: epochs in all, an epoch being every training ray once; None: no bound. The smaller bound counts.
-        accelerator: auto takes a GPU where there is one.
+        accelerator: the kind of device; auto takes a GPU where there is one.
         precision: of the products of the fields' weights, and of nothing else. bf16-mixed rounds their factors to
             bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively,
             else 32-true.
@@ -61,8 +61,8 @@ class TrainerSettings:
         devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
             TPU the cores, of one process.
         launched_by: who starts the processes: nerf itself, torchrun, or Slurm's srun; then `devices` is theirs to say.
-        lightning: other arguments of Lightning's Trainer, such as profiler; those that a setting of ours says are
-            refused.
+        lightning: other arguments of Lightning's Trainer, such as trainer.lightning.profiler=simple; those that a
+            setting of ours says are refused.
     """
 
     def __init__(

@@ -9,7 +9,6 @@ import torch
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation import protocol as environment
-from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.devices import working_device
 
@@ -63,8 +62,8 @@ def test_a_cpu_without_a_name_is_unknown(monkeypatch):
 
 def test_a_device_that_runs_out_of_memory_ends_with_one_paragraph():
     error = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has\n a total capacity of")
-    told = paragraph(error, "train", conf_folder())
+    told = paragraph(error, "train")
     assert told is not None
     assert told.startswith("There is no memory for this: CUDA out of memory. Use a smaller model")
     assert "\n" not in told
-    assert paragraph(RuntimeError("a mistake of ours"), "train", conf_folder()) is None
+    assert paragraph(RuntimeError("a mistake of ours"), "train") is None

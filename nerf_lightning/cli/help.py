@@ -1,0 +1,63 @@
+"""`nerf help`, `nerf COMMAND --help`, and the words behind them: answered from conf/ and docstrings, without Hydra."""
+
+import shutil
+from collections.abc import Iterable
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.manual.catalogue import Command, command_named
+from nerf_lightning.manual.pages import command_page, page_of
+from nerf_lightning.manual.suggestions import did_you_mean
+
+FLAGS = ("-h", "--help")
+NARROWEST, WIDEST = 60, 120
+
+
+def help_on(name: str, arguments: list[str]) -> str:
+    """Return the help of a command; with words such as `scene=colmap` or `trainer.max_steps` behind --help, of these.
+
+    Raises:
+        InputError: there is nothing of such a name.
+    """
+    asked = max((place for place, word in enumerate(arguments) if word in FLAGS), default=-1)
+    words = [word for word in arguments[asked + 1 :] if not word.startswith("-")]
+    if not words:
+        return command_page(_command(name), _width())
+    return "\n\n".join(_found(word, [name]) for word in words)
+
+
+def help_on_anything(words: list[str], commands: list[str]) -> str:
+    """Return the help of what words name: a command, or parts and settings of the first command that has them.
+
+    Raises:
+        InputError: there is nothing of such a name.
+    """
+    if words[0] in commands:
+        return help_on(words[0], words[1:])
+    # Most are of training; what only others have is found there.
+    order = sorted(commands, key=lambda name: name != "train")
+    return "\n\n".join(_found(word, order) for word in words)
+
+
+def _found(word: str, names: list[str]) -> str:
+    for name in names:
+        page = page_of(_command(name), word, _width())
+        if page is not None:
+            return page
+    known = {each for name in names for each in _names(_command(name))}
+    where = f"nerf {names[0]} has" if len(names) == 1 else "There is"
+    raise InputError(f"{where} no setting or group {word}.{did_you_mean(word.partition('=')[0], sorted(known))}")
+
+
+def _command(name: str) -> Command:
+    found = command_named(name)
+    assert found is not None
+    return found
+
+
+def _names(asked: Command) -> Iterable[str]:
+    yield from (group.typed for group in asked.groups)
+    yield from (setting.key for _, setting in asked.settings)
+
+
+def _width() -> int:
+    return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
