@@ -1,5 +1,13 @@
 """How Sphinx builds these documents: make docs."""
 
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+import settings_page  # noqa: E402
+
 project = "nerf_lightning"
 extensions = ["myst_parser", "sphinx.ext.mathjax"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
@@ -10,3 +18,5 @@ html_show_copyright = False
 exclude_patterns = ["_build"]
 # Files of the repository outside of docs are shown as links, and checked by tests/test_documents.py.
 suppress_warnings = ["myst.xref_missing"]
+
+settings_page.write(HERE)

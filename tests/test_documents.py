@@ -10,11 +10,18 @@ import pytest
 import yaml
 from support.captures import write_npz
 
+from nerf_lightning.cli.completion import completion
+from nerf_lightning.cli.help import help_on_anything
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.files.folders import conf_folder
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("[!s]*.md")),
+    ROOT / "docs" / "sweeps.md",
+]
 TAKE_PATHS = ("report", "table")
 
 
@@ -82,6 +89,12 @@ def commands():
 @pytest.mark.parametrize("command", commands())
 def test_a_command_composes(command):
     name, *words = shlex.split(command)
+    if name == "help":
+        assert not words or help_on_anything(words, ["train"])
+        return
+    if name == "completion":
+        assert completion(words, ["train"])
+        return
     if "-m" in words:
         # Of each list of choices the first.
         words = [
@@ -143,3 +156,4 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     done = subprocess.run(build, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "method.html").is_file()
+    assert "data.sample_budget" in (tmp_path / "settings.html").read_text(encoding="utf-8")
