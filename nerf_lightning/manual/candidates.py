@@ -57,7 +57,7 @@ def _keys(asked: Command, current: str, before: list[str]) -> Iterator[str]:
     yield from (_to_next_dot(f"{each.key}=", current) for each in asked.own if not each.is_section)
     if "." in current:
         chosen = dict(word.split("=", 1) for word in before if "=" in word)
-        for option, setting in asked.settings:
+        for option, setting in asked.settings_below(current.partition(".")[0]):
             is_chosen = option is None or chosen.get(option.group, option.name) == option.name
             if is_chosen and not setting.is_section and setting.key.startswith(current):
                 yield _to_next_dot(f"{setting.key}=", current)
@@ -71,7 +71,11 @@ def _to_next_dot(key: str, current: str) -> str:
 def _values(asked: Command, key: str, typed: str) -> Iterator[str]:
     name, (done, comma, _) = key.lstrip("+"), typed.rpartition(",")
     found = [option.name for group in asked.groups + asked.brought if group.typed == name for option in group.options]
-    settings = [setting for _, setting in asked.settings if setting.key == name and not setting.is_section]
+    settings = [
+        setting
+        for _, setting in asked.settings_below(name.partition(".")[0])
+        if setting.key == name and not setting.is_section
+    ]
     found += [choice for setting in settings for choice in setting.kind.choices]
     yield from (f"{key}={done}{comma}{value}" for value in found)
     if any(not setting.kind.words or "text" in setting.kind.words for setting in settings):

@@ -98,10 +98,17 @@ class Command:
 
         What an option only sets, and another group has, is left out: `assignments` has it.
         """
+        return self._settings([*self.groups, *self.brought])
+
+    def settings_below(self, root: str) -> list[tuple[Option | None, Setting]]:
+        """Return those of them that begin with a word such as `trainer`: far fewer files are read for it."""
+        return self._settings([group for group in (*self.groups, *self.brought) if _root(group.place) == root])
+
+    def _settings(self, groups: list[Group]) -> list[tuple[Option | None, Setting]]:
         found: dict[tuple[str, str, str], tuple[Option | None, Setting]] = {
             ("", "", s.key): (None, s) for s in self.own
         }
-        for group in (*self.groups, *self.brought):
+        for group in groups:
             for each in group.options:
                 for setting in each.settings:
                     if _root(setting.key) == _root(group.place):

@@ -58,11 +58,11 @@ def _words(option: Found[ast.expr]) -> list[str]:
         inner = _once(word for each in _elements(node)[:1] for word in _words_of(option, each))
         return [f"a list, each {' or '.join(inner)}"]
     if _subscripted(node) in TABLES:
-        return ["settings by their names"]
+        return ["settings by name"]
     if isinstance(node, ast.Constant) and node.value is None:
         return [WORDS["None"]]
     name = ast.unparse(node)
-    return [WORDS.get(name, f"a part ({name})")]
+    return [WORDS.get(name, f"{name}, a part that is chosen by its group")]
 
 
 def _words_of(option: Found[ast.expr], node: ast.expr) -> list[str]:

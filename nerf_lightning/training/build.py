@@ -158,8 +158,9 @@ def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettin
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
-        log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step = build_step(config, settings, scene, progress, start)
+    if start is not None:
+        log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
     return Run(settings, scene, data, RadianceFieldSystem(step, record))

@@ -41,10 +41,10 @@ def refused(result, tmp_path, *fragments):
     assert not (tmp_path / "found").exists()
 
 
-def test_help_has_examples_and_every_setting_a_comment(nerf):
+def test_help_has_examples_and_a_line_for_each_setting(nerf):
     result = nerf("poses", "--help")
     assert "nerf poses images=DIR|video=FILE" in result.out
-    assert "camera_model: OPENCV" in result.out
+    assert "camera_model=OPENCV             COLMAP's name of the lens model" in result.out
     assert "\n  poses " in nerf("--help").out
 
 
