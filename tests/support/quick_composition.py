@@ -9,18 +9,18 @@ from pathlib import Path
 
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
-from hydra._internal.hydra import Hydra
 from hydra.core.default_element import ResultDefault
-from hydra.plugins.config_source import ConfigSource
-from hydra.types import RunMode
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig
 
 CONF = f"file://{Path(__file__).parents[2] / 'conf'}"
 
-composed_mode = Hydra.get_mode
 merged = ConfigLoaderImpl._compose_config_from_defaults_list
+loaded = FileConfigSource.load_config
 
+_files: dict[str, bytes] = {}
 _lists: dict[str, DefaultsList] = {}
 _configs: dict[str, bytes] = {}
 
@@ -33,17 +33,9 @@ class Known(list[ResultDefault]):
 
 def install() -> None:
     """Let Hydra compose so in this process."""
-    Hydra.get_mode = mode_as_typed
     config_loader_impl.create_defaults_list = files_to_merge
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once
-
-
-def mode_as_typed(hydra: Hydra, config_name: str | None, overrides: list[str]) -> RunMode | None:
-    """Return what Hydra's own `get_mode` does: our conf/ sets no mode, so that only an override could.
-
-    Hydra composes the whole config a first time for it.
-    """
-    return composed_mode(hydra, config_name, overrides) if "hydra.mode" in str(overrides) else None
+    FileConfigSource.load_config = loaded_once
 
 
 def files_to_merge(repo, config_name, overrides_list, prepend_hydra, skip_missing) -> DefaultsList:
@@ -69,6 +61,15 @@ def merged_once(loader: ConfigLoaderImpl, defaults: list[ResultDefault], repo) -
     if defaults.key not in _configs:
         _configs[defaults.key] = pickle.dumps(merged(loader, defaults, repo))
     return pickle.loads(_configs[defaults.key])
+
+
+def loaded_once(source: FileConfigSource, config_path: str) -> ConfigResult:
+    """Return what a file holds, a copy each time."""
+    if not _stays(source):
+        return loaded(source, config_path)
+    if config_path not in _files:
+        _files[config_path] = pickle.dumps(loaded(source, config_path))
+    return pickle.loads(_files[config_path])
 
 
 def _stays(source: ConfigSource) -> bool:
