@@ -1,17 +1,16 @@
 """Whatever of ours a test calls is checked: arguments, results, and that axes of one name have one size."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
 import torch
 from beartype import beartype
-from jaxtyping import Float, TypeCheckError, jaxtyped
+from jaxtyping import Float, TypeCheckError
 from support.type_checks import checked
 from torch import Tensor
 
 from nerf_lightning.nerf.rendering.quadrature import weights_from_density
-
-SLOWLY = jaxtyped
 
 
 def decorated(function):
@@ -83,7 +82,21 @@ def test_axes_can_be_named_by_arguments():
         drawn(3)
 
 
-def test_plain_types_names_of_later_classes_methods_and_generators_are_checked():
+def test_a_generator_is_checked_when_it_is_made_and_its_axes_are_its_own():
+    @decorated
+    def each(values: Float[Tensor, " n"], more: Float[Tensor, " n"]) -> Iterator[Tensor]:
+        yield from values + more
+
+    @decorated
+    def total(values: Float[Tensor, " n"]) -> float:
+        return sum(map(float, each(values[:2], values[:2])))
+
+    assert total(torch.ones(5)) == 4
+    with pytest.raises(TypeCheckError, match="more"):
+        each(torch.ones(3), torch.ones(2))
+
+
+def test_plain_types_and_those_of_methods_and_properties_are_checked():
     class Box:
         @decorated
         def doubled(self, times: int = 2, *, name: "str" = "") -> "str":

@@ -84,7 +84,8 @@ def _inner(function: types.FunctionType, typechecker: Any) -> Callable:
 def _prepared(function: types.FunctionType, typechecker: Any) -> Callable:
     hints = {name: _hint(hint, function) for name, hint in function.__annotations__.items()}
     arrays = [part for hint in hints.values() for part in _parts(hint) if _is_array(part)]
-    if any("{" in array.dim_str for array in arrays):  # axes named by arguments
+    # Axes that are named by arguments; and what beartype would look at only when the first value is taken.
+    if any("{" in array.dim_str for array in arrays) or inspect.isgeneratorfunction(function):
         return slowly_checked(function, typechecker=typechecker)
     twin = types.FunctionType(
         function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
