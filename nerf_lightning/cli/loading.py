@@ -48,7 +48,7 @@ class _Later(ModuleType):
 
 @contextmanager
 def _signals_later() -> Iterator[None]:
-    """Leave out scipy.signal, an eighth of all: torchmetrics only looks whether a name is there that older ones lack."""
+    """Leave out scipy.signal, an eighth of all: torchmetrics only looks whether a name of its is there."""
     if SIGNALS in sys.modules:
         yield
         return

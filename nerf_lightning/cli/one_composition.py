@@ -20,7 +20,7 @@ def compose_once() -> None:
     def get_mode(hydra: Hydra, *given: Any, **named: Any) -> Any:
         return composed(hydra, *given, **named) if any(map(_may_set_a_mode, sys.argv[1:])) else None
 
-    Hydra.get_mode = get_mode  # type: ignore[method-assign]
+    Hydra.get_mode = get_mode  # type: ignore[assignment, method-assign]
 
 
 def _may_set_a_mode(argument: str) -> bool:
