@@ -235,7 +235,10 @@ def import_everything() -> None:
 
 
 def compose_quickly() -> None:
-    """Let every fork find composed what most of them ask for; processes that start from nothing compose themselves."""
+    """Let every fork find composed what most of them ask for; processes that start from nothing compose themselves.
+
+    A fork composes it here: Hydra looks for its plugins then, and those to come shall look for themselves.
+    """
     sys.path.append(str(Path(__file__).parent))
     import quick_composition
 
@@ -243,8 +246,17 @@ def compose_quickly() -> None:
     from nerf_lightning.config.compose import compose_config
 
     quick_composition.install()
-    for command, *picked in COMPOSED:
-        compose_config(command, picked)
+    reading, writing = os.pipe()
+    if os.fork() == 0:
+        for command, *picked in COMPOSED:
+            compose_config(command, picked)
+        with open(writing, "wb") as file:
+            file.write(quick_composition.kept())
+        os._exit(0)
+    os.close(writing)
+    with open(reading, "rb") as file:
+        quick_composition.keep(file.read())
+    os.wait()
 
 
 def serve(channel: socket.socket) -> dict[str, Any] | None:

@@ -38,20 +38,32 @@ def install() -> None:
     FileConfigSource.load_config = loaded_once
 
 
+def kept() -> bytes:
+    """Return all that was composed, for another process."""
+    return pickle.dumps((_files, _lists, _configs))
+
+
+def keep(found: bytes) -> None:
+    """Take what another process has composed."""
+    for ours, theirs in zip((_files, _lists, _configs), pickle.loads(found), strict=True):
+        ours.update(theirs)
+
+
 def files_to_merge(repo, config_name, overrides_list, prepend_hydra, skip_missing) -> DefaultsList:
     """Return what Hydra's `create_defaults_list` does; of files of others nothing is kept."""
     arguments = dict(config_name=config_name, prepend_hydra=prepend_hydra, skip_missing=skip_missing)
     if not all(map(_stays, repo.get_sources())):
         return create_defaults_list(repo=repo, overrides_list=overrides_list, **arguments)
     picked = Overrides(repo=repo, overrides_list=overrides_list)
-    key = repr((arguments, picked.override_choices, picked.append_group_defaults, picked.deletions))
+    places = [source.path for source in repo.get_sources()]
+    key = repr((arguments, places, picked.override_choices, picked.append_group_defaults, picked.deletions))
     if key not in _lists:
         found = create_defaults_list(repo=repo, overrides_list=overrides_list, **arguments)
         found.defaults = Known(found.defaults)
         found.defaults.key = key
         _lists[key] = found
-    kept = _lists[key]
-    return DefaultsList(kept.defaults, kept.defaults_tree, picked.config_overrides, kept.overrides)
+    known = _lists[key]
+    return DefaultsList(known.defaults, known.defaults_tree, picked.config_overrides, known.overrides)
 
 
 def merged_once(loader: ConfigLoaderImpl, defaults: list[ResultDefault], repo) -> DictConfig:
