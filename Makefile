@@ -32,7 +32,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -101,6 +101,9 @@ types: setup ## Check the types
 layers: setup ## Check that dependencies point downward
 	@$(VENV)/bin/lint-imports
 
+docs: setup ## Build the documents as a site: docs/_build/index.html
+	@$(VENV)/bin/python -m sphinx -q -W -b html docs docs/_build
+
 bench: setup ## Measure training and rendering speed; ARGS="model=nerf_small"
 	@$(VENV)/bin/nerf bench $(ARGS)
 
@@ -114,5 +117,5 @@ fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each
 	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_*.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
-	rm -rf $(VENV) $(XLA_VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) $(XLA_VENV) build dist docs/_build .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 	find nerf_lightning tests -name __pycache__ -type d -exec rm -rf {} +

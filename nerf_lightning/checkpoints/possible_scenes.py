@@ -54,7 +54,9 @@ def require_possible_refinement(refined: Mapping[str, Any], given: Mapping[str, 
     for name in ("width", "height"):
         if not torch.equal(refined[name], given[name]):
             raise Unfit(f"refined.{name}", "is not that of the scene's cameras")
-    if refined["lens_model"] != given["lens_model"] or refined["ndc"] is not None or given["ndc"] is not None:
+    # What was given as a pinhole may have turned out to have a lens.
+    lenses = {given["lens_model"]} | ({"radial_tangential"} if given["lens_model"] == "pinhole" else set())
+    if refined["lens_model"] not in lenses or refined["ndc"] is not None or given["ndc"] is not None:
         raise Unfit("refined", "has another kind of lens or space than the scene's cameras")
 
 

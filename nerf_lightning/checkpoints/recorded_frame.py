@@ -27,7 +27,8 @@ def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
         return scene
     trained = list(refined.splits["train"])
     by = similarity_between(given.c2w[trained], refined.cameras.c2w[trained])
-    c2w, focal = carried(scene.cameras.c2w, by), scene.cameras.focal.clone()
+    c2w, focal, lens = carried(scene.cameras.c2w, by), scene.cameras.focal.clone(), scene.cameras.lens.clone()
+    same_lens = scene.cameras.lens_model == given.lens_model
     known = {name: number for number, name in enumerate(refined.view_names)}
     for view, name in enumerate(scene.view_names):
         number = known.get(name)
@@ -36,7 +37,12 @@ def as_trained(scene: Scene, checkpoint: Checkpoint) -> Scene:
             continue
         c2w[view] = refined.cameras.c2w[number]
         focal[view] *= refined.cameras.focal[number] / given.focal[number]
-    return replace(scene, cameras=replace(scene.cameras, c2w=c2w, focal=focal), refined=True)
+        if same_lens:
+            lens[view] += refined.cameras.lens[number] - given.lens[number]
+    # A pinhole is a lens that bends nothing, should training have found that others do.
+    model = refined.cameras.lens_model if same_lens else scene.cameras.lens_model
+    cameras = replace(scene.cameras, c2w=c2w, focal=focal, lens=lens, lens_model=model)
+    return replace(scene, cameras=cameras, refined=True)
 
 
 def in_recorded_frame(scene: Scene, record: SceneRecord) -> Scene:

@@ -22,12 +22,14 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.video.animation import write_animation
 from nerf_lightning.video.encoding import write_video
 from nerf_lightning.video.settings import Form
 from nerf_lightning.visualization.pictures import save_png
 
 Range = tuple[float, float]
 LOCK = "lock"
+ENDING: dict[Form, str] = {"video": ".mp4", "animation": ".webp", "frames": ""}
 
 log = logging.getLogger(__name__)
 
@@ -39,13 +41,14 @@ class FilmFrames:
         folder: where the films go.
         films: their names.
         count: how many frames each has.
-        form: `video` keeps frames in a hidden folder until the videos are made of them; `frames` are the result.
+        form: `video` and `animation` keep frames in a hidden folder until one file is made of them; `frames` are the
+            result.
     """
 
     def __init__(self, folder: Path, films: Sequence[str], count: int, form: Form) -> None:
         self.folder, self.films, self.count, self.form = folder, films, count, form
         self.hidden = folder / ".frames"
-        self.root = self.hidden if form == "video" else folder
+        self.root = folder if form == "frames" else self.hidden
         self.lock = FileLock(self.hidden / LOCK)
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
@@ -84,21 +87,22 @@ class FilmFrames:
             raise InputError(f"{error} {self._cure()}") from error
 
     def finish(self, fps: int) -> None:
-        """Make the videos of the frames, remove these, and let others have the folder.
+        """Make the films of the frames, remove these, and let others have the folder.
 
         Raises:
             InputError: ffmpeg fails, or the disk is full; the frames stay.
         """
-        if self.form == "video":
-            for film in self.films:
+        if self.form != "frames":
+            write = write_video if self.form == "video" else write_animation
+            for film, file in zip(self.films, self.results(), strict=True):
                 try:
                     with self._kept():
-                        write_video(self.folder / f"{film}.mp4", self._read(film), fps, self.count)
+                        write(file, self._read(film), fps, self.count)
                 except InputError as error:
                     raise InputError(f"{error} {self._cure()}") from error
             self._remove()
         self.close()
-        if self.form == "video":
+        if self.form != "frames":
             with suppress(OSError):  # another process has come
                 self.hidden.rmdir()
 
@@ -107,8 +111,8 @@ class FilmFrames:
         self.lock.release()
 
     def results(self) -> list[Path]:
-        """Return the videos, or the folders of frames."""
-        return [self.folder / (film if self.form == "frames" else f"{film}.mp4") for film in self.films]
+        """Return the files, or the folders of frames."""
+        return [self.folder / f"{film}{ENDING[self.form]}" for film in self.films]
 
     def _file(self, film: str, number: int) -> Path:
         return self.root / film / f"frame_{number:04d}.png"

@@ -9,7 +9,7 @@ from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
-Form = Literal["video", "frames"]
+Form = Literal["video", "animation", "frames"]
 Projection = Literal["perspective", "equirectangular"]
 Corner = tuple[float, float, float]
 SWITCHES = ("mosaic", "hold_camera")
@@ -48,8 +48,11 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
     outputs = tuple(map(str, as_list(config["outputs"])))
     if not outputs or len(set(outputs)) < len(outputs) or not set(outputs) <= set(FILMS):
         raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
-    if config["format"] not in ("video", "frames"):
-        raise InputError(f"format={config['format']}: choose video (mp4) or frames (PNG files).")
+    if config["format"] not in get_args(Form):
+        raise InputError(
+            f"format={config['format']}: choose video (mp4), animation (WebP, which pages play by themselves) or "
+            "frames (PNG files)."
+        )
     require_one_of(get_args(Projection), projection=config["projection"])
     return FilmSettings(
         outputs=outputs,

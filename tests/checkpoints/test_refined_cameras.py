@@ -16,7 +16,8 @@ from nerf_lightning.nerf.refinements.carry import carry_along
 
 SCENE = ball_scene()
 LEARNT = carry_along(SCENE.cameras, with_noise(SCENE, 1.0, 0.01, views=(0, 1, 2)).cameras, SCENE.splits["train"])
-LEARNT = replace(LEARNT, focal=1.05 * SCENE.cameras.focal)
+LENS = torch.tensor([[0.05, -0.01, 0.0, 0.0, 0.0, 0.0]] * 6)
+LEARNT = replace(LEARNT, focal=1.05 * SCENE.cameras.focal, lens=LENS, lens_model="radial_tangential")
 
 
 def saved(path, refined=LEARNT, **changed):
@@ -62,6 +63,8 @@ def test_a_scene_that_is_read_again_gets_them_in_whatever_frame_and_size(tmp_pat
     assert found.refined
     torch.testing.assert_close(found.cameras.c2w, LEARNT.c2w, atol=1e-4, rtol=0)
     torch.testing.assert_close(found.cameras.focal, 0.5 * LEARNT.focal)
+    assert found.cameras.lens_model == "radial_tangential"
+    assert torch.equal(found.cameras.lens, LENS)
 
 
 def test_photographs_of_another_capture_go_where_the_cameras_went_as_a_whole(tmp_path):

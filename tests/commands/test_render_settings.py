@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from support.known_fields import INSIDE, solid
 from support.running import said, start
 from support.scenes import ball_scene, tiny_field
@@ -96,7 +97,7 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
         (["outputs=[rgb,color]"], ["outputs=['rgb', 'color']", "rgb, depth, opacity, normals, levels"]),
         (["outputs=[]"], ["outputs=[]"]),
         (["mosaic=maybe"], ["mosaic=maybe", "true or false"]),
-        (["format=gif"], ["format=gif", "video (mp4) or frames"]),
+        (["format=gif"], ["format=gif", "animation (WebP"]),
         (["near=-1"], ["near=-1", "not negative"]),
         (["near=7"], ["near=7 leaves nothing to see", "rays end at"]),
         (["crop=[[0,0,0]]"], ["crop=[[0, 0, 0]]", "lower and the upper corner"]),
@@ -201,6 +202,15 @@ def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
         for number in range(6):
             place = f"{name}/frame_{number:04d}.png"
             assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
+
+
+def test_films_that_pages_play_by_themselves(nerf, last, tmp_path):
+    result = nerf("render", f"ckpt={last}", *SMALL, "format=animation", "path.fps=10", f"paths.output_dir={tmp_path}")
+    assert result.code == 0, result.err
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.webp", "video.webp"]
+    with Image.open(tmp_path / "video.webp") as found:
+        found.load()
+        assert (found.width, found.n_frames, found.info["duration"]) == (12, 2, 100)
 
 
 def test_panoramas_show_what_their_faces_show(last, rendered):

@@ -56,10 +56,10 @@ def ball(radius: float = 0.8, center=(0.0, 0.0, 0.0)) -> Distance:
     return lambda positions: (positions - torch.tensor(center)).norm(dim=-1) - radius
 
 
-def photographed_ball(size: int = 24):
+def photographed_ball(size: int = 24, **lens):
     """A soft ball and what eight cameras see of it, all of which train: gradients of its pictures are exact."""
     model = solid(lambda positions: 0.1 * ball()(positions), 64, color=lambda positions: 0.5 + 0.4 * positions.sin())
-    scene = ball_scene(num_views=8, size=size, background="black")
+    scene = ball_scene(num_views=8, size=size, background="black", **lens)
     rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
     pictures = torch.stack([render_picture(model, rays_of, view, "black", 1 << 20).rgb for view in range(8)])
     rgba = torch.cat([pictures, torch.ones(8, size, size, 1)], dim=-1).clamp(0, 1)

@@ -251,7 +251,7 @@ def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
 def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
     from support.running import FAST_PATH
 
-    learning = (*FAST_PATH, "refinement=se3_focal", "encoder.blend_in=0.8")
+    learning = (*FAST_PATH, "refinement=se3_lens", "encoder.blend_in=0.8")
     whole, rest = run(*learning), run(*learning)
     saves = ModelCheckpoint(every_n_train_steps=5, save_top_k=-1)
     trainer(max_steps=12, callbacks=[saves]).fit(whole.system, whole.data)

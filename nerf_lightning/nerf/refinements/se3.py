@@ -1,10 +1,11 @@
-"""Small motions of cameras, one per photograph, and their focal lengths, one per camera."""
+"""Small motions of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
 
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import which_camera
@@ -20,10 +21,11 @@ FEWEST_PHOTOGRAPHS = 2
 class SmallMotions(Refinement):
     """Shift and turn each camera by a little: SO(3) x R^3, by the exponential map.
 
-    R' = R exp(w + (-s_y, s_x, 0) / d), c' = c + R s with s = e t, and f' = f exp(g). The vector w turns the camera
-    about its own axes (radians); the shift t, along them, is in units of the scene's extent e (half the diagonal of
-    its box); g is shared by all photographs of one camera. All are zero at first. A photograph that is not trained on
-    has no gradients, and stays where it is.
+    R' = R exp(w + (-s_y, s_x, 0) / d), c' = c + R s with s = e t, f' = f exp(g), k1' = k1 + h1, k2' = k2 + h2. The
+    vector w turns the camera about its own axes (radians); the shift t, along them, is in units of the scene's extent e
+    (half the diagonal of its box). All photographs of one camera share g and h, which belong to its focal length and to
+    the radial coefficients of its lens; what is given as a pinhole may turn out to have one. All are zero at first. A
+    photograph that is not trained on has no gradients, and stays where it is.
 
     To turn and to shift sideways move a picture all but alike, and an optimizer that takes each number by itself
     wavers between the two. So a shifted camera turns back to what lies at the distance d of the scene's middle: w is
@@ -35,10 +37,11 @@ class SmallMotions(Refinement):
     Args:
         poses: learn w and t.
         focal: learn g.
-        learning_rate: of all three, at the beginning; the run's schedule scales it.
+        lens: learn h1 and h2.
+        learning_rate: of all, at the beginning; the run's schedule scales it.
         hold: share of the run over which the cameras stay where they are: before there is a scene to stand before, they
             would only wander.
-        weight: of the penalty, the sum of |w|^2, |t|^2 and g^2 over the number of photographs.
+        weight: of the penalty, the sum of the squares of all of these over the number of photographs.
     """
 
     extent: Tensor
@@ -49,15 +52,16 @@ class SmallMotions(Refinement):
         self,
         poses: bool = True,
         focal: bool = False,
+        lens: bool = False,
         learning_rate: float = 1e-3,
         hold: float = 0.1,
         weight: float = 1e-2,
     ) -> None:
         super().__init__()
         require_ranges(locals(), {"learning_rate": (1e-8, 1.0), "hold": (0.0, 1.0), "weight": (0.0, 1e6)})
-        if not (poses or focal):
-            raise ValueError("poses=false and focal=false leave nothing to learn: choose refinement=none")
-        self.poses, self.focal = poses, focal
+        if not (poses or focal or lens):
+            raise ValueError("poses=false, focal=false and lens=false leave nothing to learn: choose refinement=none")
+        self.poses, self.focal, self.lens = poses, focal, lens
         self.learning_rate, self.hold, self.weight = learning_rate, hold, weight
         self.is_held = False
 
@@ -69,13 +73,19 @@ class SmallMotions(Refinement):
         """Take note of the cameras and of the scene's extent, once, before training.
 
         Raises:
-            InputError: rays run through normalised device coordinates, or there are too few photographs.
+            InputError: rays run through normalised device coordinates, there are too few photographs, or more of
+                panoramas than their poses is to be learnt.
         """
         if scene.cameras.ndc is not None:
             raise InputError(
                 f"refinement: the scene {scene.name} is trained in normalised device coordinates (scene.space=ndc), "
                 "which bend all rays as one camera that looks straight ahead sees them, so a camera that turns would "
                 "no longer fit the others. Train with scene.space=contracted, or with refinement=none."
+            )
+        if (self.focal or self.lens) and scene.cameras.lens_model == "equirectangular":
+            raise InputError(
+                f"refinement: the scene {scene.name} has panoramas, which have neither a focal length nor a lens. "
+                "Learn their poses alone, with refinement=se3, or choose refinement=none."
             )
         photographs = len(scene.splits["train"])
         if photographs < FEWEST_PHOTOGRAPHS:
@@ -100,6 +110,8 @@ class SmallMotions(Refinement):
             self.shift = nn.Parameter(torch.zeros(views, 3))
         if self.focal:
             self.log_focal = nn.Parameter(torch.zeros(int(camera.max()) + 1))
+        if self.lens:
+            self.radial = nn.Parameter(torch.zeros(int(camera.max()) + 1, 2))
 
     @own_precision
     def forward(self, cameras: Cameras) -> Cameras:
@@ -114,6 +126,9 @@ class SmallMotions(Refinement):
             cameras = replace(cameras, c2w=torch.cat([turned, centers], dim=-1))
         if self.focal:
             cameras = replace(cameras, focal=cameras.focal * self.log_focal.exp()[self.camera, None])
+        if self.lens:
+            model = "radial_tangential" if cameras.lens_model == "pinhole" else cameras.lens_model
+            cameras = replace(cameras, lens=cameras.lens + pad(self.radial[self.camera], (0, 4)), lens_model=model)
         return cameras
 
     def penalty(self) -> Float[Tensor, ""] | None:

@@ -13,6 +13,7 @@ from support.wrong_cameras import mean_errors, with_noise
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
 from nerf_lightning.nerf.geometry.cameras import project
+from nerf_lightning.nerf.geometry.lenses import unproject
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.refinements.carry import motions, moved_far
@@ -29,7 +30,9 @@ def a_step(scene, refinement, model=None):
     return step
 
 
-@pytest.mark.parametrize("refinement", [NoRefinement(), SmallMotions(), SmallMotions(poses=False, focal=True)])
+@pytest.mark.parametrize("refinement", [
+    NoRefinement(), SmallMotions(), SmallMotions(poses=False, focal=True), SmallMotions(poses=False, lens=True),
+])  # fmt: skip
 def test_at_first_every_ray_is_as_it_was_to_the_bit(refinement):
     scene = ball_scene()
     step = a_step(scene, refinement)
@@ -106,6 +109,47 @@ def test_a_wrong_focal_length_is_found_before_a_known_scene():
     for _ in range(30):
         step(loader.at(0, step.progress.rays_seen), optimizer)
     assert float((step.rays.cameras.focal.detach() / true.cameras.focal).mean()) == pytest.approx(1.0, abs=6e-3)
+
+
+@pytest.mark.parametrize("model", ["radial_tangential", "fisheye"])
+def test_a_wrong_lens_is_found_before_a_known_scene(model):
+    bent = (0.3, 0.0, 0.0, 0.0, 0.0, 0.0)
+    true, known = photographed_ball(lens=bent, lens_model=model)
+    given = torch.zeros(8, 6) if model == "fisheye" else torch.tensor([[0.2, *bent[1:]]] * 8)
+    scene = replace(true, cameras=replace(true.cameras, lens=given))
+    step = a_step(scene, SmallMotions(poses=False, lens=True, learning_rate=3e-2, hold=0.0, weight=0.0), known)
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
+    step.schedule, step.num_steps = ExponentialDecay(decay_rate=0.01), 60
+    loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
+    for _ in range(60):
+        step(loader.at(0, step.progress.rays_seen), optimizer)
+    corner = torch.tensor([[0.3, 0.3]])  # in focal lengths, where the coefficients are told apart from each other
+
+    def seen(lens):
+        return unproject(corner, lens, model)
+
+    before, after = (
+        float((seen(each[:1]) - seen(true.cameras.lens[:1])).norm())
+        for each in (given, step.rays.cameras.lens.detach())
+    )
+    assert after < before / 5, (before, after)
+
+
+def test_a_pinhole_may_turn_out_to_have_a_lens():
+    scene = ball_scene()
+    refinement = SmallMotions(poses=False, lens=True)
+    refinement.fit_to(scene)
+    assert refinement(scene.cameras).lens_model == "radial_tangential"
+    with torch.no_grad():
+        refinement.radial[:] = torch.tensor([0.1, -0.02])
+    assert refinement(scene.cameras).lens[0].tolist() == pytest.approx([0.1, -0.02, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_panoramas_have_no_lens_to_learn():
+    scene = ball_scene()
+    panoramas = replace(scene, cameras=replace(scene.cameras, lens_model="equirectangular"))
+    refused(SmallMotions(focal=True).fit_to, panoramas, parts=("has panoramas", "refinement=se3", "refinement=none"))
+    SmallMotions().fit_to(panoramas)
 
 
 def test_the_penalty_is_the_mean_square_of_what_has_moved():

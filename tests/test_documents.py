@@ -1,0 +1,147 @@
+"""What README and docs say is true: examples run, commands compose, settings and files that they name are there."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from support.captures import write_npz
+from support.running import start_code
+
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.files.folders import conf_folder
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TAKE_PATHS = ("report", "table")
+
+
+def python_blocks(name):
+    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_the_example_runs_without_hydra_and_lightning():
+    (example, *_) = [block for block in python_blocks("python.md") if "RadianceModel" in block]
+    check = "\nimport sys\nprint([m for m in ('hydra', 'lightning', 'omegaconf') if m in sys.modules])\n"
+    done = subprocess.run([sys.executable, "-c", example + check], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    *said, imported = done.stdout.splitlines()
+    assert imported == "[]"
+    assert said[-1] == "torch.Size([1024, 3]) torch.Size([1024])"
+
+
+def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
+    (example,) = [block for block in python_blocks("python.md") if "build_run" in block]
+    # A small scene and short runs, or it would take minutes.
+    capture = write_npz(tmp_path / "capture.npz")
+    small = f'"scene=npz", "scene.path={capture}", "data.batch_rays=32", "data.val_rays=32"'
+    for given, instead in (
+        ('"scene=bricks"', small),
+        ("max_steps=500", "max_steps=3"),
+        ("max_steps=1000", "max_steps=5"),
+    ):
+        assert example.count(given) == 1
+        example = example.replace(given, instead)
+    check = "\nprint(run.system.step.progress.step, system.step.progress.step)\n"
+    process = start_code(example + check, cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    *_, shapes, steps = output.splitlines()
+    assert shapes == "torch.Size([4, 6, 3]) torch.Size([4, 6])"
+    assert steps == "5 0"
+    assert "Warning" not in errors
+    assert list((tmp_path / "outputs" / "notebook").rglob("*.ckpt"))
+
+
+def test_the_eight_lines_of_an_encoder_are_an_encoder():
+    (example, *_) = [block for block in python_blocks("extending.md") if "(Encoder)" in block]
+    scope = {}
+    exec(compile(example, "extending.md", "exec"), scope)
+    import torch
+
+    encoder = next(value for name, value in scope.items() if name.endswith("Encoder") and name != "Encoder")()
+    assert encoder(torch.rand(5, 3)).shape == (5, encoder.out_dim)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 14
+
+
+def commands():
+    """Every `nerf COMMAND ...` that stands in a document, without what only explains it."""
+    found = set()
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+        for words in (*lines, *re.findall(r"`([^`\n]+)`", text)):
+            match = re.match(r"(?:srun |\.venv-xla/bin/)?nerf ([a-z]+.*)", words)
+            if match and not any(word in match[1] for word in ("...", "--help", "NAME", "encoder=scaled")):
+                found.add(match[1].split("  #")[0].split(" # ")[0].strip())
+    return sorted(found)
+
+
+@pytest.mark.parametrize("command", commands())
+def test_a_command_composes(command):
+    name, *words = shlex.split(command)
+    if "-m" in words:
+        # Of each list of choices the first.
+        words = [
+            re.sub(r"^([\w./@]+=[^\[(,]+),.*", r"\1", word) for word in words if word != "-m" and "tag(" not in word
+        ]
+    bare = [word for word in words if "=" not in word]
+    assert not bare or name in TAKE_PATHS, f"{bare} are no settings"
+    compose_config(name, [word for word in words if "=" in word])
+
+
+def known_settings():
+    """Return every key that a yaml in conf/ holds, as it is typed, and the groups."""
+    keys = set()
+
+    def gather(value, prefix):
+        keys.add(prefix)
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                gather(inner, f"{prefix}.{key}" if prefix else key)
+
+    for file in conf_folder().rglob("*.yaml"):
+        text = file.read_text(encoding="utf-8")
+        group = file.relative_to(conf_folder()).parent.as_posix()
+        shared = {"capture": "scene"}.get(file.stem, "") if group == "." else group
+        prefix = "" if "@package _global_" in text else shared.replace("/", ".")
+        gather(yaml.safe_load(text) or {}, prefix)
+        keys.add(group)
+    return keys
+
+
+def test_settings_that_are_named_are_there():
+    known, unknown = known_settings(), []
+    for document in DOCUMENTS:
+        text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for code in re.findall(r"`([^`\n]+)`", text):
+            for word in code.split():
+                match = re.fullmatch(r"\+?([a-z_/]+(?:\.[a-z_]+)*)(?:@[\w.]+)?(?:=.*)?", word)
+                if match is None or ("=" not in word and "." not in word) or "/" in match[1].replace("hydra/", ""):
+                    continue
+                key, is_file = match[1], re.search(r"\.(py|md|json|ckpt|csv|mp4|yaml|html|png|log|npy)$", word)
+                is_ours = key.split(".")[0] in {each.split(".")[0] for each in known}
+                if is_ours and not is_file and key not in known and not key.startswith("trainer.lightning."):
+                    unknown.append(f"{document.name}: {word}")
+    assert not unknown
+
+
+def test_files_and_pages_that_are_linked_are_there():
+    missing = []
+    for document in [*DOCUMENTS, ROOT / "SECURITY.md"]:
+        for target in re.findall(r"\]\(([^)\s#]+)\)", document.read_text(encoding="utf-8")):
+            if "://" not in target and not (document.parent / target).exists():
+                missing.append(f"{document.name}: {target}")
+    assert not missing
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip("furo")
+    build = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "method.html").is_file()
