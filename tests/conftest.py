@@ -17,8 +17,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 import pytest
 import torch
 from _pytest import runner
-from support import fork_server
+from support import fork_server, quick_composition, type_checks
 from support.large_frame import in_large_frame
+
+type_checks.install()
+quick_composition.install()
 
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from support.captures import write_npz
+from support.running import start_code
 
 from nerf_lightning.cli.completion import completion
 from nerf_lightning.cli.help import help_on_anything
@@ -54,12 +55,13 @@ def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
         assert example.count(given) == 1
         example = example.replace(given, instead)
     check = "\nprint(run.system.step.progress.step, system.step.progress.step)\n"
-    done = subprocess.run([sys.executable, "-c", example + check], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    *_, shapes, steps = done.stdout.splitlines()
+    process = start_code(example + check, cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    *_, shapes, steps = output.splitlines()
     assert shapes == "torch.Size([4, 6, 3]) torch.Size([4, 6])"
     assert steps == "5 0"
-    assert "Warning" not in done.stderr
+    assert "Warning" not in errors
     assert list((tmp_path / "outputs" / "notebook").rglob("*.ckpt"))
 
 

@@ -2,9 +2,14 @@
 
 import atexit
 import gc
+import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+SIGNALS = "scipy.signal"
 
 
 def announce_start(command: str, arguments: list[str]) -> None:
@@ -26,9 +31,37 @@ def quick_imports() -> Iterator[None]:
     was_on = gc.isenabled()
     gc.disable()
     try:
-        yield
+        with _signals_later():
+            yield
     finally:
         gc.freeze()
         atexit.register(gc.unfreeze)
         if was_on:
             gc.enable()
+
+
+class _Later(ModuleType):
+    """Stands for a module until something other than `hamming` is asked of it."""
+
+    hamming = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # inspect looks at every module's __file__
+            raise AttributeError(name)
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+        return getattr(importlib.import_module(self.__name__), name)
+
+
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Leave out scipy.signal, an eighth of all: torchmetrics only looks whether a name of its is there."""
+    if SIGNALS in sys.modules:
+        yield
+        return
+    later = sys.modules[SIGNALS] = _Later(SIGNALS)
+    try:
+        yield
+    finally:
+        if sys.modules.get(SIGNALS) is later:
+            del sys.modules[SIGNALS]

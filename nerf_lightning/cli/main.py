@@ -136,10 +136,12 @@ def _run(command: str, arguments: list[str]) -> None:
 
     with explained(command):
         from nerf_lightning.cli.arguments import options_first
+        from nerf_lightning.cli.one_composition import compose_once
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
         allow_as_typed(arguments)
         sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
+        compose_once()
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.runs.sweep import watched

@@ -1,30 +1,23 @@
 """What takes the longest to load is loaded without a pause, and nothing else changes."""
 
 import gc
-import subprocess
-import sys
 
 import pytest
+from support.cold_import import cold_import
 
 from nerf_lightning.cli.loading import announce_start, quick_imports
 
-LOADING = """
-import gc
-import pytest
 
-from nerf_lightning.cli.loading import announce_start, quick_imports
-with quick_imports():
-    print(gc.isenabled())
-    import nerf_lightning.commands.train
-print(gc.isenabled(), gc.get_freeze_count() > 100_000)
-"""
+def test_the_collector_rests_while_lightning_is_loaded(tmp_path_factory):
+    during, _, after, *_ = cold_import(tmp_path_factory)
+    assert during == "False"
+    assert after == "True True"
 
 
-def test_the_collector_rests_while_lightning_is_loaded():
-    done = subprocess.run([sys.executable, "-W", "error", "-c", LOADING], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert done.stdout.splitlines() == ["False", "True True"]
+def test_scipys_signals_are_not_loaded_before_somebody_asks_for_them(tmp_path_factory):
+    _, loaded, *_, asked = cold_import(tmp_path_factory)
+    assert loaded == "[]"
+    assert asked == "3 True"
 
 
 def test_later_jobs_of_a_sweep_leave_nothing_behind():

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from hydra._internal.hydra import Hydra
 from support.made_once import made_once
-from support.one_composition import mode_as_typed
 from support.resumed import trained
 from support.running import FAST, FAST_PATH, start_cold
 from support.scenes import ball_scene
@@ -48,7 +46,6 @@ def nerf(monkeypatch, capfd):
 
     def call(*arguments: str) -> Result:
         monkeypatch.setattr(sys, "argv", ["nerf", *map(str, arguments)])
-        monkeypatch.setattr(Hydra, "get_mode", mode_as_typed)
         capfd.readouterr()
         code, environment = 0, dict(os.environ)
         try:

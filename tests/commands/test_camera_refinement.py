@@ -8,6 +8,7 @@ from support.posed_captures import Known, wall, write_llff
 from support.running import FAST, FAST_PATH
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.evaluation import camera_fit
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 
 SETTINGS = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop", "trainer.max_steps"))],
@@ -15,7 +16,15 @@ SETTINGS = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data
 
 
 @pytest.fixture
-def refined_run(nerf, capture, tmp_path):
+def quick_fit():
+    """Evaluations fit cameras in a few steps; how close they come is tried where they are fitted."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_fit, "NUM_STEPS", 6)
+        yield
+
+
+@pytest.fixture
+def refined_run(nerf, capture, tmp_path, quick_fit):
     folder = tmp_path / "run"
     result = nerf("train", "scene=npz", f"scene.path={capture}", *SETTINGS, "refinement=se3", "encoder.blend_in=0.3",
                   f"paths.output_dir={folder}")  # fmt: skip

@@ -2,8 +2,10 @@ import subprocess
 import sys
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 
+from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.files.folders import conf_folder
 
@@ -44,10 +46,41 @@ def test_the_settings_that_readers_share_are_no_scene_and_no_command(nerf):
 
 
 def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
-    """tests/support/one_composition.py counts on it."""
+    """cli/one_composition.py counts on it."""
     configs = [OmegaConf.load(file) for file in conf_folder().rglob("*.yaml")]
     assert len(configs) > 50
     assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]
+
+
+@pytest.fixture
+def compositions(monkeypatch):
+    """How often Hydra composed a config."""
+    times, load = [], ConfigLoaderImpl.load_configuration
+
+    def counted(*given, **named):
+        times.append(1)
+        return load(*given, **named)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    return times
+
+
+@pytest.mark.parametrize(("more", "times"), [((), 1), (("hydra.mode=RUN",), 2), (("--config-dir={}",), 2)])
+def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_users(
+    compositions, tmp_path, monkeypatch, capsys, more, times
+):
+    arguments = ["table", f"paths.output_dir={tmp_path}", f"runs=[{tmp_path}]", *more]
+    monkeypatch.setattr(sys, "argv", ["nerf", *(each.format(tmp_path) for each in arguments)])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert len(compositions) == times, capsys.readouterr()
+
+
+def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "many.yaml").write_text("# @package _global_\nhydra:\n  mode: MULTIRUN\n")
+    many = ("seed=0,1", "trainer.max_steps=-1", f"paths.output_dir={tmp_path / 'out'}")
+    assert "Launching 2 jobs" in nerf("train", f"--config-dir={tmp_path}", "experiment=many", *many).err
 
 
 def test_an_unknown_command_has_a_near_match(nerf):

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+from support.running import start_code
 from torch.nn import functional
 
 from nerf_lightning.nerf import products
@@ -142,8 +143,8 @@ print("compiled")
 @pytest.mark.slow
 def test_a_layer_compiles_in_one_piece():
     # A process of its own: torch.compile cannot look through the checks of shapes that tests switch on.
-    ran = subprocess.run([sys.executable, "-c", COMPILING], capture_output=True, text=True, timeout=300)
-    assert ran.stdout == "compiled\n", ran.stderr
+    output, errors = start_code(COMPILING).communicate(timeout=300)
+    assert output == "compiled\n", errors
 
 
 def test_a_function_of_its_own_precision_is_left_alone_by_autocast_and_leaves_it_as_it_was():

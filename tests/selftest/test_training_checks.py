@@ -28,7 +28,7 @@ def test_gradients_of_every_kind_of_model_are_right(method):
 def test_whole_trainings_learn_and_end_alike(method):
     rows = rows_of(training.checks(a_place()), f"{method}, float32: PSNR", f"{method}, bfloat16: PSNR")
     assert [row.outcome for row in rows] == ["ok", "ok"]
-    assert training._reference(method)[1] > 13  # white alone gives 7 dB
+    assert training._reference_psnr(method) > 13  # white alone gives 7 dB
 
 
 def test_a_kernel_that_is_off_by_one_percent_shows_in_the_gradients(monkeypatch):
@@ -39,7 +39,7 @@ def test_a_kernel_that_is_off_by_one_percent_shows_in_the_gradients(monkeypatch)
 
 
 def test_a_precision_that_is_lowered_shows_in_the_gradients(monkeypatch):
-    training._reference("coarse and fine MLP")  # kept from here on
+    training._reference_gradients("coarse and fine MLP")  # kept from here on
     right = Linear.forward
     monkeypatch.setattr(Linear, "forward", lambda layer, features: right(layer, features.bfloat16().float()))
     rows = rows_of(training.checks(a_place()), "coarse and fine MLP, float32: gradients")
@@ -50,7 +50,7 @@ def test_a_precision_that_is_lowered_shows_in_the_gradients(monkeypatch):
 def test_an_optimizer_that_is_wrong_shows_in_the_psnr(monkeypatch):
     from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
 
-    training._reference("packed hash grid")
+    training._reference_psnr("packed hash grid")
     right = adam_cpu.adam_step
 
     def sluggish(parameter, grad, first, second, step_size, *rest):

@@ -40,6 +40,9 @@ READ_AT_IMPORT = ("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "NUMBA_", "PYTHO
 # What commands import only once they need it.
 LAZY = ("torch.utils.tensorboard", "torchmetrics", "matplotlib.pyplot", "imageio.v3", "imageio_ffmpeg", "PIL.Image",
         "lightning.pytorch", "hydra.main", "jinja2", "rich.console", "rich.progress")  # fmt: skip
+# What most forks compose: a command, and what they pick of its groups.
+COMPOSED = (("train", "scene=npz", "model=nerf_tiny"), ("train", "scene=npz", "model=fast_small"), ("train",),
+            ("eval",), ("render",), ("export",), ("view",), ("table",))  # fmt: skip
 # One that may not be there, and one for GPUs.
 NOT_IMPORTED = ("__main__", "_triton")
 # The one of them that a fork can make up for.
@@ -231,12 +234,29 @@ def import_everything() -> None:
                 importlib.import_module(module.name)
 
 
-def compose_once() -> None:
-    """Let no fork compose its config twice; processes that start from nothing do."""
-    from hydra._internal.hydra import Hydra
-    from one_composition import mode_as_typed  # beside this file, which is a script here
+def compose_quickly() -> None:
+    """Let every fork find composed what most of them ask for; processes that start from nothing compose themselves.
 
-    Hydra.get_mode = mode_as_typed
+    A fork composes it here: Hydra looks for its plugins then, and those to come shall look for themselves.
+    """
+    sys.path.append(str(Path(__file__).parent))
+    import quick_composition
+
+    sys.path.pop()
+    from nerf_lightning.config.compose import compose_config
+
+    quick_composition.install()
+    reading, writing = os.pipe()
+    if os.fork() == 0:
+        for command, *picked in COMPOSED:
+            compose_config(command, picked)
+        with open(writing, "wb") as file:
+            file.write(quick_composition.kept())
+        os._exit(0)
+    os.close(writing)
+    with open(reading, "rb") as file:
+        quick_composition.keep(file.read())
+    os.wait()
 
 
 def serve(channel: socket.socket) -> dict[str, Any] | None:
@@ -339,10 +359,10 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.update(SET_BY_NERF | os.environ)
     gc.disable()
-    compose_once()
     # Not this file's folder, but where our package is.
     sys.path[0] = str(REPOSITORY)
     import_everything()
+    compose_quickly()
     # What is there is there to stay: no fork need look through it, and so copy it.
     gc.collect()
     gc.freeze()

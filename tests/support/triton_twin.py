@@ -11,7 +11,8 @@ def check_against_the_reference(device: str, count: int) -> None:
     from nerf_lightning.nerf.kernels.hash_grid import cuda as twin
 
     twin.trial(device)
-    for features, levels, size in ((2, 3, 10), (4, 5, 12)):
+    # Each has dense levels and hashed ones.
+    for features, levels, size in ((2, 2, 10), (4, 3, 12)):
         layout = hash_grid_layout(levels, size, 4, 64)
         table = torch.randn(layout.offsets[-1], features, device=device)
         points = 1.2 * torch.rand(count, 3, device=device) - 0.1

@@ -1,0 +1,113 @@
+"""Whatever of ours a test calls is checked: arguments, results, and that axes of one name have one size."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+import torch
+from beartype import beartype
+from jaxtyping import Float, TypeCheckError
+from support.type_checks import checked
+from torch import Tensor
+
+from nerf_lightning.nerf.rendering.quadrature import weights_from_density
+
+
+def decorated(function):
+    return checked(typechecker=beartype)(function)
+
+
+@decorated
+def summed(
+    points: Float[Tensor, "*rays samples 3"], weights: Float[Tensor, "*rays samples"]
+) -> Float[Tensor, "*rays 3"]:
+    return (points * weights[..., None]).sum(-2) if weights.shape[-1] > 1 else points
+
+
+def test_our_functions_are_checked_so():
+    with pytest.raises(TypeCheckError, match="deltas"):
+        weights_from_density(torch.ones(4, 3), torch.ones(4, 2))
+
+
+def test_axes_of_one_name_have_one_size_within_a_call_and_any_in_the_next():
+    assert summed(torch.ones(2, 5, 3), torch.ones(2, 5)).shape == (2, 3)
+    assert summed(torch.ones(7, 4, 6, 3), torch.ones(7, 4, 6)).shape == (7, 4, 3)
+    with pytest.raises(TypeCheckError, match="weights"):
+        summed(torch.ones(2, 5, 3), torch.ones(2, 4))
+    with pytest.raises(TypeCheckError, match="points"):
+        summed(torch.ones(2, 5, 3, dtype=torch.int64), torch.ones(2, 5))
+
+
+def test_what_is_returned_is_checked_with_the_axes_of_what_was_given():
+    with pytest.raises(TypeCheckError, match="return"):
+        summed(torch.ones(2, 1, 3), torch.ones(2, 1))
+
+
+def test_a_function_made_anew_with_each_call_is_checked_each_time():
+    def outer(scale):
+        @decorated
+        def inner(values: Float[Tensor, " n"], more: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+            return scale * (values + more)
+
+        return inner
+
+    assert outer(2.0)(torch.ones(3), more=torch.ones(3)).tolist() == [4, 4, 4]
+    assert outer(3.0)(torch.ones(2), torch.ones(2)).tolist() == [6, 6]
+    with pytest.raises(TypeCheckError, match="more"):
+        outer(2.0)(torch.ones(3), torch.ones(2))
+
+
+def test_a_dataclass_is_checked_when_it_is_made():
+    @checked(typechecker=beartype)
+    @dataclass(frozen=True)
+    class Pair:
+        one: Float[Tensor, " n"]
+        other: Float[Tensor, " n"]
+        name: str = ""
+
+    Pair(torch.ones(3), torch.ones(3), "a")
+    with pytest.raises(TypeCheckError, match="other"):
+        Pair(torch.ones(3), torch.ones(2))
+    with pytest.raises(TypeCheckError, match="name"):
+        Pair(torch.ones(3), torch.ones(3), 3)
+
+
+def test_axes_can_be_named_by_arguments():
+    @decorated
+    def drawn(count: int) -> Float[Tensor, "{count}"]:
+        return torch.ones(2)
+
+    assert drawn(2).shape == (2,)
+    with pytest.raises(TypeCheckError):
+        drawn(3)
+
+
+def test_a_generator_is_checked_when_it_is_made_and_its_axes_are_its_own():
+    @decorated
+    def each(values: Float[Tensor, " n"], more: Float[Tensor, " n"]) -> Iterator[Tensor]:
+        yield from values + more
+
+    @decorated
+    def total(values: Float[Tensor, " n"]) -> float:
+        return sum(map(float, each(values[:2], values[:2])))
+
+    assert total(torch.ones(5)) == 4
+    with pytest.raises(TypeCheckError, match="more"):
+        each(torch.ones(3), torch.ones(2))
+
+
+def test_plain_types_and_those_of_methods_and_properties_are_checked():
+    class Box:
+        @decorated
+        def doubled(self, times: int = 2, *, name: "str" = "") -> "str":
+            return name * times
+
+        @property
+        @decorated
+        def wrong(self) -> int:
+            return "no number"
+
+    assert Box().doubled(name="a") == "aa"
+    for call in (lambda: Box().doubled("2"), lambda: Box().doubled(name=3), lambda: Box().wrong):
+        with pytest.raises(TypeCheckError):
+            call()

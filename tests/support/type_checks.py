@@ -1,0 +1,124 @@
+"""Types and shapes checked at each call of our functions: what jaxtyping's import hook puts on them, made quicker.
+
+jaxtyping's own decorator binds each call's arguments twice and checks them twice, and it, beartype and Python's
+compiler take a quarter of the time of many tests. Here a function is prepared when it is first called, its arguments
+and its result are checked once by beartype, and axes have their sizes within one call, as ever.
+"""
+
+import dataclasses
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jaxtyping
+from beartype import BeartypeConf, beartype
+from jaxtyping import AbstractArray
+
+CONF = BeartypeConf(violation_type=jaxtyping.TypeCheckError)
+
+slowly_checked = jaxtyping.jaxtyped
+
+
+def install() -> None:
+    """Let jaxtyping's import hook decorate so; our package must not have been imported yet."""
+    jaxtyping.jaxtyped = checked  # type: ignore[assignment]
+
+
+def checked(given: Any = None, *, typechecker: Any = None) -> Any:
+    """Decorate a function, or the `__init__` of a dataclass, so that its calls are checked; a class stays as it is."""
+    if given is None:
+        return functools.partial(checked, typechecker=typechecker)
+    if not inspect.isclass(given):
+        return _function(given, typechecker)
+    if dataclasses.is_dataclass(given) and "__init__" in vars(given):
+        given.__init__ = _function(given.__init__, typechecker)
+    return given
+
+
+def _function(function: Any, typechecker: Any) -> Any:
+    if not isinstance(function, types.FunctionType):
+        return slowly_checked(function, typechecker=typechecker)
+    if not function.__annotations__ or getattr(function, "__no_type_check__", False):
+        return function
+    prepared: list[Callable] = []
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        if not prepared:
+            prepared.append(_inner(function, typechecker) if _is_inner(function) else _prepared(function, typechecker))
+        return prepared[0](*arguments, **named)
+
+    return call
+
+
+def _is_inner(function: types.FunctionType) -> bool:
+    """Whether it is made anew with each call of another, and takes nothing but arguments with a name and no default."""
+    code = function.__code__
+    unusual = (
+        function.__defaults__ or code.co_kwonlyargcount or code.co_flags & (inspect.CO_VARARGS | inspect.CO_VARKEYWORDS)
+    )
+    return function.__closure__ is not None and not unusual
+
+
+_inner_checks: dict[tuple, Callable] = {}
+
+
+def _inner(function: types.FunctionType, typechecker: Any) -> Callable:
+    """Return it checked by what has been prepared for the first one of this code and these types."""
+    code, hints = function.__code__, function.__annotations__
+    key = (code, *map(repr, hints.values()))
+    if key not in _inner_checks:
+        taken = ", ".join(code.co_varnames[: code.co_argcount])
+        named: dict[str, Any] = {}
+        exec(f"def check(function_, {taken}): return function_({taken})", function.__globals__, named)
+        check = named["check"]
+        check.__name__, check.__qualname__ = function.__name__, function.__qualname__
+        check.__annotations__ = hints
+        _inner_checks[key] = _prepared(check, typechecker)
+    return functools.partial(_inner_checks[key], function)
+
+
+def _prepared(function: types.FunctionType, typechecker: Any) -> Callable:
+    hints = {name: _hint(hint, function) for name, hint in function.__annotations__.items()}
+    arrays = [part for hint in hints.values() for part in _parts(hint) if _is_array(part)]
+    # Axes that are named by arguments; and what beartype would look at only when the first value is taken.
+    if any("{" in array.dim_str for array in arrays) or inspect.isgeneratorfunction(function):
+        return slowly_checked(function, typechecker=typechecker)
+    twin = types.FunctionType(
+        function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    twin.__kwdefaults__, twin.__module__ = function.__kwdefaults__, function.__module__
+    twin.__qualname__, twin.__annotations__ = function.__qualname__, hints
+    quick = beartype(twin, conf=CONF)
+    if not arrays:
+        return quick
+
+    def within(*arguments: Any, **named: Any) -> Any:
+        with slowly_checked("context"):
+            return quick(*arguments, **named)
+
+    return within
+
+
+def _hint(hint: Any, function: types.FunctionType) -> Any:
+    """Return what an annotation means; one that cannot be known here, as of a local class, allows anything."""
+    holder = types.SimpleNamespace(__annotations__={"it": hint})
+    try:
+        return typing.get_type_hints(holder, function.__globals__, include_extras=True)["it"]
+    except Exception:
+        return Any
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    yield hint
+    for part in typing.get_args(hint):
+        # The arguments of a Callable stand in a list of their own.
+        for each in part if isinstance(part, list) else [part]:
+            yield from _parts(each)
+
+
+def _is_array(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, AbstractArray)
