@@ -1,6 +1,7 @@
 """What takes the longest to load is loaded without a pause, and nothing else changes."""
 
 import gc
+import sys
 
 import pytest
 from support.cold_import import cold_import
