@@ -26,8 +26,9 @@ from nerf_lightning.nerf.kernels.bricks.layout import SIDE, kernels
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# Voxels that stop less than this of any camera's light are left out: fog that nobody sees costs as much as walls.
-LEAST_STOPPED = 0.03
+# Voxels that stop least light are left out, as long as all of them together stop no larger a share of it: fog that is
+# hardly seen costs as much as walls.
+SHARE_LEFT_OUT = 0.05
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,12 @@ def _who_sees(grid: DensityGrid, record: SceneRecord, looks: int, report: Report
 
 
 def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:
-    """Return which voxels stop light that some camera would see, and their neighbours."""
+    """Return which voxels stop light that some camera would see, but for the faintest, and their neighbours."""
     stopped = around.light.max(axis=1) * -np.expm1(-grid.optical[tuple(around.voxels.T)])
+    order = np.argsort(stopped)
+    together = np.cumsum(stopped[order])
     kept = np.zeros(grid.optical.shape, bool)
-    kept[tuple(around.voxels[stopped > LEAST_STOPPED].T)] = True
+    kept[tuple(around.voxels[order[together > SHARE_LEFT_OUT * together[-1]]].T)] = True
     return dilated(kept)
 
 

@@ -291,11 +291,11 @@ class Frames {
 
   moved() {
     this.movedAt = performance.now();
-    document.body.dataset.state = "moving";
     this.ask();
   }
 
   ask() {
+    document.body.dataset.state = "moving";
     if (!this.waits) requestAnimationFrame(this.step);
     this.waits = true;
   }
