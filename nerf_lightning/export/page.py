@@ -16,7 +16,7 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 Quality = Literal["small", "medium", "large"]
 # Voxels along the longest side of what there is, and spherical harmonics of its colours.
-QUALITIES: dict[Quality, tuple[int, int]] = {"small": (128, 4), "medium": (212, 4), "large": (320, 9)}
+QUALITIES: dict[Quality, tuple[int, int]] = {"small": (128, 4), "medium": (216, 4), "large": (320, 9)}
 COSTS = {"box": 1.0, "coarse": 1.0, "density": 4.0, "seen": 10.0, "colours": 15.0, "measured": 8.0}
 
 

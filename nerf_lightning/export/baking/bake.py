@@ -28,7 +28,7 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 # Voxels that stop least light are left out, as long as all of them together stop no larger a share of it: fog that is
 # hardly seen costs as much as walls.
-SHARE_LEFT_OUT = 0.05
+SHARE_LEFT_OUT = 0.035
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def to_bytes_of_density(optical: Float[ndarray, "*any"]) -> UInt8[ndarray, "*any
     """Return the bytes of optical depths per voxel.
 
     >>> to_bytes_of_density(np.array([0.0, 0.05, 1.0, 1e9])).tolist()
-    [0, 81, 170, 255]
+    [0, 80, 170, 255]
     """
     exponent = np.log2(optical + 2.0**LEAST_EXPONENT)
     return np.rint(np.clip((exponent - LEAST_EXPONENT) / EXPONENT_STEP, 0, 255)).astype(np.uint8)

@@ -23,8 +23,8 @@ FIRST = 96
 STRIDE = 4
 # A voxel that stops less of the light holds nothing.
 LEAST_OPTICAL = 0.01
-# The optical depths, what is seen and what is coloured, and what these are made by.
-BYTES_PER_VOXEL = 10
+# The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
+BYTES_PER_VOXEL = 20
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 # Of each voxel, so many cameras that see it are asked, and so many in all to find them.
-LOOKS, TRIES = {1: 4, 4: 8, 9: 12}, 48
+LOOKS, TRIES = {1: 4, 4: 10, 9: 12}, 48
 # What holds back coefficients of degree 1 and 2, as a share of a voxel's light.
-RIDGE = 0.01
+RIDGE = 0.02
 # Half range of the bytes of coefficients, of degree 1 and of degree 2.
 RANGES = (0.6, 0.6)
 # Their bytes are multiples of this: such small changes are not seen, and few different bytes are packed well.
