@@ -85,6 +85,21 @@ def _view(arguments: list[str]) -> list[str]:
         return ["photographs=false", *arguments]
 
 
+def _export(arguments: list[str]) -> list[str]:
+    """Name the run's own scene as for `eval` where photographs are shown; where it is unknown, go without them."""
+    if "what=page" not in arguments:
+        return arguments
+    try:
+        return _eval(arguments)
+    except InputError as error:
+        from nerf_lightning.config.scene_overrides import UnknownScene
+
+        if not isinstance(error, UnknownScene):
+            raise
+        log.warning("The page will be without photographs: %s", error)
+        return ["what.photographs=0", "what.max_views=0", *arguments]
+
+
 def _table(arguments: list[str]) -> list[str]:
     """Take paths that stand alone for the runs."""
     return named_paths(arguments, "runs", several=True)
@@ -109,6 +124,7 @@ PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
     "train": _train,
     "eval": _eval,
     "view": _view,
+    "export": _export,
     "table": _table,
     "report": _report,
 }

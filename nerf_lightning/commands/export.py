@@ -4,12 +4,16 @@ import torch
 from omegaconf import DictConfig
 
 from nerf_lightning import ranks
+from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import Beside, Export
+from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import open_checkpoint
+from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
 
 
 def run(config: DictConfig) -> None:
@@ -24,9 +28,24 @@ def export(config: DictConfig) -> None:
     what: Export = build(config.what)
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
+    if what.shows_photographs:
+        what.beside = _beside(config, opened.checkpoint)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are those that training refined (refinement=...), not those that were read")
     say(*map(str, written))
+
+
+def _beside(config: DictConfig, checkpoint: Checkpoint) -> Beside:
+    """Return the photographs, where they are asked for and can be read, and the numbers of the run."""
+    asked = config.what.photographs or config.what.max_views
+    run = beside_checkpoint(checkpoint.path, "metrics.json").parent
+    model = checkpoint.choices.get("model", "")
+    known = [
+        ("model", model),
+        ("step", f"{checkpoint.step:,}"),
+        *facts(read_json_object(run / "metrics.json"), read_note(run)),
+    ]
+    return Beside(read_photographs(config, checkpoint) if asked else None, tuple(known))

@@ -1,24 +1,16 @@
 """Look around in a checkpoint, in the browser."""
 
-import logging
-
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
-from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
-from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.training.open_checkpoint import open_checkpoint
+from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
-
-log = logging.getLogger(__name__)
 
 
 def run(config: DictConfig) -> None:
@@ -28,7 +20,7 @@ def run(config: DictConfig) -> None:
     opened = open_checkpoint(config)
     record = opened.checkpoint.scene
     background = known_background(config.background or record.background)
-    scene = _read_photographs(config, record) if config.photographs else None
+    scene = read_photographs(config, opened.checkpoint) if config.photographs else None
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "viewer"))
     renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)
@@ -44,13 +36,3 @@ def run(config: DictConfig) -> None:
         queue.work_until(stopped)
     finally:
         page.close()
-
-
-def _read_photographs(config: DictConfig, record: SceneRecord) -> Scene | None:
-    try:
-        return in_recorded_frame(build(config.scene).read(), record)
-    except InputError as error:
-        log.warning("The cameras are shown without their photographs: %s", error)
-    except OSError as error:
-        log.warning("The cameras are shown without their photographs, which cannot be read: %s", error)
-    return None

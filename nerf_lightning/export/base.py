@@ -1,15 +1,31 @@
 """The contract of an export: a model in, files out, in the user's own frame."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.types.scene import SceneRecord
+from nerf_lightning.nerf.types.scene import Scene, SceneRecord
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What belongs to a checkpoint and is not in it."""
+
+    photographs: Scene | None = None
+    """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
+    facts: tuple[tuple[str, str], ...] = ()
+    """What is known of the run: label and value, as texts that may come from anybody."""
 
 
 class Export(ABC):
     """Write what a model has learnt as files for other programs."""
+
+    shows_photographs: bool = False
+    """Whether the photographs are read again for it."""
+    beside: Beside = Beside()
+    """What the command has found beside the checkpoint, for those that show photographs."""
 
     @abstractmethod
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:

@@ -1,6 +1,5 @@
 """Pictures and films as part of a page: `data:` addresses, which load nothing."""
 
-import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from PIL import Image
 
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
 
 LONGEST_SIDE = 1600
@@ -64,8 +64,3 @@ def embedded_video(path: Path, most_bytes: int) -> str:
     if content[4:8] != b"ftyp":
         raise InputError(f"{path.name} is not an mp4")
     return data_address("video/mp4", content)
-
-
-def data_address(kind: str, content: bytes) -> str:
-    """Return bytes as an address of this media type."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -4,17 +4,14 @@ All texts may come from anybody's run folder. They are escaped, and the page's p
 and nothing be fetched.
 """
 
-import base64
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.escaping import for_html
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.html import own_policy, rendered
 from nerf_lightning.report.curves import Drawing
 from nerf_lightning.report.embedding import Embedded
 
@@ -69,26 +66,7 @@ def write_page(report: Report, target: Path) -> None:
 
 def page(report: Report) -> str:
     """Return the report as HTML."""
-    script, style = (_text(f"page.{ending}") for ending in ("js", "css"))
-    policy = (
-        f"default-src 'none'; img-src data:; media-src data:; script-src '{_digest(script)}'; "
-        f"style-src '{_digest(style)}'; base-uri 'none'; form-action 'none'"
-    )
-    environment = Environment(
-        loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined, finalize=_escaped
-    )
-    template = environment.get_template("page.html")
+    script, style = ((FOLDER / f"page.{ending}").read_text(encoding="utf-8") for ending in ("js", "css"))
+    policy = own_policy(script, style)
     # Ours alone are put in as they are.
-    return template.render(report=report, policy=policy, script=Markup(script), style=Markup(style))
-
-
-def _escaped(value: object) -> object:
-    return Markup(for_html(value)) if type(value) is str else value
-
-
-def _text(name: str) -> str:
-    return (FOLDER / name).read_text(encoding="utf-8")
-
-
-def _digest(text: str) -> str:
-    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+    return rendered(FOLDER / "page.html", report=report, policy=policy, script=Markup(script), style=Markup(style))

@@ -1,5 +1,6 @@
 """A checkpoint on its way to be looked at: the device is chosen, the file read, its model built and prepared."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -7,6 +8,7 @@ from typing import Any, NoReturn
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.errors import InputError
@@ -15,8 +17,11 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,20 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
 def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> Model:
     model = load_model(checkpoint)
     return model.to(settings.device) if float32 else settings.prepare(model)
+
+
+def read_photographs(config: DictConfig, checkpoint: Checkpoint) -> Scene | None:
+    """Return the capture that `scene` names, as the checkpoint's model knows it.
+
+    None, and a warning, where it cannot be read.
+    """
+    try:
+        return as_trained(build(config.scene).read(), checkpoint)
+    except InputError as error:
+        log.warning("The cameras are shown without their photographs: %s", error)
+    except OSError as error:
+        log.warning("The cameras are shown without their photographs, which cannot be read: %s", error)
+    return None
 
 
 def rendering_step(checkpoint: Checkpoint) -> TrainStep:

@@ -41,6 +41,34 @@ def test_every_kind_of_export_writes_what_it_says(nerf, last, tmp_path):
     assert len(json.loads((tmp_path / "images" / "images.json").read_text())["views"]) == 2
 
 
+def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, finished_run, tmp_path):
+    where = f"paths.output_dir={tmp_path}"
+    result = nerf("export", f"ckpt={last}", "what=page", "what.resolution=16", "what.max_views=1", where)
+    if result.code:  # 20 steps may leave a field without anything in it
+        said(result, "There is nothing to export")
+        return
+    assert "against the photographs of 1 test view" in result.out
+    assert f"{tmp_path}/page.html" in result.out
+    text = (tmp_path / "page.html").read_text()
+    psnr = json.loads((finished_run / "metrics.json").read_text())["psnr"]
+    assert f"{psnr:.2f} dB" in text
+    assert text.count('alt="ball_') + text.count('<button type="button" data-view') >= 8
+    (tmp_path / "page.html").write_text("something else")
+    said(nerf("export", f"ckpt={last}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR")
+    said(nerf("export", f"ckpt={last}", "what=page", "what.quality=huge", where), "what.quality=huge", "small, medium")
+
+
+def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
+    given = ("what=page", "what.resolution=16", "what.max_views=1", "scene=npz", f"scene.path={tmp_path}/gone.npz")
+    result = nerf("export", f"ckpt={last}", *given, f"paths.output_dir={tmp_path}")
+    if result.code:
+        said(result, "There is nothing to export")
+        return
+    assert "without their photographs" in result.err
+    assert "against the photographs" not in result.out
+    assert 'class="without"' in (tmp_path / "page.html").read_text()
+
+
 def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
     where = f"paths.output_dir={tmp_path}"
     said(nerf("export", f"ckpt={tmp_path}/absent.ckpt", where), "There is no checkpoint at")

@@ -1,0 +1,133 @@
+"""From a model to bytes in bricks: densities, who sees them, and their colours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
+from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, any_in_blocks, density_grid, dilated
+from nerf_lightning.export.baking.seen_colors import (
+    LOOKS,
+    RANGES,
+    TRIES,
+    camera_views,
+    fitted_colors,
+    in_world,
+    to_bytes_of_colors,
+)
+from nerf_lightning.export.density_grid import Report
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE, kernels
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
+
+# Voxels that stop least light are left out, as long as all of them together stop no larger a share of it: fog that is
+# hardly seen costs as much as walls.
+SHARE_LEFT_OUT = 0.035
+
+
+@dataclass(frozen=True)
+class SeenVoxels:
+    """Voxels at which light from the scene's things may be stopped, and who sees them."""
+
+    voxels: Int[ndarray, "voxels 3"]
+    world: Float[Tensor, "voxels 3"]
+    """Where they lie in the world."""
+    cameras: Int[ndarray, "voxels looks"]
+    """Numbers of training cameras that see each; -1: no more."""
+    light: Float[ndarray, "voxels looks"]
+    """How much of its light arrives there."""
+
+    def only(self, which: Bool[ndarray, "voxels"]) -> "SeenVoxels":
+        """Return some of them."""
+        world = self.world[torch.from_numpy(which)]
+        return SeenVoxels(self.voxels[which], world, self.cameras[which], self.light[which])
+
+
+def bake(
+    model: Model, record: SceneRecord, resolution: int, num_harmonics: int, tile_points: int, report: Report
+) -> BakedField:
+    """Return what is dense and seen of a model's field.
+
+    Raises:
+        InputError: nothing is, or it does not fit into memory.
+    """
+    grid = density_grid(model, record, resolution, tile_points, report)
+    around = _who_sees(grid, record, LOOKS[num_harmonics], report)
+    kept = _stopping(grid, around)
+    if not kept.any():
+        raise InputError(
+            f"Nothing of {for_terminal(record.name)} is seen: no training camera looks at what has density. Correct "
+            "the box (scene.aabb_half) or the cameras' poses, and train again."
+        )
+    grid.optical[~kept] = 0.0
+    colored = around.only((around.cameras[:, 0] >= 0) & kept[tuple(around.voxels.T)])
+    centers = record.cameras.c2w[list(record.splits["train"]), :, 3]
+    seen = (colored.world, colored.cameras, colored.light)
+    fitted = fitted_colors(model, grid.places(colored.voxels), *seen, centers, num_harmonics, tile_points, report)
+    return _in_bricks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T)
+
+
+def _who_sees(grid: DensityGrid, record: SceneRecord, looks: int, report: Report) -> SeenVoxels:
+    """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
+    voxels = np.argwhere(dilated(grid.optical > LEAST_OPTICAL)).astype(np.int32)
+    world = in_world(grid.places(voxels), record)
+    eyes, views = camera_views(record)
+    in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / grid.spacing, eyes[:, 3:]], axis=1)
+    asked = (voxels, world.numpy(), in_grid.astype(np.float32), views)
+    cameras, light = kernels().seeing_cameras(grid.optical, *asked, looks, TRIES)
+    report("seen", 1.0)
+    return SeenVoxels(voxels, world, cameras, light)
+
+
+def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:
+    """Return which voxels stop light that some camera would see, but for the faintest, and their neighbours."""
+    stopped = around.light.max(axis=1) * -np.expm1(-grid.optical[tuple(around.voxels.T)])
+    order = np.argsort(stopped)
+    together = np.cumsum(stopped[order])
+    kept = np.zeros(grid.optical.shape, bool)
+    kept[tuple(around.voxels[order[together > SHARE_LEFT_OUT * together[-1]]].T)] = True
+    return dilated(kept)
+
+
+def _in_bricks(
+    grid: DensityGrid, voxels: Int[ndarray, "colored 3"], colors: UInt8[ndarray, "channels colored"]
+) -> BakedField:
+    bricks = _bricks_of(grid.optical > LEAST_OPTICAL)
+    place = np.full(bricks.shape, -1, np.int64)
+    place[bricks] = np.arange(np.count_nonzero(bricks))
+    at, within = np.divmod(voxels, SIDE)
+    brick = place[tuple(at.T)]
+    there = brick >= 0
+    value = np.ravel_multi_index((brick[there], *within[there].T), (int(bricks.sum()), SIDE, SIDE, SIDE))
+    order = np.argsort(value)
+    colored = np.zeros((int(bricks.sum()), SIDE, SIDE, SIDE), bool)
+    colored.reshape(-1)[value] = True
+    (nx, ny, nz), side = bricks.shape, SIDE
+    blocks = grid.optical.reshape(nx, side, ny, side, nz, side).transpose(0, 2, 4, 1, 3, 5)
+    x, y, z = (float(number) for number in grid.lower)
+    return BakedField(
+        lower=(x, y, z),
+        spacing=grid.spacing,
+        shape=(nx, ny, nz),
+        bricks=np.flatnonzero(bricks).astype(np.int32),
+        density=to_bytes_of_density(blocks[bricks]),
+        colored=colored,
+        colors=np.ascontiguousarray(colors[:, there][:, order]),
+        ranges=RANGES,
+    )
+
+
+def _bricks_of(dense: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
+    """Return the bricks in which something lies, or on whose border."""
+    padded = np.pad(dense, ((0, 1),) * 3)
+    found = dense.copy()
+    for a, b, c in np.ndindex(2, 2, 2):
+        # A brick's tile reaches one value further: what stands there is the first of the next brick.
+        found |= padded[a : a + dense.shape[0], b : b + dense.shape[1], c : c + dense.shape[2]]
+    return any_in_blocks(found, SIDE)

@@ -1,0 +1,93 @@
+"""A radiance field as bytes in bricks: what a page holds, and how its numbers are read."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE
+
+LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
+"""Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""
+EXPONENT_STEP = (MOST_EXPONENT - LEAST_EXPONENT) / 255.0
+
+NO_CHANGE = 128
+"""The byte of a coefficient that is nothing."""
+
+
+@dataclass(frozen=True)
+class BakedField:
+    """Density and colour at the corners of a lattice, in bricks of 8 x 8 x 8 values.
+
+    A byte q of density is an optical depth per voxel of 2^(a + b q) - 2^a: a step of any length has its own opacity.
+    Colour is a sum of real spherical harmonics of the viewing direction; bytes of the first are its colour, bytes of
+    the others go from -range to range, with nothing at 128.
+    """
+
+    lower: tuple[float, float, float]
+    """Where the first value stands, scene units."""
+    spacing: float
+    """Scene units between values."""
+    shape: tuple[int, int, int]
+    """Bricks along each axis."""
+    bricks: Int[ndarray, "bricks"]
+    """Which bricks there are: x * (ny * nz) + y * nz + z, rising."""
+    density: UInt8[ndarray, "bricks 8 8 8"]
+    colored: Bool[ndarray, "bricks 8 8 8"]
+    """Which values have a colour: those that can be seen."""
+    colors: UInt8[ndarray, "channels colored"]
+    """Three channels for each spherical harmonic; the coloured values in their order."""
+    ranges: tuple[float, float]
+    """Half range of the coefficients of degree 1 and 2."""
+
+    @property
+    def num_harmonics(self) -> int:
+        """How many spherical harmonics a colour has: 1, 4 or 9."""
+        return len(self.colors) // 3
+
+    @property
+    def index(self) -> Int[ndarray, "x y z"]:
+        """The number of each brick, -1 where there is none."""
+        index = np.full(math.prod(self.shape), -1, np.int32)
+        index[self.bricks] = np.arange(len(self.bricks))
+        return index.reshape(self.shape)
+
+    def channel(self, number: int) -> UInt8[ndarray, "bricks 8 8 8"]:
+        """Return a channel of all values; those without a colour are black, and the same from all sides."""
+        values = np.full(self.colored.shape, 0 if number < 3 else NO_CHANGE, np.uint8)
+        values[self.colored] = self.colors[number]
+        return values
+
+    @property
+    def scale(self) -> Float[ndarray, "numbers"]:
+        """How bytes become numbers, as the marcher takes it."""
+        return np.array([LEAST_EXPONENT, EXPONENT_STEP, *self.ranges], np.float32)
+
+
+def to_bytes_of_density(optical: Float[ndarray, "*any"]) -> UInt8[ndarray, "*any"]:
+    """Return the bytes of optical depths per voxel.
+
+    >>> to_bytes_of_density(np.array([0.0, 0.05, 1.0, 1e9])).tolist()
+    [0, 80, 170, 255]
+    """
+    exponent = np.log2(optical + 2.0**LEAST_EXPONENT)
+    return np.rint(np.clip((exponent - LEAST_EXPONENT) / EXPONENT_STEP, 0, 255)).astype(np.uint8)
+
+
+def tiles_of(
+    values: UInt8[ndarray, "bricks 8 8 8"], index: Int[ndarray, "x y z"], empty: int
+) -> UInt8[ndarray, "bricks 9 9 9"]:
+    """Return the bricks with a border beyond their last values: the first ones of the next bricks, else `empty`."""
+    tiles = np.full((len(values), TILE, TILE, TILE), empty, np.uint8)
+    tiles[:, :SIDE, :SIDE, :SIDE] = values
+    place = np.argwhere(index >= 0)
+    padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)
+    own, border = slice(0, SIDE), SIDE
+    for a, b, c in list(np.ndindex(2, 2, 2))[1:]:
+        other = padded[tuple((place + np.array([a, b, c])).T)]
+        there = other >= 0
+        part = tiles[(slice(None), *(border if each else own for each in (a, b, c)))]
+        part[there] = values[(other[there], *(0 if each else own for each in (a, b, c)))]
+    return tiles

@@ -1,0 +1,153 @@
+"""Where a model has density: the box that holds it, and its values on a lattice over that box."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
+from nerf_lightning.machine import require_memory
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.tiles import tiles
+from nerf_lightning.nerf.types.scene import SceneRecord
+
+# Cells along the longest side of the first look.
+FIRST = 96
+# The second look is at every fourth voxel.
+STRIDE = 4
+# A voxel that stops less of the light holds nothing.
+LEAST_OPTICAL = 0.01
+# The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
+BYTES_PER_VOXEL = 20
+
+
+@dataclass(frozen=True)
+class DensityGrid:
+    """Optical depths per voxel, at lower + spacing (i, j, k); each side is a multiple of a brick's."""
+
+    lower: Float[Tensor, "3"]
+    spacing: float
+    optical: Float[ndarray, "x y z"]
+
+    def places(self, voxels: Int[ndarray, "voxels 3"]) -> Float[Tensor, "voxels 3"]:
+        """Return where voxels lie, scene frame."""
+        return (self.lower + self.spacing * torch.from_numpy(voxels)).float()
+
+
+def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points: int, report: Report) -> DensityGrid:
+    """Return the densities over what there is in a scene's box, `resolution` voxels along its longest side.
+
+    Raises:
+        InputError: there is nothing, or the grid does not fit into memory.
+    """
+    box = _box_of_content(model, record, tile_points, report)
+
+    def sides_of(count: int) -> tuple[float, tuple[int, int, int]]:
+        sides = (box[1] - box[0]).double()
+        spacing = float(sides.max()) / count
+        x, y, z = (SIDE * int(-(-float(side) // (SIDE * spacing)) or 1) for side in sides)
+        return spacing, (x, y, z)
+
+    def bytes_of(count: int) -> int:
+        x, y, z = sides_of(count)[1]
+        return BYTES_PER_VOXEL * x * y * z
+
+    spacing, shape = sides_of(resolution)
+    require_memory(
+        f"what.resolution={resolution} makes a grid of {' x '.join(map(str, shape))} voxels",
+        resolution,
+        bytes_of,
+        lambda count: f"what.resolution={count}",
+    )
+    lower = box.double().mean(dim=0) - 0.5 * spacing * (torch.tensor(shape) - 1)
+    grid = DensityGrid(lower, spacing, np.zeros(shape, np.float32))
+    _fill(model, grid, tile_points, report)
+    if not (grid.optical > LEAST_OPTICAL).any():
+        raise InputError(_nothing(record))
+    return grid
+
+
+def _box_of_content(model: Model, record: SceneRecord, tile_points: int, report: Report) -> Float[Tensor, "2 3"]:
+    lattice = Lattice.over(record.aabb, FIRST)
+    density = sample_density(model, lattice, tile_points, report, "box")
+    # A voxel is finer than the cells of this look by half at least.
+    found = np.argwhere(density * (0.5 * lattice.spacing) > LEAST_OPTICAL)
+    if not len(found):
+        raise InputError(_nothing(record))
+    corners = np.stack([found.min(axis=0) - 1, found.max(axis=0) + 1]).astype(np.float64)
+    inside = torch.from_numpy(corners) * lattice.spacing + lattice.lower
+    return torch.stack([inside[0].maximum(record.aabb[0].double()), inside[1].minimum(record.aabb[1].double())])
+
+
+def _nothing(record: SceneRecord) -> str:
+    return (
+        f"There is nothing to export: the model of {for_terminal(record.name)} has no density anywhere in the scene's "
+        "box. Train longer, or correct the box (scene.aabb_half) and train again."
+    )
+
+
+def _fill(model: Model, grid: DensityGrid, tile_points: int, report: Report) -> None:
+    """Ask for the densities of the bricks in or beside which the second look has found something."""
+    coarse = np.argwhere(np.ones([-(-side // STRIDE) for side in grid.optical.shape], bool))
+    found = _asked(model, grid, (STRIDE * coarse).astype(np.int32), tile_points, report, "coarse")
+    candidates = _bricks_around((found > LEAST_OPTICAL).reshape([-(-side // STRIDE) for side in grid.optical.shape]))
+    corner = SIDE * np.argwhere(candidates).astype(np.int32)
+    within = np.argwhere(np.ones((SIDE,) * 3, bool)).astype(np.int32)
+    for part in tiles(len(corner), max(1, CHUNK // SIDE**3)):
+        voxels = (corner[part, None] + within).reshape(-1, 3)
+        grid.optical[tuple(voxels.T)] = _asked(model, grid, voxels, tile_points)
+        report("density", part.stop / max(1, len(corner)))
+
+
+def _asked(
+    model: Model,
+    grid: DensityGrid,
+    voxels: Int[ndarray, "voxels 3"],
+    tile_points: int,
+    report: Report | None = None,
+    stage: str = "",
+) -> Float[ndarray, "voxels"]:
+    device = next(model.parameters()).device
+    optical = np.empty(len(voxels), np.float32)
+    for part in tiles(len(voxels), tile_points):
+        optical[part] = grid.spacing * model.density(grid.places(voxels[part]).to(device)).cpu().numpy()
+        if report is not None:
+            report(stage, part.stop / len(voxels))
+    return optical
+
+
+def _bricks_around(found: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
+    """Return the bricks within a stride of what was found; two strides make a brick."""
+    return any_in_blocks(dilated(found), SIDE // STRIDE)
+
+
+def any_in_blocks(mask: Bool[ndarray, "x y z"], side: int) -> Bool[ndarray, "bx by bz"]:
+    """Return in which blocks of a side anything is true.
+
+    >>> any_in_blocks(np.eye(4, dtype=bool)[None].repeat(2, 0), 2)[0].tolist()
+    [[True, False], [False, True]]
+    """
+    pairs = [n for length in mask.shape for n in (length // side, side)]
+    blocks: Bool[ndarray, "bx by bz"] = np.asarray(mask.reshape(pairs).any(axis=(1, 3, 5)))
+    return blocks
+
+
+def dilated(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
+    """Return the mask with all neighbours, those across edges and corners among them.
+
+    >>> int(dilated(np.pad(np.ones((1, 1, 1), bool), 2)).sum())
+    27
+    """
+    grown = mask.copy()
+    for axis in range(3):
+        before = np.moveaxis(grown.copy(), axis, 0)
+        into = np.moveaxis(grown, axis, 0)
+        into[1:] |= before[:-1]
+        into[:-1] |= before[1:]
+    return grown

@@ -1,0 +1,71 @@
+"""What a page shows, computed without it: the same steps through the same bytes."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.export.baking.baked_field import NO_CHANGE, BakedField, tiles_of
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.kernels.bricks.layout import kernels
+from nerf_lightning.nerf.types.rays import RayBundle
+
+STEP = 0.5
+"""Voxels between two samples."""
+
+
+@dataclass(frozen=True)
+class MarchedRays:
+    """What rays meet."""
+
+    rgb: Float[Tensor, "*rays 3"]
+    """Without background: the light of what is there."""
+    opacity: Float[Tensor, "*rays"]
+    depth: Float[Tensor, "*rays"]
+    """Distance at which the stopped light was stopped, scene units; 0 where none was."""
+    num_densities: float
+    """Samples of density per ray, and of colour, on average."""
+    num_colors: float
+
+
+class Marcher:
+    """Render a baked field."""
+
+    def __init__(self, baked: BakedField):
+        self.baked, self.index = baked, baked.index
+        self.density = tiles_of(baked.density, self.index, empty=0)
+        channels = range(len(baked.colors))
+        tiles = [tiles_of(baked.channel(each), self.index, 0 if each < 3 else NO_CHANGE) for each in channels]
+        self.colors = np.stack(tiles, axis=-1)
+
+    def render(self, rays: RayBundle) -> MarchedRays:
+        """Return what rays meet in the box."""
+        shape = rays.near.shape
+        lower, spacing = torch.tensor(self.baked.lower), self.baked.spacing
+        origins = ((rays.origins - lower) / spacing).float().reshape(-1, 3).contiguous()
+        directions, looks = rays.directions.float().reshape(-1, 3), rays.view_directions.float().reshape(-1, 3)
+        basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
+        found = kernels().march_tiles(
+            origins.numpy(),
+            directions.contiguous().numpy(),
+            basis.contiguous().numpy(),
+            self.index,
+            self.density,
+            self.colors,
+            self.baked.scale,
+            STEP,
+        )
+        columns = torch.from_numpy(found)
+        depth = spacing * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
+        mean: Float[ndarray, "columns"] = found[:, 5:].mean(axis=0)
+        return MarchedRays(
+            columns[:, :3].view(*shape, 3),
+            columns[:, 3].view(shape),
+            depth.view(shape),
+            float(mean[0]),
+            float(mean[1]),
+        )

@@ -1,0 +1,95 @@
+"""The scene as one page that anyone can open and walk around in: no server, no network, no program."""
+
+from pathlib import Path
+from typing import Literal
+
+from nerf_lightning.console import StageProgress, say
+from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.baking.bake import bake
+from nerf_lightning.export.baking.cost import Cost, measured_cost
+from nerf_lightning.export.baking.marcher import Marcher
+from nerf_lightning.export.base import Export
+from nerf_lightning.export.page_file import is_page, page_of, write_page
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.types.scene import SceneRecord
+
+Quality = Literal["small", "medium", "large"]
+# Voxels along the longest side of what there is, and spherical harmonics of its colours.
+QUALITIES: dict[Quality, tuple[int, int]] = {"small": (128, 4), "medium": (216, 4), "large": (320, 9)}
+COSTS = {"box": 1.0, "coarse": 1.0, "density": 4.0, "seen": 10.0, "colours": 15.0, "measured": 8.0}
+
+
+class PageExport(Export):
+    """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
+
+    Args:
+        quality: about 3, 10 or 30 MB.
+        resolution: voxels along the longest side of what there is; None: as the quality has it.
+        photographs: most photographs that are places to jump to, spread over all; 0: none.
+        max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
+    """
+
+    shows_photographs = True
+
+    def __init__(
+        self,
+        quality: Quality = "medium",
+        resolution: int | None = None,
+        photographs: int = 24,
+        max_views: int = 8,
+    ):
+        if resolution is not None and resolution < 8:
+            raise InputError(f"what.resolution={resolution}: give 8 voxels or more, or null for what.quality's.")
+        for name, value in (("photographs", photographs), ("max_views", max_views)):
+            if value < 0:
+                raise InputError(f"what.{name}={value}: give 0 or more.")
+        self.quality, self.photographs, self.max_views = quality, photographs, max_views
+        usual, self.num_harmonics = QUALITIES[quality]
+        self.resolution = resolution or usual
+
+    def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
+        """Write the page, and say what it costs."""
+        target = folder / "page.html"
+        require_no_other(target)
+        require_box(record)
+        with StageProgress(COSTS) as report:
+            baked = bake(model, record, self.resolution, self.num_harmonics, tile_points, report)
+            marcher = Marcher(baked)
+            cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
+        page = page_of(marcher, record, self.beside, self.photographs, cost.facts())
+        write_page(page, target)
+        say(*self._said(target, cost))
+        return [target]
+
+    def _said(self, target: Path, cost: Cost) -> list[str]:
+        size = f"{target.stat().st_size / 1e6:.1f} MB"
+        return [f"size         {size} (what.quality={self.quality})", *(f"{a:<12} {b}" for a, b in cost.facts())]
+
+
+def require_box(record: SceneRecord) -> None:
+    """Refuse a scene without an end.
+
+    Raises:
+        InputError: all space is contracted.
+    """
+    if record.space == "contracted":
+        raise InputError(
+            f"what=page: {for_terminal(record.name)} was trained with all of space contracted around its box "
+            "(scene.space=contracted), and a page holds a box alone: what lies around it would be missing. Use "
+            "nerf view or nerf render, what=points or what=mesh, or train again with scene.space=bounded (or ndc, for "
+            "photographs that all look the same way)."
+        )
+
+
+def require_no_other(target: Path) -> None:
+    """Refuse to write over what is no page of ours.
+
+    Raises:
+        InputError: there is such a file, or a folder.
+    """
+    if target.is_dir() or (target.exists() and not is_page(target)):
+        kind = "a folder" if target.is_dir() else "a file that is no page of this program"
+        raise InputError(
+            f"{target} is {kind}, and would be lost. Move it away, or give another folder with paths.output_dir=DIR."
+        )

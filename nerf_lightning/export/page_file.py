@@ -1,0 +1,194 @@
+"""A page as a file: what stands in it, and how it is read again."""
+
+import base64
+import binascii
+import io
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from markupsafe import Markup
+from PIL import Image
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.baking.baked_field import BakedField
+from nerf_lightning.export.baking.cost import over
+from nerf_lightning.export.baking.marcher import STEP, Marcher
+from nerf_lightning.export.baking.payload import described, packed, unpacked
+from nerf_lightning.export.base import Beside
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.html import data_address, own_policy, rendered
+from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.render_image import view_rays
+from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
+from nerf_lightning.visualization.pictures import to_bytes
+
+FOLDER = Path(__file__).parent / "page_files"
+MARK = b"<!-- nerf_lightning page 1 -->"
+BEHIND: dict[Background, str] = {"white": "#ffffff", "random": "#ffffff", "black": "#000000", "none": "#000000"}
+# Pixels of the longer side: of the still picture, of photographs.
+STILL, PHOTOGRAPH = 640, 320
+JPEG_QUALITY = 80
+# How much is seen around a panorama's direction, in radians.
+PART_OF_PANORAMA = 1.5
+
+
+@dataclass(frozen=True)
+class ViewOnPage:
+    """A place to jump to."""
+
+    name: str
+    source: str
+    """The photograph, as an address; empty where there is none."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows besides its scene."""
+
+    title: str
+    facts: list[tuple[str, str]]
+    views: list[ViewOnPage]
+    still: str
+    background: str
+    about: dict[str, Any]
+    field: bytes
+
+
+def page_of(
+    marcher: Marcher, record: SceneRecord, beside: Beside, max_photographs: int, facts: list[tuple[str, str]]
+) -> Page:
+    """Return the page of a baked field.
+
+    Args:
+        marcher: of the field.
+        record: its cameras and names.
+        beside: photographs, and what is known of the run.
+        max_photographs: most places to jump to; one at least.
+        facts: what is known of the page.
+    """
+    field = packed(marcher.baked)
+    views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
+    middle, radius = _middle(marcher.baked, record)
+    up = record.cameras.c2w[:, :, 1].mean(dim=0)
+    about = described(marcher.baked) | {
+        "bytes": len(field),
+        "step": STEP,
+        "cameras": [_camera(record.cameras, view) for view in views],
+        "first": 0,
+        "middle": middle,
+        "radius": radius,
+        "up": (up / up.norm().clamp(min=1e-6)).tolist(),
+        "ndc": None if record.cameras.ndc is None else record.cameras.ndc[0].tolist(),
+    }
+    grid = " x ".join(str(8 * count) for count in marcher.baked.shape)
+    known = [
+        ("scene", record.name),
+        *beside.facts,
+        *facts,
+        ("grid", f"{grid}, {about['bricks']:,} bricks of 8 x 8 x 8"),
+    ]
+    places = [_view(record, beside, view if max_photographs else None) for view in views]
+    return Page(record.name, known, places, _still(marcher, record, views[0]), BEHIND[record.background], about, field)
+
+
+def write_page(page: Page, target: Path) -> None:
+    """Write one file of HTML."""
+    script, style, shader = (_text(name) for name in ("page.js", "page.css", "march.glsl"))
+    text = rendered(
+        FOLDER / "page.html",
+        page=page,
+        policy=own_policy(script, style),
+        about=Markup(_in_script(json.dumps(page.about))),
+        script=Markup(script),
+        style=Markup(style),
+        shader=Markup(shader),
+        field=Markup(base64.b64encode(page.field).decode()),
+    )
+    with whole_file(target) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
+    """Return what a page says of its scene, and the field in it.
+
+    Raises:
+        InputError: it is no page, or damaged.
+    """
+    text = path.read_text(encoding="utf-8")
+    found = [re.search(rf'<script type="[\w/]+" id="{name}">([^<]*)</script>', text) for name in ("about", "field")]
+    if found[0] is None or found[1] is None:
+        raise InputError(f"{path} is no page of this program, or cut off. Export it again.")
+    try:
+        about = json.loads(found[0][1])
+        return about, unpacked(about, base64.b64decode(found[1][1], validate=True))
+    except (ValueError, binascii.Error) as error:
+        raise InputError(f"The page {path} is damaged: {error}. Export it again.") from error
+
+
+def is_page(path: Path) -> bool:
+    """Tell whether a file begins as our pages do."""
+    try:
+        with path.open("rb") as file:
+            return MARK in file.read(200)
+    except OSError:
+        return False
+
+
+def _text(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def _in_script(text: str) -> str:
+    # Nothing in a text may end the element that it stands in.
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]:
+    """Return what one turns around, and how far things are from it, in the world."""
+    if record.space == "ndc":
+        return [0.0, 0.0, -2.0], 1.0
+    half = 0.5 * 8 * baked.spacing * np.array(baked.shape)
+    return (np.array(baked.lower) + half).tolist(), float(np.linalg.norm(half))
+
+
+def _camera(cameras: Cameras, view: int) -> dict[str, Any]:
+    right, up, back, eye = cameras.c2w[view].T.tolist()
+    width, height = int(cameras.width[view]), int(cameras.height[view])
+    focal, center = cameras.focal[view].tolist(), cameras.center[view].tolist()
+    if cameras.lens_model == "equirectangular":
+        focal, center = [height / PART_OF_PANORAMA] * 2, [width / 2, height / 2]
+    return {"eye": eye, "axes": [right, up, back], "focal": focal, "center": center, "width": width, "height": height}
+
+
+def _view(record: SceneRecord, beside: Beside, view: int | None) -> ViewOnPage:
+    if view is None:
+        return ViewOnPage("start", "")
+    name, scene = record.view_names[view], beside.photographs
+    # A panorama would not lie over what is seen from its place.
+    if scene is None or name not in scene.view_names or record.cameras.lens_model == "equirectangular":
+        return ViewOnPage(name, "")
+    return ViewOnPage(name, _jpeg(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))
+
+
+def _still(marcher: Marcher, record: SceneRecord, view: int) -> str:
+    cameras = at_most(record.cameras, STILL)
+    rays_of = RayGenerator(cameras, record.near, record.far)
+    return _jpeg(over(marcher.render(view_rays(rays_of, view)[0]), record.background), STILL)
+
+
+def _jpeg(picture: Float[Tensor, "height width 3"], longest: int) -> str:
+    image = Image.fromarray(to_bytes(torch.as_tensor(picture)).contiguous().numpy())
+    image.thumbnail((longest, longest))
+    content = io.BytesIO()
+    image.save(content, format="JPEG", quality=JPEG_QUALITY)
+    return data_address("image/jpeg", content.getvalue())

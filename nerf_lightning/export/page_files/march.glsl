@@ -1,0 +1,122 @@
+// Steps through bricks of density and colour (baked_field.py); marcher.py takes the same ones.
+// Places are in voxels; a tile of 9 x 9 x 9 values is a brick of 8 with the first values of the next ones.
+precision highp float;
+precision highp int;
+precision highp sampler3D;
+precision highp isampler3D;
+
+const float SIDE = 8.0;
+const float LEAST_ALPHA = 0.002, LEAST_TRANSMITTANCE = 0.004;
+
+uniform isampler3D index;
+uniform sampler3D base;
+#if HARMONICS > 1
+uniform sampler3D more0, more1, more2;
+#endif
+#if HARMONICS > 4
+uniform sampler3D more3, more4, more5;
+#endif
+uniform ivec3 shape;
+uniform ivec3 atlas;
+uniform vec3 lower, eye, behind;
+uniform float spacing, step_length, height;
+uniform mat3 turn;
+uniform vec2 focal, center, exponents, ranges, depths;
+uniform int shown;
+#ifdef NDC
+uniform vec2 ndc;
+#endif
+out vec4 pixel;
+
+float way_out(vec3 at, vec3 along) {
+  vec3 low = floor(at / SIDE) * SIDE;
+  vec3 to = mix(low - at, low + SIDE - at, greaterThan(along, vec3(0.0)));
+  vec3 way = mix(vec3(1e9), to / along, greaterThan(abs(along), vec3(1e-9)));
+  return min(way.x, min(way.y, way.z));
+}
+
+vec3 harmonic_color(vec3 coordinate, vec3 first, vec3 look) {
+  vec3 color = first;
+#if HARMONICS > 1
+  float n = 128.0 / 255.0, one = ranges.x * 255.0 / 127.0;
+  vec4 a = texture(more0, coordinate) - n, b = texture(more1, coordinate) - n, c = texture(more2, coordinate) - n;
+  color += one * 0.4886025119 * (-look.y * a.xyz + look.z * vec3(a.w, b.xy) - look.x * vec3(b.zw, c.x));
+#endif
+#if HARMONICS > 4
+  float two = ranges.y * 255.0 / 127.0;
+  vec4 d = texture(more3, coordinate) - n, e = texture(more4, coordinate) - n, f = texture(more5, coordinate) - n;
+  color += two * (1.0925484306 * (look.x * look.y * c.yzw - look.y * look.z * d.xyz - look.x * look.z * vec3(e.zw, f.x))
+    + 0.3153915653 * (3.0 * look.z * look.z - 1.0) * vec3(d.w, e.xy)
+    + 0.5462742153 * (look.x * look.x - look.y * look.y) * f.yzw);
+#endif
+  return clamp(color, 0.0, 1.0);
+}
+
+vec3 slope(vec3 start, vec3 within) {
+  // Densities along the axes, without leaving the tile.
+  vec3 size = vec3(atlas * 9), up = min(within + 1.0, SIDE), down = max(within - 1.0, 0.0);
+  vec3 found;
+  for (int axis = 0; axis < 3; axis++) {
+    vec3 a = within, b = within;
+    a[axis] = up[axis];
+    b[axis] = down[axis];
+    found[axis] = texture(base, (start + a.zyx + 0.5) / size).w - texture(base, (start + b.zyx + 0.5) / size).w;
+  }
+  return found;
+}
+
+void main() {
+  vec2 plane = (vec2(gl_FragCoord.x, height - gl_FragCoord.y) - center) / focal;
+  vec3 look = normalize(turn * vec3(plane.x, -plane.y, -1.0));
+  vec3 origin = eye, along = look;
+#ifdef NDC
+  if (look.z > -1e-3) { pixel = vec4(behind, 1.0); return; }
+  origin += max(0.0, -(1.0 + eye.z) / look.z) * look;
+  vec3 start_point = vec3(-ndc * origin.xy / origin.z, 1.0 + 2.0 / origin.z);
+  along = normalize(vec3(-ndc * look.xy / look.z, 1.0) - start_point);
+  origin = start_point;
+#endif
+  origin = (origin - lower) / spacing;
+  vec3 speed = mix(vec3(1e-9), along, greaterThan(abs(along), vec3(1e-9)));
+  vec3 a = -origin / speed, b = (vec3(shape) * SIDE - origin) / speed;
+  vec3 first = min(a, b), last = max(a, b);
+  float enter = max(0.0, max(first.x, max(first.y, first.z))), leave = min(last.x, min(last.y, last.z));
+  float through = 1.0, depth = 0.0, number = 0.0, nothing = exp2(exponents.x);
+  vec3 color = vec3(0.0), normal = vec3(0.0), size = vec3(atlas * 9);
+  for (int turns = 0; turns < 8192 && through > LEAST_TRANSMITTANCE; turns++) {
+    float t = enter + (number + 0.5) * step_length;
+    if (t >= leave) break;
+    vec3 at = origin + t * along;
+    ivec3 brick = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
+    int tile = texelFetch(index, brick.zyx, 0).x;
+    if (tile < 0) {
+      float beyond = t + way_out(at, along);
+      number = max(number + 1.0, ceil((beyond - enter) / step_length - 0.5));
+      continue;
+    }
+    number += 1.0;
+    vec3 start = 9.0 * vec3(tile % atlas.x, tile / atlas.x % atlas.y, tile / (atlas.x * atlas.y));
+    vec3 within = clamp(at - SIDE * vec3(brick), 0.0, SIDE);
+    vec3 coordinate = (start + within.zyx + 0.5) / size;
+    vec4 value = texture(base, coordinate);
+    float alpha = 1.0 - exp(-(exp2(exponents.x + exponents.y * 255.0 * value.w) - nothing) * step_length);
+    if (alpha < LEAST_ALPHA) continue;
+    float weight = through * alpha;
+    if (shown == 2) {
+      vec3 uphill = slope(start, within);
+      normal -= weight * uphill / max(length(uphill), 1e-6);
+    } else if (shown == 0) {
+      color += weight * harmonic_color(coordinate, value.xyz, look);
+    }
+    depth += weight * t * spacing;
+    through *= 1.0 - alpha;
+  }
+  float opacity = 1.0 - through;
+  if (shown == 1) {
+    float near = 1.0 - clamp((depth / max(opacity, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0);
+    color = opacity * vec3(near);
+  } else if (shown == 2) {
+    color = opacity * (0.5 + 0.5 * normal / max(length(normal), 1e-6));
+  }
+  pixel = vec4(color + through * behind, 1.0);
+}

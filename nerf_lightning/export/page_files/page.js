@@ -1,0 +1,460 @@
+"use strict";
+
+const SIDE = 8, TILE = 9, NO_CHANGE = 128;
+const byId = (id) => document.getElementById(id);
+
+// What is said to a person, in place of the scene.
+class Refusal extends Error {}
+
+function tell(text) {
+  byId("message").textContent = text;
+  byId("message").classList.add("wrong");
+  document.body.classList.remove("running");
+  document.body.dataset.state = "refused";
+}
+
+// ---- The file --------------------------------------------------------------------------------------------------
+
+function readAbout() {
+  const element = byId("about");
+  if (element === null) throw new Refusal("This file is not whole: it ends before the scene. Fetch it again.");
+  return JSON.parse(element.textContent);
+}
+
+async function readField(about) {
+  const element = byId("field");
+  const text = element === null ? "" : element.textContent;
+  const expected = 4 * Math.ceil(about.bytes / 3);
+  if (text.length !== expected) {
+    const [there, all] = [text.length, expected].map((length) => (length / 1e6).toFixed(2));
+    throw new Refusal(`This file is not whole: ${there} MB of the scene's ${all} MB are there. Fetch it again.`);
+  }
+  if (!("DecompressionStream" in window)) {
+    throw new Refusal("This browser is too old to unpack the scene: use one of 2023 or later.");
+  }
+  let bytes;
+  try {
+    const raw = atob(text);
+    element.remove();
+    const packed = new Uint8Array(raw.length);
+    for (let i = 0; i < raw.length; i++) packed[i] = raw.charCodeAt(i);
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+    bytes = await new Response(stream).arrayBuffer();
+  } catch (error) {
+    throw new Refusal("The scene in this file is damaged: it cannot be unpacked. Fetch the file again.");
+  }
+  return partsOf(about, bytes);
+}
+
+function partsOf(about, bytes) {
+  const values = SIDE ** 3 * about.bricks;
+  const sizes = [4 * about.bricks, values, values / 8, 3 * about.harmonics * about.colored];
+  if (bytes.byteLength !== sizes.reduce((sum, size) => sum + size)) {
+    throw new Refusal("The scene in this file is damaged: it does not have the size that it says. Fetch it again.");
+  }
+  const starts = sizes.map((_, i) => sizes.slice(0, i).reduce((sum, size) => sum + size, 0));
+  const [numbers, density, mask, colors] = starts.map((start, i) => new Uint8Array(bytes, start, sizes[i]));
+  return { numbers: new Int32Array(bytes, numbers.byteOffset, about.bricks), density, mask, colors };
+}
+
+// ---- Tiles: bricks with the first values of the next ones -------------------------------------------------------
+
+function indexOf(about, numbers) {
+  const index = new Int32Array(about.shape[0] * about.shape[1] * about.shape[2]).fill(-1);
+  numbers.forEach((number, brick) => { index[number] = brick; });
+  return index;
+}
+
+function neighboursOf(about, numbers, index) {
+  const [nx, ny, nz] = about.shape, found = new Int32Array(8 * numbers.length);
+  numbers.forEach((number, brick) => {
+    const x = Math.floor(number / (ny * nz)), y = Math.floor(number / nz) % ny, z = number % nz;
+    for (let corner = 0; corner < 8; corner++) {
+      const [i, j, k] = [x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)];
+      found[8 * brick + corner] = i < nx && j < ny && k < nz ? index[(i * ny + j) * nz + k] : -1;
+    }
+  });
+  return found;
+}
+
+// Every place of a tile: in which of the eight bricks it lies, and where there.
+const PLACES = Array.from({ length: TILE ** 3 }, (_, place) => {
+  const at = [Math.floor(place / TILE ** 2), Math.floor(place / TILE) % TILE, place % TILE];
+  const corner = at.reduce((sum, each) => 2 * sum + (each === SIDE ? 1 : 0), 0);
+  return [corner, at.reduce((sum, each) => SIDE * sum + each % SIDE, 0), at];
+});
+
+function fillChannel(into, channel, values, empty, neighbours, bricks, atlas) {
+  const width = TILE * atlas[0], slice = width * TILE * atlas[1];
+  const offsets = PLACES.map(([, , [a, b, c]]) => 4 * (a * slice + b * width + c) + channel);
+  for (let brick = 0; brick < bricks; brick++) {
+    const column = brick % atlas[0], row = Math.floor(brick / atlas[0]) % atlas[1];
+    const layer = Math.floor(brick / (atlas[0] * atlas[1]));
+    const start = 4 * TILE * (layer * slice + row * width + column);
+    for (let place = 0; place < PLACES.length; place++) {
+      const other = neighbours[8 * brick + PLACES[place][0]];
+      into[start + offsets[place]] = other < 0 ? empty : values[SIDE ** 3 * other + PLACES[place][1]];
+    }
+  }
+}
+
+function spread(channel, field, colored, empty) {
+  const values = new Uint8Array(field.density.length).fill(empty);
+  let next = channel * colored;
+  for (let place = 0; place < values.length; place++) {
+    if (field.mask[place >> 3] >> (place & 7) & 1) values[place] = field.colors[next++];
+  }
+  return values;
+}
+
+function atlasOf(bricks, most) {
+  const across = Math.min(Math.ceil(Math.cbrt(bricks)), Math.floor(most / TILE));
+  const down = Math.min(across, Math.ceil(bricks / across));
+  const deep = Math.ceil(bricks / (across * down));
+  if (deep * TILE > most) {
+    throw new Refusal("This device cannot hold a scene of this size. Ask for the file of a smaller quality (what.quality=small).");
+  }
+  return [across, down, deep];
+}
+
+// ---- The picture -------------------------------------------------------------------------------------------------
+
+const NAMES = ["base", "more0", "more1", "more2", "more3", "more4", "more5"];
+
+class Picture {
+  constructor(about, field) {
+    this.about = about;
+    this.canvas = byId("scene");
+    const gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    if (gl === null) {
+      throw new Refusal("This browser does not have WebGL2, so the scene cannot be turned: here is a still picture of it. Current versions of Chrome, Firefox and Safari have it.");
+    }
+    this.gl = gl;
+    this.atlas = atlasOf(about.bricks, gl.getParameter(gl.MAX_3D_TEXTURE_SIZE));
+    this.program = this.linked();
+    gl.useProgram(this.program);
+    this.upload(field);
+    this.fix();
+  }
+
+  linked() {
+    const gl = this.gl, program = gl.createProgram();
+    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}`;
+    const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
+    for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, head + byId("shader").textContent]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getShaderInfoLog(shader)}`);
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Refusal(`This browser's graphics refuse the scene: ${gl.getProgramInfoLog(program)}`);
+    return program;
+  }
+
+  at(name) { return this.gl.getUniformLocation(this.program, name); }
+
+  texture(unit, name, filter, ...image) {
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_3D, key, filter);
+    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) gl.texParameteri(gl.TEXTURE_3D, key, gl.CLAMP_TO_EDGE);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage3D(gl.TEXTURE_3D, 0, ...image);
+    gl.uniform1i(this.at(name), unit);
+  }
+
+  upload(field) {
+    const gl = this.gl, about = this.about, [nx, ny, nz] = about.shape;
+    const index = indexOf(about, field.numbers), neighbours = neighboursOf(about, field.numbers, index);
+    this.texture(0, "index", gl.NEAREST, gl.R32I, nz, ny, nx, 0, gl.RED_INTEGER, gl.INT, index);
+    const size = this.atlas.map((count) => TILE * count), channels = 3 * about.harmonics;
+    for (let unit = 0; 4 * unit <= channels; unit++) {
+      const bytes = new Uint8Array(4 * size[0] * size[1] * size[2]);
+      const fill = (into, values, empty) => fillChannel(bytes, into, values, empty, neighbours, about.bricks, this.atlas);
+      for (let into = 0; into < 4; into++) {
+        const channel = unit === 0 ? into : 4 * unit - 1 + into, empty = channel < 3 ? 0 : NO_CHANGE;
+        if (unit === 0 && into === 3) fill(3, field.density, 0);
+        else if (channel < channels) fill(into, spread(channel, field, about.colored, empty), empty);
+      }
+      this.texture(unit + 1, NAMES[unit], gl.LINEAR, gl.RGBA8, ...size, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    }
+    if (gl.getError() !== gl.NO_ERROR) throw new Refusal("This device has too little graphics memory for the scene. Ask for the file of a smaller quality (what.quality=small).");
+  }
+
+  fix() {
+    const gl = this.gl, about = this.about;
+    gl.uniform3iv(this.at("shape"), about.shape);
+    gl.uniform3iv(this.at("atlas"), this.atlas);
+    gl.uniform3fv(this.at("lower"), about.lower);
+    gl.uniform1f(this.at("spacing"), about.spacing);
+    gl.uniform1f(this.at("step_length"), about.step);
+    gl.uniform2fv(this.at("exponents"), about.exponents);
+    gl.uniform2fv(this.at("ranges"), about.ranges);
+    if (about.ndc) gl.uniform2fv(this.at("ndc"), about.ndc);
+  }
+
+  // The lens fits into the window, its middle in the window's; `share` of the window's pixels along each side.
+  draw(view, share) {
+    const gl = this.gl, ratio = share * window.devicePixelRatio;
+    const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    gl.viewport(0, 0, width, height);
+    const lens = view.lens, scale = Math.min(width / lens.width, height / lens.height);
+    gl.uniform1f(this.at("height"), height);
+    gl.uniform2f(this.at("focal"), scale * lens.focal[0], scale * lens.focal[1]);
+    gl.uniform2f(this.at("center"), width / 2 + scale * (lens.center[0] - lens.width / 2), height / 2 + scale * (lens.center[1] - lens.height / 2));
+    gl.uniform3fv(this.at("eye"), view.eye);
+    gl.uniformMatrix3fv(this.at("turn"), false, view.axes.flat());
+    gl.uniform3fv(this.at("behind"), view.behind);
+    gl.uniform1i(this.at("shown"), view.shown);
+    const away = length(minus(view.eye, this.about.middle));
+    gl.uniform2f(this.at("depths"), Math.max(0, away - this.about.radius), away + this.about.radius);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+}
+
+// ---- Where one looks from: an eye, three axes (right, up, back), and what it turns around ------------------------
+
+const plus = (a, b, by = 1) => a.map((x, i) => x + by * b[i]);
+const minus = (a, b) => plus(a, b, -1);
+const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
+const length = (a) => Math.sqrt(dot(a, a));
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+function turned(vector, axis, angle) {
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  return plus(plus(vector.map((x) => c * x), cross(axis, vector), s), axis, (1 - c) * dot(axis, vector));
+}
+
+class View {
+  constructor(about) {
+    this.about = about;
+    this.shown = 0;
+    this.jump(about.first);
+  }
+
+  jump(number) {
+    const camera = this.about.cameras[number];
+    this.eye = [...camera.eye];
+    this.axes = camera.axes.map((axis) => [...axis]);
+    this.lens = camera;
+    const ahead = -dot(minus(this.about.middle, this.eye), this.axes[2]);
+    this.target = plus(this.eye, this.axes[2], -Math.max(ahead, 0.1 * this.about.radius));
+    this.photograph = number;
+  }
+
+  orbit(right, up) {
+    const pivots = [[this.about.up, -right]];
+    // Not over the top, where right and left would change places.
+    const steep = dot(turned(this.axes[2], this.axes[0], -up), this.about.up);
+    if (Math.abs(steep) < 0.995 || Math.abs(steep) < Math.abs(dot(this.axes[2], this.about.up))) pivots.push([this.axes[0], -up]);
+    for (const [axis, angle] of pivots) {
+      this.eye = plus(this.target, turned(minus(this.eye, this.target), axis, angle));
+      this.axes = this.axes.map((each) => turned(each, axis, angle));
+    }
+    this.photograph = null;
+  }
+
+  move(right, up, back) {
+    const by = [right, up, back].reduce((sum, share, i) => plus(sum, this.axes[i], share), [0, 0, 0]);
+    this.eye = plus(this.eye, by);
+    this.target = plus(this.target, by);
+    this.photograph = null;
+  }
+
+  pan(right, up) {
+    const unit = length(minus(this.eye, this.target));
+    this.move(-right * unit, -up * unit, 0);
+  }
+
+  zoom(factor) {
+    const away = minus(this.eye, this.target);
+    if (length(away) * factor > 1e-3 * this.about.radius) this.eye = plus(this.target, away, factor);
+    this.photograph = null;
+  }
+}
+
+// ---- Frames: coarse while something moves, as fine as the screen when nothing does -------------------------------
+
+const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.15;
+
+class Frames {
+  constructor(picture, view) {
+    Object.assign(this, { picture, view, share: 0.6, movedAt: -Infinity, before: 0, waits: false, keys: new Set() });
+    this.step = this.step.bind(this);
+  }
+
+  moved() {
+    this.movedAt = performance.now();
+    this.ask();
+  }
+
+  ask() {
+    document.body.dataset.state = "moving";
+    if (!this.waits) requestAnimationFrame(this.step);
+    this.waits = true;
+  }
+
+  step(now) {
+    this.waits = false;
+    const elapsed = now - this.before;
+    this.before = now;
+    if (this.keys.size && elapsed < 500) fly(this, elapsed / 1000);
+    place(this.view);
+    if (this.keys.size || performance.now() - this.movedAt < PAUSE) {
+      if (elapsed > SLOW && elapsed < 1000) this.share = Math.max(COARSEST, 0.85 * this.share);
+      if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
+      this.picture.draw(this.view, this.share);
+      this.ask();
+    } else {
+      this.picture.draw(this.view, 1);
+      document.body.dataset.state = "still";
+    }
+  }
+}
+
+const FLIGHT = { w: [0, 0, -1], s: [0, 0, 1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] };
+const TURNS = { arrowleft: [1, 0], arrowright: [-1, 0], arrowup: [0, 1], arrowdown: [0, -1] };
+const ZOOMS = { "+": -1, "=": -1, "-": 1 };
+
+function fly(frames, seconds) {
+  const view = frames.view, speed = 0.8 * view.about.radius * seconds;
+  for (const key of frames.keys) {
+    if (key in FLIGHT) view.move(...FLIGHT[key].map((share) => share * speed));
+    if (key in TURNS) view.orbit(...TURNS[key].map((share) => -1.2 * seconds * share));
+    if (key in ZOOMS) view.zoom(Math.exp(1.2 * seconds * ZOOMS[key]));
+  }
+  frames.movedAt = performance.now();
+}
+
+// The photograph lies over what its camera shows.
+function place(view) {
+  const photograph = byId("photograph"), source = sourceOf(view.photograph);
+  photograph.hidden = byId("wiping").hidden = !source;
+  for (const button of document.querySelectorAll("#photographs button")) {
+    button.setAttribute("aria-pressed", String(Number(button.dataset.view) === view.photograph));
+  }
+  if (!source) return;
+  const scale = Math.min(innerWidth / view.lens.width, innerHeight / view.lens.height);
+  const [width, height] = [scale * view.lens.width, scale * view.lens.height];
+  Object.assign(photograph.style, { width: `${width}px`, height: `${height}px`, left: `${(innerWidth - width) / 2}px`, top: `${(innerHeight - height) / 2}px` });
+  photograph.style.setProperty("--at", `${byId("wipe").value}%`);
+  if (photograph.src !== source) photograph.src = source;
+}
+
+function sourceOf(number) {
+  const picture = number === null ? null : document.querySelector(`#photographs button[data-view="${number}"] img`);
+  return picture === null ? "" : picture.src;
+}
+
+// ---- Mouse, fingers, keys, buttons -------------------------------------------------------------------------------
+
+function listenToPointers(canvas, frames) {
+  const fingers = new Map(), view = frames.view;
+  const middle = () => [...fingers.values()].reduce((sum, at) => plus(sum, at, 1 / fingers.size), [0, 0]);
+  const apart = () => length(minus(...[...fingers.values()].slice(0, 2)));
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
+  canvas.addEventListener("pointermove", (event) => {
+    if (!fingers.has(event.pointerId)) return;
+    const [before, wide] = [middle(), fingers.size > 1 ? apart() : 0];
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    const [x, y] = minus(middle(), before).map((pixels) => pixels / canvas.clientHeight);
+    if (fingers.size > 1) {
+      view.pan(x, -y);
+      view.zoom(wide / Math.max(1, apart()));
+    } else if (event.shiftKey || event.buttons & 6) view.pan(x, -y);
+    else view.orbit(4 * x, 4 * y);
+    frames.moved();
+  });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    view.zoom(Math.exp(Math.max(-60, Math.min(60, event.deltaY)) / 300));
+    frames.moved();
+  }, { passive: false });
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+}
+
+function listenToKeys(frames) {
+  const held = (key) => key in FLIGHT || key in TURNS || key in ZOOMS;
+  const once = {
+    1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
+    b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => jump(frames, frames.view.about.first),
+    i: () => byId("numbers").showModal(), "[": () => next(frames, -1), "]": () => next(frames, 1),
+  };
+  addEventListener("keydown", (event) => {
+    const key = event.key.toLowerCase();
+    if (event.ctrlKey || event.metaKey || event.altKey || byId("numbers").open || event.target.matches("input, select")) return;
+    if (held(key)) {
+      event.preventDefault();
+      frames.keys.add(key);
+      frames.moved();
+    } else if (key in once && !event.repeat) once[key]();
+  });
+  addEventListener("keyup", (event) => frames.keys.delete(event.key.toLowerCase()));
+  addEventListener("blur", () => frames.keys.clear());
+}
+
+function show(frames, what) {
+  frames.view.shown = what;
+  byId("shown").value = String(what);
+  frames.ask();
+}
+
+function jump(frames, number) {
+  frames.view.jump(number);
+  frames.ask();
+}
+
+function next(frames, by) {
+  const count = frames.view.about.cameras.length, now = frames.view.photograph ?? frames.view.about.first;
+  jump(frames, (now + by + count) % count);
+}
+
+function listenToControls(frames) {
+  byId("shown").addEventListener("change", (event) => show(frames, Number(event.target.value)));
+  byId("wipe").addEventListener("input", () => place(frames.view));
+  byId("back").addEventListener("click", () => jump(frames, frames.view.about.first));
+  byId("about-run").addEventListener("click", () => byId("numbers").showModal());
+  const background = byId("background");
+  const behind = () => [1, 3, 5].map((start) => parseInt(background.value.slice(start, start + 2), 16) / 255);
+  background.addEventListener("input", () => {
+    frames.view.behind = behind();
+    frames.ask();
+  });
+  frames.view.behind = behind();
+  for (const button of document.querySelectorAll("#photographs button")) {
+    button.addEventListener("click", () => {
+      if (byId("wipe").value === "0") byId("wipe").value = "50";  // who asks for a photograph wants to see it
+      jump(frames, Number(button.dataset.view));
+    });
+  }
+  addEventListener("resize", () => frames.ask());
+}
+
+async function start() {
+  try {
+    const about = readAbout(), picture = new Picture(about, await readField(about));
+    const frames = new Frames(picture, new View(about));
+    picture.canvas.addEventListener("webglcontextlost", () => tell("The graphics of this device gave up. Open the page again."));
+    listenToPointers(picture.canvas, frames);
+    listenToKeys(frames);
+    listenToControls(frames);
+    document.body.classList.add("running");
+    frames.ask();
+  } catch (error) {
+    if (!(error instanceof Refusal)) console.error(error);
+    tell(error instanceof Refusal ? error.message : "This file is damaged: its scene cannot be read. Fetch it again.");
+  }
+}
+
+// What follows this script in the file is there only then.
+document.addEventListener("DOMContentLoaded", start);

@@ -1,0 +1,140 @@
+"""The page as a file: what stands in it, what it refuses, and that a stranger's texts stay texts."""
+
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from support.baked_ball import all_around, beside, record_of, shiny_model
+from support.running import refused
+
+from nerf_lightning.export.page import QUALITIES, PageExport
+from nerf_lightning.export.page_file import is_page, read_baked
+
+NAME = '</script><script>alert(1)</script><img src=x onerror="alert(2)">'
+
+
+def exported(folder, scene=None, facts=(), **settings):
+    scene = scene or all_around()
+    what = PageExport(**({"resolution": 24, "photographs": 4, "max_views": 1} | settings))
+    what.beside = beside(scene, *facts)
+    with torch.no_grad():
+        return what.export(shiny_model(), record_of(scene), folder, 4096)[0]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    return exported(tmp_path_factory.mktemp("page"))
+
+
+class Elements(HTMLParser):
+    """Every element of a page with its attributes, and the text of those that hold some."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.texts = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def test_the_page_holds_the_field_the_cameras_and_the_photographs(page):
+    about, baked = read_baked(page)
+    assert baked.num_harmonics == QUALITIES["medium"][1] == about["harmonics"]
+    assert max(baked.shape) <= 4
+    assert len(about["cameras"]) == 4
+    eye = np.array(about["cameras"][0]["eye"])
+    np.testing.assert_allclose(eye, record_of(all_around()).cameras.c2w[0, :, 3], atol=1e-6)
+    elements = Elements(page.read_text())
+    pictures = [attrs["src"] for tag, attrs in elements.found if tag == "img" and "src" in attrs]
+    assert len(pictures) == 1 + 4
+    assert all(each.startswith("data:image/jpeg;base64,") for each in pictures)
+
+
+def test_nothing_is_loaded_and_no_script_runs_but_the_pages_own(page):
+    elements = Elements(page.read_text())
+    policy = next(attrs["content"] for tag, attrs in elements.found if tag == "meta" and "http-equiv" in attrs)
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    assert "unsafe" not in policy
+    assert not [attrs for _, attrs in elements.found if attrs.get("src", "data:")[:5] != "data:" or "href" in attrs]
+    assert [attrs.get("type") for tag, attrs in elements.found if tag == "script"].count(None) == 1
+
+
+def test_what_it_costs_is_printed_and_stands_in_the_page(page, tmp_path, capsys):
+    target = exported(tmp_path)
+    out = capsys.readouterr().out
+    assert "size" in out
+    assert "dB against the photographs of 1 test view, the model" in out
+    assert "of density and" in out
+    assert "dB against the photographs of 1 test view" in target.read_text()
+    exported(tmp_path, max_views=0)  # over our own page
+    assert "dB" not in capsys.readouterr().out
+
+
+def test_texts_of_a_stranger_stay_texts(page, tmp_path):
+    names = tuple(f"{NAME}{view}\x1b\u202e" for view in range(6))
+    planted = exported(tmp_path, replace(all_around(), name=NAME, view_names=names), facts=[(NAME, NAME)])
+    ours, theirs = Elements(page.read_text()), Elements(planted.read_text())
+    # A fact more is a row more.
+    assert [tag for tag, _ in theirs.found if tag not in ("tr", "th", "td")] == [
+        tag for tag, _ in ours.found if tag not in ("tr", "th", "td")
+    ]
+    assert theirs.texts.count(NAME) >= 4
+    assert not {"onerror", "onload"} & {name for _, attrs in theirs.found for name in attrs}
+    assert not {"\x1b", "\u202e"} & set(planted.read_text())
+
+
+def test_without_photographs_the_cameras_are_still_there(tmp_path):
+    what = PageExport(resolution=24, photographs=3)
+    with torch.no_grad():
+        (target,) = what.export(shiny_model(), record_of(all_around()), tmp_path, 4096)
+    text = target.read_text()
+    assert text.count('class="without"') == 3
+    assert "between their pictures of 6 test views" in text
+    assert "against the photographs" not in text
+
+
+def test_refusals(tmp_path):
+    model, record = shiny_model(), record_of(all_around())
+    contracted = replace(record, space="contracted")
+    parts = ("what=page: ball was trained with all of space contracted", "nerf view", "scene.space=bounded")
+    refused(PageExport().export, model, contracted, tmp_path, 4096, parts=parts)
+    assert not list(tmp_path.iterdir())
+    target = tmp_path / "page.html"
+    target.write_text("<html>somebody's own</html>")
+    refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html", "would be lost", "Move it away"))
+    assert target.read_text() == "<html>somebody's own</html>"
+    target.unlink()
+    target.mkdir()
+    refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html is a folder",))
+    refused(PageExport, "small", 4, parts=("what.resolution=4", "8 voxels or more"))
+    refused(PageExport, "small", None, -1, parts=("what.photographs=-1",))
+
+
+def test_a_file_that_is_no_page_or_not_whole_is_refused(page, tmp_path):
+    assert is_page(page)
+    other, cut = tmp_path / "other.html", tmp_path / "cut.html"
+    other.write_text("<html></html>")
+    assert not is_page(other)
+    refused(read_baked, other, parts=("no page of this program",))
+    cut.write_text(page.read_text()[:-3000])
+    refused(read_baked, cut, parts=("cut off",))
+    cut.write_text(page.read_text().replace('id="field">H4sI', 'id="field">H4xx'))
+    refused(read_baked, cut, parts=("damaged",))
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    from nerf_lightning.export import page_file
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(page_file.Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        exported(tmp_path)
+    assert not list(tmp_path.iterdir())
