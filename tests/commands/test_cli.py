@@ -79,7 +79,7 @@ def test_a_config_is_composed_once_unless_the_mode_may_stand_in_a_file_of_the_us
 def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "many.yaml").write_text("# @package _global_\nhydra:\n  mode: MULTIRUN\n")
-    many = ("seed=0,1", "trainer.max_steps=-1", f"paths.output_dir={tmp_path / 'out'}")
+    many = ("seed=0,1", "trainer.max_steps=-1", f"paths.root_dir={tmp_path / 'out'}")
     assert "Launching 2 jobs" in nerf("train", f"--config-dir={tmp_path}", "experiment=many", *many).err
 
 
