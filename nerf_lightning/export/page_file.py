@@ -24,6 +24,7 @@ from nerf_lightning.export.baking.payload import described, packed, unpacked
 from nerf_lightning.export.base import Beside
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
+from nerf_lightning.files.regular import open_regular, read_text
 from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -38,6 +39,7 @@ BEHIND: dict[Background, str] = {"white": "#ffffff", "random": "#ffffff", "black
 # Pixels of the longer side: of the still picture, of photographs.
 STILL, PHOTOGRAPH = 640, 320
 JPEG_QUALITY = 80
+MOST_BYTES = 1 << 30
 # How much is seen around a panorama's direction, in radians.
 PART_OF_PANORAMA = 1.5
 
@@ -124,7 +126,7 @@ def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
     Raises:
         InputError: it is no page, or damaged.
     """
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path, MOST_BYTES)
     found = [re.search(rf'<script type="[\w/]+" id="{name}">([^<]*)</script>', text) for name in ("about", "field")]
     if found[0] is None or found[1] is None:
         raise InputError(f"{path} is no page of this program, or cut off. Export it again.")
@@ -138,9 +140,9 @@ def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
 def is_page(path: Path) -> bool:
     """Tell whether a file begins as our pages do."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path, None) as file:
             return MARK in file.read(200)
-    except OSError:
+    except InputError:
         return False
 
 

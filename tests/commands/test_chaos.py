@@ -316,8 +316,8 @@ def test_errors_that_follow_each_other_in_a_circle_are_one_paragraph(tmp_path):
     """The failure that a thread keeps is raised again and again, also while the errors that it caused are handled."""
     first, second = OSError(28, "No space left on device", str(tmp_path)), RuntimeError("closed")
     first.__context__, second.__context__ = second, first
-    assert paragraph(first, "train", tmp_path) == (
+    assert paragraph(first, "train") == (
         f"{tmp_path}: No space left on device. See that the place exists, can be written, and has space left."
     )
     second.__context__ = InputError("The run folder is gone.")
-    assert paragraph(first, "train", tmp_path) == "The run folder is gone."
+    assert paragraph(first, "train") == "The run folder is gone."

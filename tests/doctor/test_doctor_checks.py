@@ -73,9 +73,10 @@ def test_views_are_compared_a_few_at_a_time(monkeypatch):
 
     evidence = with_pictures(copy)
     whole = but_poses(evidence)
+    del whole["memory"]  # what is free changes
     monkeypatch.setattr(check, "PAIRS_AT_ONCE", 5 * VIEWS)
     assert check.rows_at_once(VIEWS) == 5
-    assert but_poses(evidence) == whole
+    assert whole.items() <= but_poses(evidence).items()
     judged(evidence, "duplicates", "look", "2 pairs")
 
 

@@ -1,5 +1,6 @@
 """The page as a file: what stands in it, what it refuses, and that a stranger's texts stay texts."""
 
+import os
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -121,6 +122,8 @@ def test_a_file_that_is_no_page_or_not_whole_is_refused(page, tmp_path):
     other, cut = tmp_path / "other.html", tmp_path / "cut.html"
     other.write_text("<html></html>")
     assert not is_page(other)
+    os.mkfifo(tmp_path / "pipe.html")
+    assert not is_page(tmp_path / "pipe.html")  # nobody writes: it would wait for ever
     refused(read_baked, other, parts=("no page of this program",))
     cut.write_text(page.read_text()[:-3000])
     refused(read_baked, cut, parts=("cut off",))

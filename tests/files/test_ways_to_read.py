@@ -12,7 +12,12 @@ LOADERS = {"np", "torch", "OmegaConf"}
 OURS = {
     "config/compose.py": ["load"],
     "training/callbacks/live_view.py": ["print"],  # the address, which is ours
-    "cli/main.py": ["load", "read_text", "print", "print", "print"],
+    "cli/main.py": ["load", "read_text", "print", "print", "print", "print", "print", "print"],
+    "cli/loading.py": ["print"],
+    "cli/completion.py": ["read_text"],
+    "manual/sources.py": ["read_text"],
+    "manual/commented_yaml.py": ["read_text"],
+    "export/page_file.py": ["read_text"],
     "console.py": ["print"],
     "runs/sweep.py": ["print"],
     "evaluation/protocol.py": ["read_text"],
