@@ -10,6 +10,7 @@ from nerf_lightning.budgets import require_within
 from nerf_lightning.escaping import require_printable
 from nerf_lightning.files.schema import Unfit
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
+from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import is_rigid
 
 
@@ -54,8 +55,7 @@ def require_possible_refinement(refined: Mapping[str, Any], given: Mapping[str, 
     for name in ("width", "height"):
         if not torch.equal(refined[name], given[name]):
             raise Unfit(f"refined.{name}", "is not that of the scene's cameras")
-    # What was given as a pinhole may have turned out to have a lens.
-    lenses = {given["lens_model"]} | ({"radial_tangential"} if given["lens_model"] == "pinhole" else set())
+    lenses = (given["lens_model"], with_coefficients(given["lens_model"]))
     if refined["lens_model"] not in lenses or refined["ndc"] is not None or given["ndc"] is not None:
         raise Unfit("refined", "has another kind of lens or space than the scene's cameras")
 

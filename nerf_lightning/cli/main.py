@@ -19,13 +19,12 @@ from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.folders import PACKAGE, conf_folder
 from nerf_lightning.manual.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-PACKAGE = Path(__file__).parents[1]
 OF_ITSELF = {
     "completion": "Print the script with which bash, zsh or fish completes what is typed: nerf completion bash.",
     "help": "Tell all of a setting, of a group or of an option: nerf help scene=colmap.",

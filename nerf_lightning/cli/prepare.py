@@ -72,23 +72,23 @@ def _eval(arguments: list[str]) -> list[str]:
 
 def _view(arguments: list[str]) -> list[str]:
     """Name the run's own scene as for `eval`; without it, cameras are shown without photographs, unless wished for."""
-    try:
+    wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
+    if "true" in map(str.lower, wished[-1:]):
         return _eval(arguments)
-    except InputError as error:
-        from nerf_lightning.config.scene_overrides import UnknownScene
-
-        wished = [value for key, _, value in (each.partition("=") for each in arguments) if key == "photographs"]
-        if not isinstance(error, UnknownScene) or "true" in map(str.lower, wished[-1:]):
-            raise
-        if not wished:
-            log.warning("The cameras are shown without their photographs: %s", error)
-        return ["photographs=false", *arguments]
+    said = "" if wished else "The cameras are shown without their photographs"
+    return _eval_or_without(arguments, ["photographs=false"], said)
 
 
 def _export(arguments: list[str]) -> list[str]:
     """Name the run's own scene as for `eval` where photographs are shown; where it is unknown, go without them."""
     if "what=page" not in arguments:
         return arguments
+    without = ["what.photographs=0", "what.max_views=0"]
+    return _eval_or_without(arguments, without, "The page will be without photographs")
+
+
+def _eval_or_without(arguments: list[str], without: list[str], said: str) -> list[str]:
+    """Name the run's own scene as for `eval`; where it is unknown, say so (nothing, if empty) and do without."""
     try:
         return _eval(arguments)
     except InputError as error:
@@ -96,8 +96,9 @@ def _export(arguments: list[str]) -> list[str]:
 
         if not isinstance(error, UnknownScene):
             raise
-        log.warning("The page will be without photographs: %s", error)
-        return ["what.photographs=0", "what.max_views=0", *arguments]
+        if said:
+            log.warning("%s: %s", said, error)
+        return [*without, *arguments]
 
 
 def _table(arguments: list[str]) -> list[str]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
-from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, any_in_blocks, density_grid, dilated
+from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, density_grid, dilated
 from nerf_lightning.export.baking.seen_colors import (
     LOOKS,
     RANGES,
@@ -22,7 +22,7 @@ from nerf_lightning.export.baking.seen_colors import (
     to_bytes_of_colors,
 )
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, kernels
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks, kernels
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 

@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
 from nerf_lightning.machine import require_memory
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -125,17 +125,6 @@ def _asked(
 def _bricks_around(found: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
     """Return the bricks within a stride of what was found; two strides make a brick."""
     return any_in_blocks(dilated(found), SIDE // STRIDE)
-
-
-def any_in_blocks(mask: Bool[ndarray, "x y z"], side: int) -> Bool[ndarray, "bx by bz"]:
-    """Return in which blocks of a side anything is true.
-
-    >>> any_in_blocks(np.eye(4, dtype=bool)[None].repeat(2, 0), 2)[0].tolist()
-    [[True, False], [False, True]]
-    """
-    pairs = [n for length in mask.shape for n in (length // side, side)]
-    blocks: Bool[ndarray, "bx by bz"] = np.asarray(mask.reshape(pairs).any(axis=(1, 3, 5)))
-    return blocks
 
 
 def dilated(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:

@@ -20,6 +20,11 @@ ON_AXIS = 1e-12
 """Radii below this count as this: the axis itself has no direction around it, and its gradient must be finite."""
 
 
+def with_coefficients(model: LensModel) -> LensModel:
+    """Return the model that a camera has once coefficients are learnt: a pinhole is a lens that bends nothing."""
+    return "radial_tangential" if model == "pinhole" else model
+
+
 def project_plane(
     directions: Float[Tensor, "*rays 3"], lens: Float[Tensor, "*#rays 6"], model: LensModel
 ) -> Float[Tensor, "*rays 2"]:

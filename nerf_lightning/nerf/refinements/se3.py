@@ -9,6 +9,7 @@ from torch.nn.functional import pad
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import which_camera
+from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.ranges import require_ranges
@@ -127,8 +128,8 @@ class SmallMotions(Refinement):
         if self.focal:
             cameras = replace(cameras, focal=cameras.focal * self.log_focal.exp()[self.camera, None])
         if self.lens:
-            model = "radial_tangential" if cameras.lens_model == "pinhole" else cameras.lens_model
-            cameras = replace(cameras, lens=cameras.lens + pad(self.radial[self.camera], (0, 4)), lens_model=model)
+            lens = cameras.lens + pad(self.radial[self.camera], (0, 4))
+            cameras = replace(cameras, lens=lens, lens_model=with_coefficients(cameras.lens_model))
         return cameras
 
     def penalty(self) -> Float[Tensor, ""] | None:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from numba import njit
 from numpy import ndarray
 
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE
+from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
 OPAQUE_DEPTH = np.float32(6.0)
@@ -43,7 +43,7 @@ def seeing_cameras(
     """
     cameras = np.full((len(voxels), most), -1, np.int32)
     light = np.zeros((len(voxels), most), np.float32)
-    filled = (optical.reshape(*(n for side in optical.shape for n in (side // SIDE, SIDE))) > 0).any(axis=(1, 3, 5))
+    filled = any_in_blocks(optical > 0, SIDE)
     over_rows(_seeing, len(voxels), optical, filled, voxels, places, eyes, views, tries, cameras, light)
     return cameras, light
 
