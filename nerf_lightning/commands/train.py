@@ -29,7 +29,7 @@ from nerf_lightning.training.launch.lightning_flags import PROFILE
 from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.memory_plan import announce_memory
-from nerf_lightning.training.tile_size import measured_tile
+from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
 
 MOST_VIDEO_BYTES = 20_000_000
 """Of a film in the page that follows a training."""
@@ -96,7 +96,8 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | N
         step.tile_points = parts.settings.tile_points
     parts.settings.prepare(parts.system.model)
     parts.system.record["precision"] = parts.settings.precision
-    if former is None and parts.settings.measures_tile and not parts.system.model.needs_whole_batch:
+    measures_tile = parts.settings.measures_tile and parts.num_steps > SHORT_RUN
+    if former is None and measures_tile and not parts.system.model.needs_whole_batch:
         tile = ranks.from_first(lambda: measured_tile(parts.settings, step, parts.data.batches))
         step.tile_points = parts.settings.tile_points = tile
     if ranks.is_first():

@@ -16,6 +16,8 @@ GAIN = 0.95
 # Smaller tiles than one that takes so much longer than the fastest are not tried: they only add to what made it slow.
 HOPELESS = 1.2
 LONGEST_SECONDS = 0.4
+# What the trial takes, in steps and at most: so short a run would spend more on it than it saves.
+SHORT_RUN = 50
 FEW_RAYS = 16
 
 log = logging.getLogger(__name__)

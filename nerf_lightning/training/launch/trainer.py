@@ -52,7 +52,8 @@ class TrainerSettings:
             bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively,
             else 32-true.
         tile_points: most points that a step sends through a field at once; auto takes the fastest of a few sizes,
-            measured at the start of a run and kept; None trains a batch whole. The result is the same up to rounding.
+            measured at the start of a run (but for one of 50 steps or fewer) and kept; None trains a batch whole. The
+            result is the same up to rounding.
         clip_norm: gradients are scaled down to this norm; None leaves them.
         val_every_steps: steps between two looks at the validation rays.
         num_threads: torch's threads on the CPU; None: one per core of ours.
