@@ -191,21 +191,21 @@ class PeakBytes(TorchDispatchMode):
         self.watched: set[int] = set()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation, and look at what went in and what came out."""
+        """Run the operation, and look at what came out."""
         kwargs = kwargs or {}
-        for tensor in _tensors_in((args, kwargs)):
-            self._watch(tensor, is_new=False)
         out = func(*args, **kwargs)
         for tensor in _tensors_in(out):
-            self._watch(tensor, is_new=True)
+            self._watch(tensor, (args, kwargs))
         return out
 
-    def _watch(self, tensor: Tensor, is_new: bool) -> None:
+    def _watch(self, tensor: Tensor, taken: Any) -> None:
         storage = tensor.untyped_storage()
         key = storage._cdata
         if key in self.watched or storage.device.type != self.device_type:
             return
-        size = storage.nbytes() if is_new else 0
+        if any(key == each.untyped_storage()._cdata for each in _tensors_in(taken)):
+            return  # a view of what was there before
+        size = storage.nbytes()
         self.watched.add(key)
         self.held += size
         self.most = max(self.most, self.held)
@@ -223,12 +223,10 @@ def peak_bytes(work: Callable[[], Any], device: torch.device) -> int:
     return counter.most
 
 
-def _tensors_in(tree: Any) -> Iterator[Tensor]:
-    # What operations take and return is nested no deeper than lists; torch's own flattening takes as long as they do.
+def _tensors_in(tree: Any) -> list[Tensor]:
+    # What operations take and return is nested no deeper than lists; torch's own flattening takes longer.
     if isinstance(tree, Tensor):
-        yield tree
-    elif isinstance(tree, (tuple, list)):
-        for part in tree:
-            yield from _tensors_in(part)
-    elif isinstance(tree, dict):
-        yield from _tensors_in(list(tree.values()))
+        return [tree]
+    if isinstance(tree, dict):
+        tree = list(tree.values())
+    return [tensor for part in tree for tensor in _tensors_in(part)] if isinstance(tree, (tuple, list)) else []

@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.made_once import made_once
 from support.resumed import trained
-from support.running import FAST, FAST_PATH, start_cold
+from support.running import FAST, NO_LAYOUT, FAST_PATH, start_cold
 from support.scenes import ball_scene
 
 from nerf_lightning.cli import main as cli
@@ -69,7 +69,8 @@ def finished_run(tmp_path_factory, capture):
     def train(folder):
         steps = ("trainer.max_steps=20", f"paths.output_dir={folder}/run")
         # Most other runs of the tests are forks; this one is as whole as a person's.
-        process = start_cold("nerf_lightning", "train", "scene=npz", f"scene.path={capture}", *FAST, *steps)
+        whole = [setting for setting in FAST if setting != NO_LAYOUT]
+        process = start_cold("nerf_lightning", "train", "scene=npz", f"scene.path={capture}", *whole, *steps)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 0, output
         assert "Traceback" not in output

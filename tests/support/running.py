@@ -14,6 +14,8 @@ from nerf_lightning.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
 
+# Drawing where the cameras stand takes longer than such a run.
+NO_LAYOUT = "~callbacks.camera_layout"
 # Small enough for a test: seconds in all.
 FAST = (
     "model=nerf_tiny",
@@ -25,6 +27,7 @@ FAST = (
     "callbacks.monitor.every_steps=5",
     "callbacks.ray_histograms.every_steps=10",
     "callbacks.checkpoints.every_steps=5",
+    NO_LAYOUT,
     "evaluation.max_views=2",
     "evaluation.num_pictures=1",
     "path.num_frames=2",
