@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.made_once import made_once
 from support.resumed import trained
-from support.running import FAST, NO_LAYOUT, FAST_PATH, start_cold
+from support.running import FAST, FAST_PATH, NO_LAYOUT, start_cold
 from support.scenes import ball_scene
 
 from nerf_lightning.cli import main as cli
