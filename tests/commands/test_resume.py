@@ -94,6 +94,7 @@ def assert_the_same_end(capture, folder, never_stopped, threads):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive  # killed once: test_kill.py; the packed model, killed and stopped: test_fast_path.py
 def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture, tmp_path, never_stopped):
     assert_the_same_end(capture, tmp_path / "run", never_stopped, 1)
 

@@ -153,7 +153,11 @@ def found_matches(folder, names, pairs, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "reader", "folder", "step"), [("fern", LlffReader, "images_8", 4), ("fox", TransformsReader, "images", 16)]
+    ("name", "reader", "folder", "step"),
+    [
+        ("fern", LlffReader, "images_8", 4),
+        pytest.param("fox", TransformsReader, "images", 16, marks=pytest.mark.exhaustive),
+    ],
 )
 def test_matched_features_of_neighbours(cache, tmp_path, name, reader, folder, step):
     root = real_capture(name)

@@ -104,7 +104,7 @@ print(json.dumps([measured, plan.total, gaps]))
     ("model", "precision", "tile", "overrides"),
     [
         ("nerf_tiny", "bf16-mixed", 131_072, ["data.batch_rays=4096"]),
-        ("fast_proposal", "bf16-mixed", 131_072, []),
+        pytest.param("fast_proposal", "bf16-mixed", 131_072, [], marks=pytest.mark.exhaustive),
         pytest.param("nerf_tiny", "32-true", 131_072, ["data.batch_rays=4096"], marks=pytest.mark.exhaustive),
         pytest.param("fast_small", "32-true", 131_072, [], marks=pytest.mark.exhaustive),
         pytest.param("fast_small", "bf16-mixed", 131_072, [], marks=pytest.mark.exhaustive),
