@@ -12,12 +12,16 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
+from nerf_lightning.nerf.kernels.prefetch import prefetch
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 
 CHUNK = 1024
+# A processor looks ahead two or three points by itself, and waits for memory most of the time; asked for so many points
+# ahead, the entries of large levels come in time. Smaller levels than this stay in the cache.
+AHEAD, LARGE_BYTES = 8, 1 << 18
 SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
 ONE = np.float32(1.0)
 
@@ -181,15 +185,39 @@ def _scatter(into, e, w, grad, row, column, lanes):
             into[e[k], f] += w[k] * grad[row, column + f]
 
 
+@njit(fastmath=True)
+@no_type_check
+def _ask_for(address, entry_bytes, e):
+    # One by one: a loop over them would store them first.
+    prefetch(address, e[0] * entry_bytes)
+    prefetch(address, e[1] * entry_bytes)
+    prefetch(address, e[2] * entry_bytes)
+    prefetch(address, e[3] * entry_bytes)
+    prefetch(address, e[4] * entry_bytes)
+    prefetch(address, e[5] * entry_bytes)
+    prefetch(address, e[6] * entry_bytes)
+    prefetch(address, e[7] * entry_bytes)
+
+
 # Each loop below finds a point's cell in the same four lines: a function that returned all of it took twice the time.
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def _forward(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
     width = len(lanes)
+    address, entry_bytes = np.int64(table.ctypes.data), np.int64(4 * width)
     for chunk in range(first, last, CHUNK):
+        end = min(last, chunk + CHUNK)
         for level in range(resolutions.shape[0]):
             resolution, column = resolutions[level], level * width
-            for i in range(chunk, min(last, chunk + CHUNK)):
+            large = (offsets[level + 1] - offsets[level]) * entry_bytes > LARGE_BYTES
+            for i in range(chunk, end):
+                j = i + AHEAD
+                if large and j < end:
+                    x, fx = _cell(points[j, 0], resolution)
+                    y, fy = _cell(points[j, 1], resolution)
+                    z, fz = _cell(points[j, 2], resolution)
+                    e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+                    _ask_for(address, entry_bytes, e)
                 x, fx = _cell(points[i, 0], resolution)
                 y, fy = _cell(points[i, 1], resolution)
                 z, fz = _cell(points[i, 2], resolution)
@@ -201,7 +229,16 @@ def _forward(first, last, table, points, resolutions, offsets, hashed, mask, lan
 @no_type_check
 def _add_table_gradient(level, into, points, grad, resolutions, offsets, hashed, mask, lanes):
     resolution, column = resolutions[level], level * len(lanes)
+    address, entry_bytes = np.int64(into.ctypes.data), np.int64(4 * len(lanes))
+    large = (offsets[level + 1] - offsets[level]) * entry_bytes > LARGE_BYTES
     for i in range(points.shape[0]):
+        j = i + AHEAD
+        if large and j < points.shape[0]:
+            x, fx = _cell(points[j, 0], resolution)
+            y, fy = _cell(points[j, 1], resolution)
+            z, fz = _cell(points[j, 2], resolution)
+            e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
+            _ask_for(address, entry_bytes, e)
         x, fx = _cell(points[i, 0], resolution)
         y, fy = _cell(points[i, 1], resolution)
         z, fz = _cell(points[i, 2], resolution)
