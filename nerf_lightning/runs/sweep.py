@@ -102,7 +102,8 @@ def _end() -> list[JobRecord]:
     # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
     from nerf_lightning.console import say
     from nerf_lightning.runs.sweep_table import job_rows
-    from nerf_lightning.runs.table_files import print_rows, write_rows
+    from nerf_lightning.runs.table_files import write_rows
+    from nerf_lightning.runs.table_screen import print_rows
 
     sweep = _begun[-1]
     for number, handler in sweep.former_handlers.items():
@@ -111,7 +112,7 @@ def _end() -> list[JobRecord]:
     if not records:
         return []
     rows = job_rows(records, sweep.folder)
-    print_rows(rows, f"sweep {sweep.folder}")
+    print_rows(rows, f"sweep {sweep.folder}", "The files below hold all of it.")
     write_rows(rows, sweep.folder, "sweep")
     say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
