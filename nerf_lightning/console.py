@@ -101,9 +101,30 @@ def spoken(seconds: int | float) -> str:
     return " ".join(f"{count} {name}" for count, name in words if count or len(words) == 1)
 
 
+class _Label(logging.Filter):
+    """What stands before each line of this process; empty: nothing."""
+
+    text = ""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if not getattr(record, "is_labelled", False):
+            record.msg, record.args, record.is_labelled = f"{self.text}{record.getMessage()}", (), True
+        return True
+
+
+_LABEL = _Label()
+
+
+def label_lines(label: str) -> None:
+    """Put a label before all that this process says and logs: one of several that share a terminal."""
+    _LABEL.text = f"{for_terminal(label)} " if label else ""
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(_LABEL)
+
+
 def say(*lines: str) -> None:
     """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
-    print("\n".join(map(for_terminal, lines)), flush=True)
+    print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
 
 
 class StdoutConsole(Console):

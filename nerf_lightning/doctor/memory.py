@@ -5,7 +5,7 @@ from nerf_lightning.doctor.model_choice import IN_A_BOX, PHOTOGRAPHS, model_for
 from nerf_lightning.machine import free_memory
 
 # Bytes that training takes beside the pixels, the program itself included: the most of a process on a CPU, measured.
-BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.3e9}
+BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.0e9}
 MANY_PIXELS = 200e6
 SMALL = 64
 
