@@ -1,14 +1,22 @@
 """What a person sees in the terminal: lines on stdout, progress bars on stderr."""
 
-from collections.abc import Mapping
+import logging
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn, track
 
 from nerf_lightning import ranks
 from nerf_lightning.escaping import for_terminal
 
 DAY = 86_400
+LINE_SECONDS = 30.0
+"""Time between two lines that say how far something is, where no bar can be shown."""
+
+Item = TypeVar("Item")
+log = logging.getLogger(__name__)
 
 
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
@@ -18,8 +26,36 @@ def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress
     return Progress(*columns, console=console, transient=True, disable=not shown)
 
 
+class ProgressLines:
+    """A line in the log now and then that says how far something is: what a bar shows where there is a terminal."""
+
+    def __init__(self) -> None:
+        console = Console(stderr=True)
+        self.shown = ranks.is_first() and not console.is_terminal
+        self.began = self.told = time.monotonic()
+
+    def __call__(self, what: str, fraction: float) -> None:
+        """Say it, if it is time; `fraction` is of the whole."""
+        now = time.monotonic()
+        if not self.shown or now - self.told < LINE_SECONDS or not 0 < fraction < 1:
+            return
+        self.told = now
+        left = (now - self.began) * (1 - fraction) / fraction
+        log.info("%s: %.0f %%, about %s left", what, 100 * fraction, spoken(left))
+
+
+def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
+    """Yield the items, and show how far it is: a bar on a terminal, elsewhere a line now and then."""
+    lines = ProgressLines()
+    for done, item in enumerate(track(items, description=what, transient=True, console=stderr_console())):
+        lines(what, done / len(items))
+        yield item
+
+
 class StageProgress:
     """One bar over stages of unequal cost, with the time left; one stage at a time goes from 0 to 1.
+
+    Where there is no terminal, a line now and then says the same.
 
     Args:
         costs: each stage's expected cost in any one unit, in the order of the stages.
@@ -28,7 +64,7 @@ class StageProgress:
     def __init__(self, costs: Mapping[str, float]):
         self.costs = dict(costs)
         columns = ("{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-        self.bar = progress_bar(*columns)
+        self.bar, self.lines = progress_bar(*columns), ProgressLines()
         self.task = self.bar.add_task(next(iter(costs)), total=sum(costs.values()))
 
     def __enter__(self) -> "StageProgress":
@@ -42,7 +78,9 @@ class StageProgress:
         """Say that `stage` is done to this fraction, and all before it wholly."""
         names = list(self.costs)
         before = sum(self.costs[name] for name in names[: names.index(stage)])
-        self.bar.update(self.task, description=stage, completed=before + min(fraction, 1.0) * self.costs[stage])
+        completed = before + min(fraction, 1.0) * self.costs[stage]
+        self.bar.update(self.task, description=stage, completed=completed)
+        self.lines(stage, completed / sum(self.costs.values()))
 
 
 def spoken(seconds: int | float) -> str:
@@ -63,9 +101,30 @@ def spoken(seconds: int | float) -> str:
     return " ".join(f"{count} {name}" for count, name in words if count or len(words) == 1)
 
 
+class _Label(logging.Filter):
+    """What stands before each line of this process; empty: nothing."""
+
+    text = ""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if not getattr(record, "is_labelled", False):
+            record.msg, record.args, record.is_labelled = f"{self.text}{record.getMessage()}", (), True
+        return True
+
+
+_LABEL = _Label()
+
+
+def label_lines(label: str) -> None:
+    """Put a label before all that this process says and logs: one of several that share a terminal."""
+    _LABEL.text = f"{for_terminal(label)} " if label else ""
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(_LABEL)
+
+
 def say(*lines: str) -> None:
     """Print lines to stdout; whatever they name, each stays one line, and steers no terminal."""
-    print("\n".join(map(for_terminal, lines)), flush=True)
+    print("\n".join(f"{_LABEL.text}{for_terminal(line)}" for line in lines), flush=True)
 
 
 class StdoutConsole(Console):

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from nerf_lightning.console import StdoutConsole
+from nerf_lightning.console import StdoutConsole, spoken
 
 
 def min_median_max(values: list[float]) -> dict[str, float]:
@@ -23,6 +23,6 @@ def print_table(result: dict[str, Any]) -> None:
             table.add_row(name, *(f"{value[key]:,.3g}" if value[key] < 100 else f"{value[key]:,.0f}" for key in value))
     if result["seconds_and_steps_to_target_psnr"] is not None:
         seconds, steps = result["seconds_and_steps_to_target_psnr"]
-        table.add_row("seconds to the target PSNR", f"{seconds:.1f}", f"{steps} steps", "")
+        table.add_row("time to the target PSNR", spoken(seconds), f"{steps} steps", "")
     table.add_row("peak memory, GB", f"{result['peak_memory_gigabytes']:.2f}", "", "")
     StdoutConsole(width=100).print(table)

@@ -5,12 +5,17 @@ from collections import Counter
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.text import Text
 
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.key_meanings import PLACES
 from nerf_lightning.console import StdoutConsole, say, spoken
+from nerf_lightning.data.readers.auto import AutoReader
+from nerf_lightning.doctor.about_capture import about_capture
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.doctor.picture import doctor_picture
@@ -26,23 +31,36 @@ STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
 def run(config: DictConfig) -> int:
     """Do what the config says; return the number of checks whose verdict is `wrong`."""
     started = time.monotonic()
-    scene = build(config.scene).read()
+    reader = build(config.scene)
+    scene = reader.read()
+    about = about_capture(scene, *_origin(config, reader))
     default = Path(config.paths.root_dir) / scene.name / f"doctor_{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = output_folder(config.paths.output_dir, default)
     evidence, checks = examine(scene)
     rows = [{key: getattr(check, key) for key in ("name", "verdict", "message", "cure")} for check in checks]
-    write_json(folder / "doctor.json", {"scene": scene.name, "checks": rows})
-    save_png(folder / "doctor.png", doctor_picture(evidence, checks))
+    write_json(folder / "doctor.json", {"scene": scene.name, "capture": about, "checks": rows})
+    save_png(folder / "doctor.png", doctor_picture(evidence, checks, about))
     written = [folder / "doctor.json", folder / "doctor.png"]
     proofs = [proof for check in checks for proof in check.proofs]
     if proofs:
         written.append(folder / "doctor_proof.png")
         save_png(written[-1], proof_picture(scene, proofs))
+    say(f"capture  {about}")
     print_checks(checks)
     seconds = time.monotonic() - started
     say(f"{summary(checks)}; {len(scene.view_names)} views examined in {spoken(seconds)}")
     say(f"written to  {listed(map(str, written), cap=len(written))}")
     return sum(check.verdict == "wrong" for check in checks)
+
+
+def _origin(config: DictConfig, reader: Any) -> tuple[str | None, str]:
+    """Return where the capture lies, and how scene= names its format."""
+    form = HydraConfig.get().runtime.choices["scene"]
+    if isinstance(reader, AutoReader):
+        known = reader.known_format(reader.folder())
+        form = form if known is None else known[1]
+    given = (config.scene.get(key.partition(".")[2]) for key in PLACES)
+    return next((str(place) for place in given if place), None), str(form)
 
 
 def summary(checks: Sequence[Check]) -> str:

@@ -7,10 +7,15 @@ from omegaconf import DictConfig, ListConfig
 
 from nerf_lightning.console import say
 from nerf_lightning.errors import require_one_of
-from nerf_lightning.runs.output_folder import folder_around, output_folder
+from nerf_lightning.report.curves import psnr_curve
+from nerf_lightning.report.table_page import write_table_page
+from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
-from nerf_lightning.runs.table import ORDERS, result_table
-from nerf_lightning.runs.table_files import print_rows, write_rows
+from nerf_lightning.runs.table import ORDERS, no_curve, result_table
+from nerf_lightning.runs.table_files import Row, write_csv, write_markdown
+from nerf_lightning.runs.table_screen import print_rows
+
+ENDINGS = (".md", ".csv", ".html")
 
 
 def run(config: DictConfig) -> int:
@@ -20,12 +25,30 @@ def run(config: DictConfig) -> int:
     folders = [Path(name) for name in _names(config.runs)]
     scenes, models = (None if names is None else _names(names) for names in (config.scenes, config.models))
     found = find_results(folders, config.measured, scenes, models)
-    rows, notes = result_table(found, config.sort, bool(config.published), bool(config.force))
-    folder = output_folder(config.paths.output_dir or str(folder_around(folders)), Path())
-    write_rows(rows, folder, "table", tuple(notes))
-    print_rows(rows, "1 run" if len(found.measured) == 1 else f"{len(found.measured)} runs")
-    say(*notes, f"written to  {folder / 'table.md'} and {folder / 'table.csv'}")
+    curve_of = psnr_curve if config.curves else no_curve
+    rows, notes = result_table(found, config.sort, bool(config.published), bool(config.force), curve_of)
+    count = len(found.measured)
+    title = f"{count} run{'' if count == 1 else 's'}, sorted by {config.sort}"
+    out = config.out or config.paths.output_dir
+    written = _write(rows, notes, title, Path(str(out))) if out else []
+    print_rows(rows, title, "A wider one shows more, and out=DIR writes all of it.")
+    say(*notes, *(f"written to  {path}" for path in written))
     return len(rows)
+
+
+def _write(rows: list[Row], notes: list[str], title: str, out: Path) -> list[Path]:
+    """Write the file that was asked for, or one of each kind into a folder; return where."""
+    is_file = out.suffix in ENDINGS
+    folder = output_folder(str(out.parent if is_file else out), Path())
+    paths = [folder / out.name] if is_file else [folder / f"table{ending}" for ending in ENDINGS]
+    for path in paths:
+        if path.suffix == ".csv":
+            write_csv(rows, path)
+        elif path.suffix == ".md":
+            write_markdown(rows, path, notes)
+        else:
+            write_table_page(rows, title, notes, path)
+    return paths
 
 
 def _names(value: Any) -> list[str]:

@@ -167,7 +167,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         ckpt what.** labels outputs mosaic format background crop near hold_camera projection
         host port open_browser photographs max_height
-        run measured max_megabytes runs scenes models sort published force
+        run measured max_megabytes runs scenes models sort published force curves out
         rounds steps warmup_steps target_psnr kernels render_rays
         images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads
         """,

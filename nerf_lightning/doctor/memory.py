@@ -1,10 +1,11 @@
 """What training will take."""
 
 from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.model_choice import IN_A_BOX, PHOTOGRAPHS, model_for
 from nerf_lightning.machine import free_memory
 
-# Bytes that training takes beside the pixels, by measurement of model=fast on a CPU.
-BESIDE_PIXELS = 1.0e9
+# Bytes that training takes beside the pixels, the program itself included: the most of a process on a CPU, measured.
+BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.0e9}
 MANY_PIXELS = 200e6
 SMALL = 64
 
@@ -14,10 +15,11 @@ def memory(evidence: Evidence) -> Check:
     pixels = evidence.scene.pixels
     count = len(pixels.rgba)
     store = pixels.rgba.nbytes + (0 if pixels.mask is None else pixels.mask.nbytes)
-    needed, free = store + BESIDE_PIXELS, free_memory()
+    model, reason = model_for(evidence.scene)
+    needed, free = store + BESIDE_PIXELS[model], free_memory()
     message = (
-        f"{count / 1e6:.1f} million pixels take {store / 1e9:.2f} GB; training with model=fast takes about "
-        f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free"
+        f"{count / 1e6:.1f} million pixels take {store / 1e9:.2f} GB; training with model={model} takes "
+        f"about {needed / 1e9:.1f} GB on a CPU, {free / 1e9:.1f} GB are free; model=auto chooses it, since {reason}"
     )
     sides = f"{int(pixels.width.max())} x {int(pixels.height.max())}"
     if needed > free:

@@ -15,13 +15,22 @@ from nerf_lightning.visualization.figures import new_figure, picture_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+WIDEST = 130
 VERDICTS = {"ok": "#3c9d6b", "look": "#d9a400", "wrong": "#c8372d"}
 
 
 def doctor_picture(
-    evidence: Evidence, checks: Sequence[Check], width: int = 1500, height: int = 1150
+    evidence: Evidence, checks: Sequence[Check], about: str, width: int = 1500, height: int = 1150
 ) -> UInt8[Tensor, "height width 3"]:
-    """Return the picture: two views of the cameras, the coverage map and the verdicts."""
+    """Return the picture: two views of the cameras, the coverage map and the verdicts.
+
+    Args:
+        evidence: what was found.
+        checks: the verdicts.
+        about: what was examined, in one line.
+        width: in pixels.
+        height: in pixels.
+    """
     figure = new_figure(width, height)
     grid = figure.add_gridspec(2, 2, height_ratios=[1.25, 1.0], width_ratios=[1.0, 1.0])
     scene = evidence.scene
@@ -30,15 +39,20 @@ def doctor_picture(
     draw_layout(above, side, scene, content)
     draw_coverage(figure.add_subplot(grid[1, 0]), scene)
     _write_verdicts(figure.add_subplot(grid[1, 1]), checks)
-    num_views, points = len(scene.view_names), len(content)
+    points = len(content)
     what = "sparse points" if len(scene.points) else "matched details"
     figure.suptitle(
-        f"{scene.name}: {num_views} views, {points} {what}, space {scene.space}",
-        fontsize=14,
+        f"{shortened(about)}\n{points} {what}, space {scene.space}",
+        fontsize=12,
         weight="bold",
         parse_math=False,
     )
     return picture_of(figure)
+
+
+def shortened(text: str) -> str:
+    """Return a line that a picture has room for, without the beginning of a long one."""
+    return text if len(text) <= WIDEST else f"... {text[-WIDEST:]}"
 
 
 def content_points(evidence: Evidence) -> Float[Tensor, "points 3"]:

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.console import stderr_console
+from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.camera_fit import fitted_camera
 from nerf_lightning.evaluation.color_fit import exposure_fitted
@@ -87,7 +86,7 @@ class Scoring:
         rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
-        for view in track(mine, description=f"evaluating {self.split}", transient=True, console=stderr_console()):
+        for view in tracked(mine, f"evaluating {self.split}"):
             if scene.refined and view not in scene.splits["train"]:
                 cameras = fitted_camera(model, scene, view, background, tile_points)
                 rays_of = RayGenerator(cameras, scene.near, scene.far)

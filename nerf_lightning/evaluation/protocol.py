@@ -89,7 +89,12 @@ def split_hash(scene: Scene, views: list[int]) -> str:
 
 
 def measured_of(
-    model: nn.Module, config: str, choices: Mapping[str, str], device: torch.device, precision: str
+    model: nn.Module,
+    config: str,
+    choices: Mapping[str, str],
+    device: torch.device,
+    precision: str,
+    step: int | None = None,
 ) -> dict[str, Any]:
     """Return what was measured, with what.
 
@@ -99,6 +104,7 @@ def measured_of(
         choices: the names picked from each config group.
         device: where it is rendered.
         precision: of the products.
+        step: how long it was trained.
     """
     settings = plain_yaml(config, "The run's config")
     weights = model.state_dict()
@@ -109,6 +115,7 @@ def measured_of(
         "seed": settings.get("seed") if isinstance(settings, dict) else None,
         "config": config_hash(settings),
         "checkpoint": weights_hash(weights),
+        "step": step,
         "version": __version__,
         "commit": commit(),
         "device": torch.cuda.get_device_name(device) if on_gpu else device.type,

@@ -40,7 +40,8 @@ class MeshExport(Export):
         min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
         seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
         faces: most faces, reached by decimation; None keeps all.
-        format: of the file; PLY and OBJ open everywhere, GLB is one file for browsers.
+        format: of the file; PLY and OBJ open everywhere, in the capture's frame; GLB is one file for browsers, and its
+            root node turns it so that y is up, as glTF has it.
     """
 
     def __init__(
@@ -86,7 +87,8 @@ class MeshExport(Export):
             colors = surface_colors(model, record, points, outward, reach, self.colors, tile_points, report)
         path, to_user = folder / f"mesh.{self.format}", record.to_user.double()
         placed, turned = points_to_user(points.double(), to_user), directions_to_user(outward.double(), to_user)
-        save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy())
+        up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
+        save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy(), up.numpy())
         log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
         return [path]
 

@@ -1,15 +1,18 @@
 """Mesh files: PLY, OBJ and GLB, with a colour and a normal for each vertex, by libraries that are an extra."""
 
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.nerf.geometry.frames import upright_rotation
 
 MeshFormat = Literal["ply", "obj", "glb"]
 
@@ -20,8 +23,21 @@ def save_mesh(
     faces: Int[ndarray, "faces 3"],
     normals: Float[ndarray, "vertices 3"],
     colors: UInt8[ndarray, "vertices 3"],
+    up: Float[ndarray, "3"],
 ) -> None:
-    """Write a mesh, whole or not at all; the ending says in which format."""
+    """Write a mesh, whole or not at all; the ending says in which format.
+
+    PLY and OBJ say nothing of up, and keep the frame. In glTF, y is up: there the vertices keep the frame too, and the
+    root node turns it.
+
+    Args:
+        path: of the file.
+        vertices: where the corners are.
+        faces: three corners each.
+        normals: of the corners.
+        colors: of the corners, sRGB.
+        up: the unit vector that points up, in the frame of the vertices.
+    """
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
     shown = _linear(colors) if form == "glb" else colors
@@ -29,7 +45,7 @@ def save_mesh(
     settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},
-        "glb": {"include_normals": True, "tree_postprocessor": _unlit},
+        "glb": {"include_normals": True, "tree_postprocessor": partial(_as_gltf, up)},
     }
     content = mesh.export(file_type=form, **settings[form])
     with whole_file(path) as part:
@@ -41,6 +57,23 @@ def _linear(colors: UInt8[ndarray, "vertices 3"]) -> UInt8[ndarray, "vertices 3"
     share = colors / 255.0
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * linear).astype(np.uint8)
+
+
+def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
+    """Return the rotation that takes `up` to +y, and what a frame with z up calls x to x.
+
+    >>> (y_up(np.array([0.0, 0.0, 1.0])) @ [1, 2, 3, 1]).tolist()
+    [1.0, 3.0, -2.0, 1.0]
+    """
+    turned = np.eye(4)
+    turned[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright_rotation(torch.from_numpy(up)).numpy()
+    return turned
+
+
+def _as_gltf(up: Float[ndarray, "3"], tree: dict[str, Any]) -> None:
+    (root,) = tree["scenes"][tree["scene"]]["nodes"]
+    tree["nodes"][root]["matrix"] = y_up(up).T.flatten().tolist()  # column by column
+    _unlit(tree)
 
 
 def _unlit(tree: dict[str, Any]) -> None:

@@ -34,10 +34,10 @@ class Chart:
     is_logarithmic: bool = False
 
 
-# Only names of these forms are drawn: others may be anything.
+# Only names of these forms are drawn: others may be anything. Older runs have those with train/ and val/.
 CHARTS = (
-    Chart("PSNR (dB)", re.compile(r"(train/psnr_\w{1,40}|val/psnr)")),
-    Chart("loss", re.compile(r"train/loss(_\w{1,40})?"), is_logarithmic=True),
+    Chart("PSNR (dB)", re.compile(r"(train/psnr_\w{1,40}|val/psnr|PSNR/(train_\w{1,40}|validation))")),
+    Chart("loss", re.compile(r"(train/loss(_\w{1,40})?|Training loss/\w{1,40})"), is_logarithmic=True),
     Chart("learning rate", re.compile(r"train/learning_rate"), is_logarithmic=True),
     Chart("rays per second", re.compile(r"speed/rays_per_second")),
     Chart("memory (GB)", re.compile(r"memory/\w{1,40}_gigabytes")),
@@ -98,6 +98,28 @@ def _draw(chart: Chart, curves: Mapping[str, Curve]) -> bytes:
 
 
 MOST_POINTS = 1000
+VALIDATION = ("PSNR/validation", "val/psnr")
+FEWEST_POINTS, FEWEST_VALIDATIONS = 3, 8
+"""Of fewer points, nobody sees a curve; of fewer validations, that of the batches is taken instead."""
+
+
+def psnr_curve(run: Path) -> Sequence[float]:
+    """Return the PSNR of a run as it rose: that of the validation where there are enough, else of the batches.
+
+    It is empty where the run has no TensorBoard files that can be read.
+    """
+    try:
+        curves = read_curves(run / "tensorboard")
+    except (InputError, OSError):
+        return []
+    validated = next((curves[tag][1] for tag in VALIDATION if tag in curves), [])
+    of_levels = [
+        values for tag, (_, values) in curves.items() if CHARTS[0].tags.fullmatch(tag) and tag not in VALIDATION
+    ]
+    # The last level is the picture.
+    values = validated if len(validated) >= FEWEST_VALIDATIONS or not of_levels else of_levels[-1]
+    finite = [value for value in values if math.isfinite(value)]
+    return finite if len(finite) >= FEWEST_POINTS else []
 
 
 def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.console import spoken
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
 from nerf_lightning.evaluation.metrics_files import COLUMNS
@@ -42,10 +43,11 @@ def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
         *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
     ]
     origin = _mapping(metrics.get("origin"))
+    trained = number(note.get("training_seconds"))
+    shown.append(("training", "" if trained is None else spoken(trained)))
     for label, value, form in (
         ("frames per second", metrics.get("frames_per_second"), "{:.3g}"),
         ("memory, GB at most", metrics.get("peak_memory_gigabytes"), "{:.2f}"),
-        ("seconds of training", note.get("training_seconds"), "{:,.0f}"),
         ("steps", note.get("finished_at_step"), "{:,.0f}"),
         ("parameters", origin.get("parameters"), "{:,.0f}"),
         ("weights, MB", origin.get("megabytes"), "{:.1f}"),

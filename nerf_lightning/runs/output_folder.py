@@ -1,9 +1,8 @@
 """Where a command that does not train writes: as the user says, or beside the checkpoint."""
 
 import contextlib
-import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,20 +15,6 @@ def beside_checkpoint(checkpoint: Path, name: str) -> Path:
     """Return the folder of this name in the run folder that a checkpoint lies in."""
     beside = checkpoint.absolute().parent
     return (beside.parent if beside.name == "checkpoints" else beside) / name
-
-
-def folder_around(folders: Sequence[Path]) -> Path:
-    """Return where that is written which is said of all these folders.
-
-    That is the one that holds the others, else the folder that they lie beside each other in; where there is none, or
-    it is the root of the disk, the working folder.
-    """
-    places = [Path(os.path.abspath(folder)) for folder in folders]
-    outermost = min(places, key=lambda place: len(place.parts))
-    if all(place.is_relative_to(outermost) for place in places):
-        return outermost
-    beside = outermost.parent
-    return beside if beside.name and all(place.parent == beside for place in places) else Path()
 
 
 def chosen_folder(given: str | None, default: Path) -> Path:

@@ -18,6 +18,9 @@ class Published:
     scene: str
     method: str
     psnr: float
+    resolution: str
+    """Of the pictures that it was measured on."""
+    steps: int | None
     time: str | None
     source: str
     measured: str
@@ -52,6 +55,8 @@ def _all() -> tuple[Published, ...]:
             scene=scene,
             method=result["method"],
             psnr=float(psnr),
+            resolution=benchmark["resolution"],
+            steps=result.get("steps"),
             time=result["time"],
             source=result["source"],
             measured=benchmark["measured"],

@@ -130,6 +130,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     values = {metric: number(metrics.get(metric)) for metric in METRICS}
     values["frames_per_second"] = number(metrics.get("frames_per_second"))
     values |= {key: number(origin.get(key)) for key in ("parameters", "megabytes")}
+    values["steps"] = number(origin.get("step")) if run.steps is None else run.steps
     values["minutes"] = _minutes(number(note.get("training_seconds")))
     return RunResult(
         summary=run,

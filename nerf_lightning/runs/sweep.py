@@ -1,6 +1,7 @@
 """A sweep as its own process sees it: the command to go on with, the jobs' cores, Ctrl-C, and the table at its end."""
 
 import logging
+import math
 import os
 import signal
 import sys
@@ -11,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 import psutil
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
@@ -19,8 +21,8 @@ from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.runs.saved_overrides import to_give_again
-from nerf_lightning.runs.sweep_job import JobRecord, read_records, records_folder, stop_file
-from nerf_lightning.runs.sweep_record import SweepRecord
+from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, remove_empty, stop_file
+from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
 from nerf_lightning.slurm import slurm_job
 
 log = logging.getLogger(__name__)
@@ -38,6 +40,8 @@ class Sweep:
     record: SweepRecord
     received: int | None = None
     """The signal that stopped it."""
+    made: list[Path] = field(default_factory=list)
+    """Its folder and those around it that were not there before, the innermost first."""
     former_handlers: dict[int, Any] = field(default_factory=dict)
 
     def go_on_with(self) -> str:
@@ -59,6 +63,7 @@ class SweepWatch(Callback):
         asked: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
         record = SweepRecord([*asked["hydra"], *asked["task"]], slurm_job())
         sweep = Sweep(sys.argv[0], Path(config.hydra.sweep.dir), record)
+        sweep.made = [each for each in (sweep.folder, *sweep.folder.parents) if not each.exists()]
         for leftover in (*records_folder(sweep.folder).glob("*.json"), stop_file(sweep.folder)):
             leftover.unlink(missing_ok=True)
         record.write(sweep.folder)
@@ -67,6 +72,7 @@ class SweepWatch(Callback):
             print(for_terminal(said), file=sys.stderr)
         # Optuna's database library lists its parts.
         logging.getLogger("alembic").setLevel(logging.WARNING)
+        os.environ[NUM_JOBS] = _num_jobs(config.hydra)
         launcher = config.hydra.launcher._target_
         if launcher.endswith(LOCAL_LAUNCHERS):
             _share_cores(launcher, config.hydra.launcher)
@@ -102,7 +108,8 @@ def _end() -> list[JobRecord]:
     # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
     from nerf_lightning.console import say
     from nerf_lightning.runs.sweep_table import job_rows
-    from nerf_lightning.runs.table_files import print_rows, write_rows
+    from nerf_lightning.runs.table_files import write_rows
+    from nerf_lightning.runs.table_screen import print_rows
 
     sweep = _begun[-1]
     for number, handler in sweep.former_handlers.items():
@@ -110,13 +117,36 @@ def _end() -> list[JobRecord]:
     records = read_records(sweep.folder)
     if not records:
         return []
+    if all(record.state == "failed" for record in records) and _remove_refused(sweep):
+        return records
     rows = job_rows(records, sweep.folder)
-    print_rows(rows, f"sweep {sweep.folder}")
+    print_rows(rows, f"sweep {sweep.folder}", "The files below hold all of it.")
     write_rows(rows, sweep.folder, "sweep")
     say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
         say(f"go on with   {sweep.go_on_with()}")
     return records
+
+
+def _remove_refused(sweep: Sweep) -> bool:
+    """Remove what a sweep has made none of whose jobs has begun; tell whether there was nothing else."""
+    folder = sweep.folder
+    if any(path.name not in (".hydra", "multirun.yaml") for path in folder.iterdir()):
+        return False
+    for left in (*records_folder(folder).glob("*.json"), sweep_record(folder), folder / "multirun.yaml"):
+        left.unlink(missing_ok=True)
+    for empty in (records_folder(folder), folder / ".hydra", *sweep.made):
+        remove_empty(empty)
+    return True
+
+
+def _num_jobs(hydra: DictConfig) -> str:
+    """Return how many jobs there will be, empty where the sweeper decides it as it goes."""
+    if not hydra.sweeper._target_.endswith(".BasicSweeper"):
+        return str(hydra.sweeper.get("n_trials") or "")
+    parsed = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
+    swept = (sum(1 for _ in each.sweep_string_iterator()) for each in parsed if each.is_sweep_override())
+    return str(math.prod(swept))
 
 
 def _complain(bad: list[JobRecord], total: int, error: Exception | None) -> None:

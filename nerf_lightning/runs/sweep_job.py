@@ -4,6 +4,7 @@ Jobs may run in other processes and on other machines; what the sweep's own proc
 files in the sweep's folder. A job that fails returns None, so that the sweep goes on with the others.
 """
 
+import contextlib
 import json
 import logging
 import os
@@ -18,11 +19,14 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.config.messages import paragraph
+from nerf_lightning.console import label_lines
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.regular import read_text
-from nerf_lightning.runs.summary import folders_of_runs, read_note
+from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 from nerf_lightning.slurm import was_requeued
 
+NUM_JOBS = "NERF_LIGHTNING_JOBS"
+"""In the environment of the jobs: how many there are."""
 MOST_BYTES = 1 << 20
 """Of a record."""
 
@@ -61,6 +65,7 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
     if elsewhere:
         _behave_as_one_of_many()
+        label_lines(job_label(int(hydra.job.num), own, list(hydra.overrides.task)))
         if stop_file(sweep_folder).exists():
             return None
     record = JobRecord(int(hydra.job.num), list(hydra.overrides.task), str(own), os.getpid())
@@ -72,6 +77,7 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
         value = run(config)
     except Exception as error:
         _failed(record, error, paragraph(error, command)).write(sweep_folder)
+        remove_empty(own)
         return None
     except (SystemExit, KeyboardInterrupt) as stop:
         if 0 < (getattr(stop, "code", None) or 0) < 128:  # of processes that the job had started
@@ -89,17 +95,35 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
 def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
     log.info("job %d has finished before: %s", record.number, former)
     own = Path(record.folder)
-    if former != own and not any(own.iterdir()):
-        own.rmdir()
+    if former != own:
+        remove_empty(own)
     replace(record, folder=str(former), state="finished before").write(sweep_folder)
     return number(read_note(former).get("psnr"))
 
 
+def remove_empty(folder: Path) -> None:
+    """Remove a folder that nothing was written into."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def job_label(number: int, folder: Path, overrides: list[str]) -> str:
+    """Return what tells a job from those beside it: its number, and the settings that its folder is called by.
+
+    >>> job_label(2, Path("2_optimizer.lr=0.01"), ["model=fast", "optimizer.lr=0.01"])
+    '[3 lr=0.01]'
+    """
+    given = by_key(overrides).items()
+    swept = [f"{key.rpartition('.')[2]}={value}" for key, value in given if f"_{key}=" in folder.name]
+    total = os.environ.get(NUM_JOBS)
+    return f"[{' '.join([str(number + 1) + (f'/{total}' if total else ''), *swept])}]"
+
+
 def _failed(record: JobRecord, error: Exception, reason: str | None) -> JobRecord:
     if reason is None:
-        log.exception("job %d crashed", record.number)
+        log.exception("job %s crashed", Path(record.folder).name)
         return replace(record, state="crashed", reason=f"{type(error).__name__}: {error}".splitlines()[0])
-    log.error("job %d failed: %s", record.number, reason)
+    log.error("job %s failed: %s", Path(record.folder).name, reason)
     return replace(record, state="failed", reason=reason)
 
 

@@ -1,7 +1,7 @@
 """Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
@@ -14,18 +14,25 @@ from nerf_lightning.runs.summary import differing_keys
 from nerf_lightning.runs.table_files import Row
 
 ORDERS = (
-    *("psnr", "ssim", "lpips", "depth_error", "normal_error"),
-    *("minutes", "parameters", "megabytes", "frames_per_second", "model"),
+    *("psnr", "cc_psnr", "ssim", "lpips", "depth_error", "normal_error"),
+    *("steps", "minutes", "parameters", "megabytes", "frames_per_second", "model"),
 )
 """What rows may be sorted by."""
 SPREAD = {
     "psnr": "PSNR",
+    "cc_psnr": "cc PSNR",
     "ssim": "SSIM",
     "lpips": "LPIPS",
     "depth_error": "depth error",
     "normal_error": "normal error",
 }
-PLAIN = {"minutes": "minutes", "frames_per_second": "frames/s", "parameters": "parameters", "megabytes": "MB"}
+PLAIN = {
+    "steps": "steps",
+    "minutes": "minutes",
+    "frames_per_second": "frames/s",
+    "parameters": "parameters",
+    "megabytes": "MB",
+}
 HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
 # What tells whose numbers they are, and may move them a little: named below a table where it differs.
 NOTED = ("version", "commit", "device", "precision")
@@ -33,10 +40,22 @@ NOTED = ("version", "commit", "device", "precision")
 MOST_SETTINGS = 32
 """Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
 
+MOST_CURVES = 40
+"""Rows whose curves are read: of more, the table would take long to come."""
+
 Group = list[RunResult]
+Curve = Sequence[float]
+"""Values over the length of a run, at steps of equal distance."""
 
 
-def result_table(found: FoundResults, order: str, published: bool, force: bool) -> tuple[list[Row], list[str]]:
+def no_curve(folder: Path) -> Curve:
+    """Return no values, for tables without curves."""
+    return ()
+
+
+def result_table(
+    found: FoundResults, order: str, published: bool, force: bool, curve_of: Callable[[Path], Curve] = no_curve
+) -> tuple[list[Row], list[str]]:
     """Return the rows, and the lines that belong below them.
 
     Args:
@@ -44,6 +63,7 @@ def result_table(found: FoundResults, order: str, published: bool, force: bool) 
         order: one of `ORDERS`.
         published: add what others have published.
         force: put results together that were not measured alike.
+        curve_of: returns the PSNR over the length of the run in a folder, empty where it is not known.
 
     Raises:
         InputError: they were not measured alike, and not `force`.
@@ -51,7 +71,7 @@ def result_table(found: FoundResults, order: str, published: bool, force: bool) 
     results = found.measured
     notes = one_protocol(results, force)
     groups, left_out = group_seeds(results)
-    rows = group_rows(groups, order)
+    rows = group_rows(groups, order, curve_of)
     if published:
         rows = with_published(rows, results)
     notes += [*noted_settings(groups), *noted_origins(results)]
@@ -119,10 +139,24 @@ def group_seeds(results: Sequence[RunResult]) -> tuple[list[Group], list[RunResu
     return [list(seeds.values()) for seeds in groups.values()], left_out
 
 
-def group_rows(groups: Sequence[Group], order: str) -> list[Row]:
+def group_rows(groups: Sequence[Group], order: str, curve_of: Callable[[Path], Curve] = no_curve) -> list[Row]:
     """Return a row per group, by scene and then the best first; settings that all share are left out."""
     shown = _differing(groups)[:MOST_SETTINGS]
-    return [_row(group, shown) for group in sorted(groups, key=lambda group: _rank(group, order))]
+    ranked = sorted(groups, key=lambda group: _rank(group, order))
+    return [_row(group, shown, curve) for group, curve in zip(ranked, relative_curves(ranked, curve_of), strict=True)]
+
+
+def relative_curves(groups: Sequence[Group], curve_of: Callable[[Path], Curve]) -> list[Curve]:
+    """Return the curve of each group's newest run, in parts of the range that the curves of its scene fill."""
+    curves = [curve_of(group[0].folder) for group in groups[:MOST_CURVES]] + [()] * len(groups[MOST_CURVES:])
+    reached: dict[str, list[float]] = {}
+    for group, curve in zip(groups, curves, strict=True):
+        reached.setdefault(group[0].scene, []).extend(curve)
+    relative: list[Curve] = []
+    for group, curve in zip(groups, curves, strict=True):
+        low, high = min(reached[group[0].scene], default=0.0), max(reached[group[0].scene], default=1.0)
+        relative.append([(value - low) / (high - low or 1.0) for value in curve])
+    return relative
 
 
 def noted_settings(groups: Sequence[Group]) -> list[str]:
@@ -145,7 +179,9 @@ def with_published(rows: list[Row], results: Sequence[RunResult]) -> list[Row]:
             {
                 "scene": scene,
                 "model": found.method,
+                "resolution": found.resolution,
                 "PSNR": found.psnr,
+                "steps": found.steps,
                 "time": found.time,
                 "source": f"published, {found.measured}: {found.source}",
             }
@@ -161,18 +197,33 @@ def without_empty(rows: list[Row]) -> list[Row]:
     return [{column: row.get(column) for column in kept} for row in rows]
 
 
-def _row(group: Group, shown: list[str]) -> Row:
+def _row(group: Group, shown: list[str], curve: Curve) -> Row:
     first = group[0]
     row: Row = {"scene": first.scene, "model": first.model}
     row |= {key: first.settings.get(key, "") for key in shown}
     seeds = sorted(result.seed for result in group if result.seed is not None)
-    row["seeds"] = " ".join(map(str, seeds))
+    row |= {"resolution": _resolution(first), "seeds": " ".join(map(str, seeds))}
     for metric, column in SPREAD.items():
         mean, deviation = _spread(group, metric)
         row |= {column: mean, f"{column} std": deviation}
-    row["steps"] = first.summary.steps
+        if metric == "psnr":
+            row["curve"] = curve or None
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
+    row["steps"] = None if row["steps"] is None else round(row["steps"])
     return row | {"time": None, "source": None}
+
+
+def _resolution(result: RunResult) -> str:
+    """Return the size of the pictures that were measured; of several sizes, the smallest and how many more."""
+    found = result.protocol.get("resolution")
+    sizes = [f"{size[0]} x {size[1]}" for size in found if _is_size(size)] if isinstance(found, list) else []
+    return f"{sizes[0]} and {len(sizes) - 1} more" if len(sizes) > 1 else "".join(sizes)
+
+
+def _is_size(size: object) -> bool:
+    return (
+        isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) and 0 < side < 10**6 for side in size)
+    )
 
 
 def _spread(group: Group, key: str) -> tuple[float | None, float | None]:

@@ -1,62 +1,116 @@
-"""Rows of a table: printed, and written as markdown for people and as CSV with all digits.
+"""Rows of a table, written as markdown for people and as CSV with all digits.
 
-Texts in them may come from anybody's run folders: they stay text, in a terminal, a browser and a spreadsheet.
+Texts in them may come from anybody's run folders: they stay text, in a browser and a spreadsheet.
 """
 
 import csv
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-from rich.text import Text
-
-from nerf_lightning.console import StdoutConsole
-from nerf_lightning.escaping import for_csv, for_markdown, for_terminal
+from nerf_lightning.console import spoken
+from nerf_lightning.escaping import for_csv, for_markdown
 from nerf_lightning.files.atomic import whole_file
 
 Row = dict[str, Any]
 
 DECIMALS = {
-    **{"PSNR": 2, "PSNR std": 2, "SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4, "seconds": 1, "minutes": 1},
+    **{
+        "PSNR": 2,
+        "PSNR std": 2,
+        "cc PSNR": 2,
+        "cc PSNR std": 2,
+        "SSIM": 4,
+        "SSIM std": 4,
+        "LPIPS": 4,
+        "LPIPS std": 4,
+        "seconds": 1,
+        "minutes": 1,
+    },
     **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
 }
 COUNTS = ("steps", "parameters", "runs")
-
-
-def print_rows(rows: list[Row], title: str) -> None:
-    """Print the table to the terminal, whole even where the terminal is narrow, but for the ends of sources."""
-    table = Table(title=Text(for_terminal(title)))
-    for column in rows[0]:
-        is_number = column in (*DECIMALS, *COUNTS)
-        table.add_column(Text(for_terminal(column)), justify="right" if is_number else "left", overflow="fold")
-    for row in rows:
-        short = row | {"source": (row["source"] or "").partition(",")[0]} if "source" in row else row
-        table.add_row(*(Text(for_terminal(text)) for text in _texts(short)))
-    console = StdoutConsole()
-    (console if console.is_terminal else StdoutConsole(width=160)).print(table)
+SECONDS = {"seconds": 1, "minutes": 60}
+"""Columns of times, in seconds each."""
+BLOCKS = "▁▂▃▄▅▆▇█"
+SPARKLINE = 12
+"""Signs in which a curve is drawn."""
 
 
 def write_rows(rows: list[Row], folder: Path, name: str, notes: tuple[str, ...] = ()) -> None:
     """Write `NAME.csv` with all digits, and `NAME.md` with the notes below."""
-    columns = list(rows[0])
-    with whole_file(folder / f"{name}.csv") as part, part.open("w", encoding="utf-8", newline="") as file:
+    write_csv(rows, folder / f"{name}.csv")
+    write_markdown(rows, folder / f"{name}.md", notes)
+
+
+def write_csv(rows: list[Row], path: Path) -> None:
+    """Write the rows with all digits; curves are left out."""
+    columns = [column for column in rows[0] if column != "curve"]
+    with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(map(for_csv, columns))
-        writer.writerows([for_csv(value) for value in row.values()] for row in rows)
-    head, *lines = ([*map(for_markdown, line)] for line in (columns, *map(_texts, rows)))
-    text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(columns), *lines))
-    with whole_file(folder / f"{name}.md") as part:
+        writer.writerows([for_csv(row[column]) for column in columns] for row in rows)
+
+
+def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> None:
+    """Write the rows as a table of Markdown, with the notes below."""
+    head, *lines = ([*map(for_markdown, line)] for line in (list(rows[0]), *map(texts, rows)))
+    text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *lines))
+    with whole_file(path) as part:
         part.write_text(text + "".join(f"\n{for_markdown(note)}\n" for note in notes), encoding="utf-8")
 
 
-def _texts(row: Row) -> list[str]:
+def sparkline(curve: Sequence[float]) -> str:
+    """Return a curve as a word of blocks, the lowest for 0 and the highest for 1.
+
+    >>> sparkline([0.0, 0.2, 0.5, 1.0])
+    '▁▂▅█'
+    """
+    count = min(SPARKLINE, len(curve))
+    picked = [curve[round(place * (len(curve) - 1) / max(count - 1, 1))] for place in range(count)]
+    return "".join(BLOCKS[min(int(value * len(BLOCKS)), len(BLOCKS) - 1)] for value in picked)
+
+
+def is_number(column: str) -> bool:
+    """Tell whether a column holds numbers."""
+    return column in (*DECIMALS, *COUNTS)
+
+
+def texts(row: Row) -> list[str]:
+    """Return what a person reads of a row."""
     return [_text(key, value) for key, value in row.items()]
+
+
+def told_columns(rows: list[Row]) -> dict[str, list[str]]:
+    """Return the texts of each column as a person reads them.
+
+    Deviations stand beside their means, all times are in one column, and what others have published says so.
+    """
+    lines = [dict(zip(row, texts(row), strict=True)) for row in rows]
+    columns: dict[str, list[str]] = {}
+    for name in rows[0]:
+        if name in SECONDS or name == "time":
+            columns["time"] = [_time(row) for row in rows]
+        elif not name.endswith(" std"):
+            of = f"{name} std"
+            columns[name] = [f"{line[name]} ± {line[of]}" if line.get(of) else line[name] for line in lines]
+    if "model" in columns:
+        told = zip(columns["model"], rows, strict=True)
+        columns["model"] = [f"{text} (published)" if row.get("source") else text for text, row in told]
+    return columns
+
+
+def _time(row: Row) -> str:
+    told = (spoken(value * SECONDS[key]) for key in SECONDS if (value := row.get(key)) is not None)
+    return next(told, row.get("time") or "")
 
 
 def _text(column: str, value: Any) -> str:
     if value is None:
         return ""
+    if column == "curve":
+        return sparkline(value)
     if column in DECIMALS and not isinstance(value, str):
         return f"{value:.{DECIMALS[column]}f}"
     if column in COUNTS and not isinstance(value, str):

@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from nerf_lightning.console import StdoutConsole, say
+from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.selftest.check import Row
 
 COLORS = {"ok": "green", "wrong": "bold red", "not run": "yellow"}
@@ -15,7 +15,7 @@ def print_rows(rows: list[Row], device: str, seconds: float) -> None:
     counts = {outcome: sum(row.outcome == outcome for row in rows) for outcome in COLORS}
     found = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
     StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {device}"))
-    say(*remarks(rows), f"{found}; {seconds:.0f} seconds")
+    say(*remarks(rows), f"{found}; {spoken(seconds)}")
 
 
 def result_table(rows: list[Row], title: str) -> Table:

@@ -13,11 +13,11 @@ from omegaconf import DictConfig
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.console import spoken
 from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.model_choice import model_for
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
 AUTO = "auto"
-IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
 
@@ -76,13 +76,6 @@ def corrected(
         config = copy.deepcopy(config)
         config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked
-
-
-def model_for(scene: Scene) -> tuple[str, str]:
-    """Return the model that suits a scene, and why."""
-    if scene.space == "bounded":
-        return IN_A_BOX, "the scene stands in a box"
-    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
 
 
 def _settle(section: DictConfig, key: str, value: bool) -> None:

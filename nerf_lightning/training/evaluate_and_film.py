@@ -111,7 +111,8 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
 def _origin(trainer: Trainer, model: Model, settings: TrainerSettings) -> dict[str, Any]:
     system: Any = trainer.lightning_module
     record = system.record
-    return measured_of(model, record["config"], record["choices"], settings.device, settings.precision)
+    of = (record["config"], record["choices"], settings.device, settings.precision, trainer.global_step)
+    return measured_of(model, *of)
 
 
 def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
-from rich.progress import track
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.console import stderr_console
+from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
@@ -55,7 +54,7 @@ def film(
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         mine = ranks.every_other(missing)
-        for number in track(mine, description="filming", transient=True, console=stderr_console()):
+        for number in tracked(mine, "filming"):
             for name, picture in _frame(shots, settings, number, seen).items():
                 frames.save(name, number, picture)
         ranks.gather(None)  # all frames are there

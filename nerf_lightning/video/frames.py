@@ -14,10 +14,9 @@ from pathlib import Path
 import torch
 from filelock import FileLock, Timeout
 from jaxtyping import UInt8
-from rich.progress import track
 from torch import Tensor
 
-from nerf_lightning.console import stderr_console
+from nerf_lightning.console import tracked
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
@@ -123,7 +122,7 @@ class FilmFrames:
 
     def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width 3"]]:
         numbers = range(self.count)
-        for number in track(numbers, description=f"encoding {film}", transient=True, console=stderr_console()):
+        for number in tracked(numbers, f"encoding {film}"):
             file = self._file(film, number)
             try:
                 yield torch.from_numpy(read_rgba(file)[..., :3].copy())

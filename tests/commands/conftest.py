@@ -86,7 +86,7 @@ def table(nerf, tmp_path):
 
     def call(*arguments):
         out = tmp_path / "out"
-        result = nerf("table", tmp_path / "runs", f"paths.output_dir={out}", *arguments)
+        result = nerf("table", tmp_path / "runs", f"out={out}", *arguments)
         written = out / "table.csv"
         return result, list(csv.DictReader(written.read_text().splitlines())) if result.code == 0 else []
 

@@ -51,6 +51,11 @@ def test_a_good_capture(corner, doctor, tmp_path):
         assert picture.size == (1500, 1150)
     assert not (tmp_path / "examined" / "doctor_proof.png").exists()
     lines = result.out.splitlines()
+    about = f"{tmp_path / 'corner'}: scene=transforms, 10 photographs of {WIDTH} x {HEIGHT} ("
+    assert lines[0].startswith(f"capture  {about}")
+    assert json.loads((tmp_path / "examined" / "doctor.json").read_text())["capture"].startswith(about)
+    assert "training with model=fast_proposal takes about" in checks["memory"]["message"]
+    assert "model=auto chooses it, since the photographs show" in checks["memory"]["message"]
     assert sum(line.startswith(("ok ", "look ", "wrong ")) for line in lines) == len(checks)
     assert "0 wrong; 10 views examined in" in result.out
 

@@ -85,9 +85,13 @@ def assert_the_same_end(capture, folder, never_stopped, threads):
     assert process.returncode == 0, output
     assert "going on from step" in output
     assert_same_to_the_bit(state(folder), never_stopped)
-    steps = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("train/loss")]
+    steps = [
+        event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("Training loss/sum")
+    ]
     assert steps == list(range(5, STEPS + 1, 5)), "TensorBoard shows each step once"
-    validated = [event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("val/psnr")]
+    validated = [
+        event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("PSNR/validation")
+    ]
     assert len(set(validated)) == len(validated)
     # Killed between a save and the validation of the same step, it has lost that one.
     assert {14 * number for number in range(1, STEPS // 14)} - {killed_at} <= set(validated)

@@ -156,4 +156,4 @@ def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
         folder = run.parent
         assert (folder / "checkpoints/last.ckpt").is_file()
         assert (folder / ".hydra/config.yaml").is_file()
-        assert len(EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("test/psnr")) == 1
+        assert len(EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("PSNR/test")) == 1

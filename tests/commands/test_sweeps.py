@@ -74,6 +74,9 @@ def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, 
     assert f"{psnr[0]:.2f}" in output
     if launcher == "parallel":
         assert output.count(f"cpu, {max(1, len(os.sched_getaffinity(0)) // 2)} threads") == 2
+        for number in (0, 1):
+            assert f"[{number + 1}/2 seed={number}] test PSNR" in output
+            assert f"INFO  [{number + 1}/2 seed={number}] run folder" in output
 
 
 def test_jobs_side_by_side_have_the_cores_that_slurm_gave(monkeypatch):
@@ -169,6 +172,25 @@ def test_sigterm_stops_the_sweep_and_not_only_its_job(capture, tmp_path):
     assert code == 143, output
     assert [row["state"] for row in table(tmp_path)] == ["stopped"]
     assert not (tmp_path / "1_seed=1").exists()
+
+
+def test_a_sweep_that_is_refused_leaves_nothing(nerf, tmp_path):
+    words = ("train", "-m", "scene=transforms", "scene.root=nowhere", f"paths.root_dir={tmp_path}/outputs")
+    refused = nerf(*words, "model=nerf_tiny,nerf_small")
+    assert refused.code == 2
+    assert "2 of 2 jobs failed. 0_model=nerf_tiny, 1_model=nerf_small: The folder nowhere does not exist" in refused.err
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "own").mkdir()
+    assert nerf(*words, "seed=0,1", f"paths.output_dir={tmp_path}/own").code == 2
+    assert [path.name for path in tmp_path.rglob("*")] == ["own"], "what was there before stays"
+
+
+def test_a_learning_rate_below_zero_is_refused_before_anything_is_made(nerf, capture, tmp_path):
+    words = ("train", "scene=npz", f"scene.path={capture}", *QUICK, "trainer.max_steps=2")
+    refused = nerf(*words, "optimizer.lr=-1", f"paths.root_dir={tmp_path}/outputs")
+    assert refused.code == 2
+    assert "Invalid learning rate: -1" in refused.err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

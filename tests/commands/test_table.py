@@ -7,6 +7,7 @@ import statistics
 import pytest
 from support.measured_runs import PROTOCOL, leave_measured_run, ours
 from support.running import said
+from torch.utils.tensorboard import SummaryWriter
 
 
 def test_seeds_become_a_mean_and_a_deviation(table, tmp_path):
@@ -216,9 +217,69 @@ def test_nothing_to_show_is_said(nerf, table, tmp_path):
     said(nerf("table"), "runs has no value")
 
 
+def test_published_rows_and_ours_say_what_size_they_were_measured_at(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a", protocol={"resolution": [[200, 200]]})
+    result, rows = table()
+    assert [row["resolution"] for row in ours(rows)] == ["200 x 200"]
+    assert {row["resolution"] for row in rows if row["source"]} == {"800 x 800"}
+    assert "200 x 200" in result.out
+    assert "Zip-NeRF (published)" in result.out
+
+
+def test_pictures_of_several_sizes_are_counted(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a", protocol={"resolution": [[8, 6], [8, 9], [9, 9]]})
+    assert ours(table()[1])[0]["resolution"] == "8 x 6 and 2 more"
+
+
+def test_the_steps_of_a_run_that_never_finished_come_from_its_measurement(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a", origin={"step": 70}, finished_at_step=None)
+    assert ours(table()[1])[0]["steps"] == "70"
+
+
+def test_the_psnr_of_fitted_colours_has_a_column_where_it_was_measured(table, tmp_path):
+    run = leave_measured_run(tmp_path / "runs" / "a")
+    assert "cc PSNR" not in table()[1][0]
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(metrics | {"cc_psnr": 31.5}))
+    assert ours(table("sort=cc_psnr")[1])[0]["cc PSNR"] == "31.5"
+
+
+@pytest.mark.parametrize("width", [80, 100, 160])
+def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypatch, width):
+    for number in range(3):
+        overrides = tuple(f"model.levels.fine.a{key}.some_long_setting={number}" for key in range(6))
+        leave_measured_run(tmp_path / "runs" / str(number), 20.0, overrides=overrides)
+    monkeypatch.setenv("COLUMNS", str(width))
+    result, _rows = table()
+    lines = result.out.splitlines()
+    end = next(number for number, line in enumerate(lines) if line.startswith("For "))
+    assert max(map(len, lines[:end])) <= width
+    rule = next(number for number, line in enumerate(lines) if line.startswith("─"))
+    head = " ".join(lines[2:rule]).split()
+    assert {"model", "PSNR", "resolution", "some_long_setting"} <= set(head)
+    whole = ["scene", "model", "resolution", "PSNR", "curve", "time", "steps", "some_long_setting", "SSIM", "seeds"]
+    assert set(head) <= {*whole, *(f"a{key}." for key in range(6))}
+    assert f"a{head.count('some_long_setting')}.some_long_setting" in f"{lines[end]} a6.some_long_setting"
+
+
+def test_curves_stand_in_the_table_and_in_its_page(table, tmp_path):
+    run = leave_measured_run(tmp_path / "runs" / "a")
+    writer = SummaryWriter(str(run / "tensorboard"))
+    for step in range(10):
+        writer.add_scalar("train/psnr_fine", 10.0 + step, 50 * step)
+    writer.close()
+    leave_measured_run(tmp_path / "runs" / "b", origin={"config": "b"})
+    result, rows = table("published=false")
+    assert "▁▁▂▃▄▅▆▇██" in result.out
+    assert "curve" not in rows[0], "CSV holds numbers"
+    page = (tmp_path / "out" / "table.html").read_text()
+    assert page.count("<polyline") == 1
+    assert "▁" not in table("published=false", "curves=false")[0].out
+
+
 @pytest.mark.slow
 def test_a_real_run_is_a_row(nerf, finished_run, tmp_path):
-    result = nerf("table", finished_run, f"paths.output_dir={tmp_path}")
+    result = nerf("table", finished_run, f"out={tmp_path}")
     assert result.code == 0, result.err
     (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
     metrics = json.loads((finished_run / "metrics.json").read_text())

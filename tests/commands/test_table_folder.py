@@ -2,52 +2,30 @@
 
 import os
 import sys
-from pathlib import Path
 
 import pytest
 from support.measured_runs import leave_measured_run
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.runs.output_folder import folder_around
+
+FILES = {"table.csv", "table.html", "table.md"}
 
 
-def test_the_table_lies_in_the_folder_that_was_named(nerf, tmp_path):
+def test_files_are_written_only_where_they_are_asked_for(nerf, tmp_path, monkeypatch):
     leave_measured_run(tmp_path / "runs" / "a")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     assert nerf("table", tmp_path / "runs").code == 0
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"a", "table.csv", "table.md"}
-
-
-def test_the_table_of_several_folders_lies_beside_them_or_here(nerf, tmp_path, monkeypatch):
-    for place in ("runs/a", "runs/b", "elsewhere/c"):
-        leave_measured_run(tmp_path / place)
-    here = tmp_path / "here"
-    here.mkdir()
-    for folders, wanted in (
-        (("runs/a", "runs/b"), tmp_path / "runs"),
-        (("elsewhere", "elsewhere/c"), tmp_path / "elsewhere"),
-        (("runs/a", "elsewhere/c"), here),
-    ):
-        monkeypatch.chdir(here)
-        result = nerf("table", *(tmp_path / folder for folder in folders))
-        assert result.code == 0, result.err
-        assert (wanted / "table.csv").exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "here", "runs"]
-
-
-def test_a_way_around_names_the_same_folder():
-    runs = Path("runs").absolute()
-    assert folder_around([Path("runs/a"), Path("runs/a/../b")]) == runs
-    assert folder_around([Path("runs/a"), runs / "b"]) == runs
-    assert folder_around([Path("runs/../runs")]) == runs
-
-
-def test_no_table_lies_in_the_root():
-    assert folder_around([Path("/data"), Path("/runs")]) == Path()
-    assert folder_around([Path("/data/a"), Path("/home/b")]) == Path()
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["a"]
+    assert list((tmp_path / "here").iterdir()) == []
+    for out, wanted in (("out=tables", FILES), ("out=tables/own.csv", FILES | {"own.csv"})):
+        monkeypatch.chdir(tmp_path / "here")
+        assert nerf("table", tmp_path / "runs", out).code == 0
+        assert {path.name for path in (tmp_path / "here" / "tables").iterdir()} == wanted
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
-@pytest.mark.parametrize("name", [".table.{}.part.csv", ".table.{}.part.md", ".{}.probe", "table.md", "table.csv"])
+@pytest.mark.parametrize("name", [".table.{}.part.csv", ".table.{}.part.md", ".{}.probe", "table.md", "table.html"])
 def test_planted_links_are_not_written_through(nerf, tmp_path, name):
     victims = [tmp_path / "precious", tmp_path / "not_there"]
     victims[0].write_text("precious")
@@ -55,7 +33,7 @@ def test_planted_links_are_not_written_through(nerf, tmp_path, name):
         runs = tmp_path / f"runs_{victim.name}"
         leave_measured_run(runs / "a")
         (runs / name.format(os.getpid())).symlink_to(victim)
-        result = nerf("table", runs)
+        result = nerf("table", runs, f"out={runs}")
         assert result.code == 0, result.err
         assert (runs / "table.md").read_text().startswith("| scene")
         assert not (runs / "table.md").is_symlink()

@@ -17,6 +17,9 @@ def test_texts_of_strangers_stay_texts(table, tmp_path):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "<script>" not in text
     assert len(text.splitlines()) == 2 + len(names)
+    page = (tmp_path / "out" / "table.html").read_text()
+    assert "<script>alert" not in page
+    assert "\x1b" not in page
 
 
 DAMAGED = {

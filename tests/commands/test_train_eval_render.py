@@ -10,6 +10,7 @@ from support.captures import real_capture
 from support.running import FAST, said
 from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 
 def events(folder):
@@ -68,17 +69,27 @@ def test_tensorboard_has_scalars_pictures_config_and_a_row_of_hyper_parameters(f
     log = events(finished_run)
     tags = log.Tags()
     assert {
-        "train/loss",
-        "train/psnr_coarse",
-        "train/psnr_fine",
+        *("PSNR/train_coarse", "PSNR/train_fine", "PSNR/validation", "PSNR/test"),
+        *("Training loss/sum", "Training loss/coarse", "Training loss/fine"),
         "train/learning_rate",
         "speed/rays_per_second",
     } <= set(tags["scalars"])
-    assert {"val/psnr", "val/psnr_standard_error", "memory/resident_gigabytes", "test/psnr"} <= set(tags["scalars"])
-    assert [event.step for event in log.Scalars("train/loss")] == [5, 10, 15, 20]
-    assert {"validation/picture", "scene/cameras"} <= set(tags["images"])
+    assert {"val/psnr_standard_error", "memory/resident_gigabytes"} <= set(tags["scalars"])
+    assert [event.step for event in log.Scalars("Training loss/sum")] == [5, 10, 15, 20]
+    assert {"Pictures/validation", "Pictures/cameras"} <= set(tags["images"])
     assert "config/text_summary" in tags["tensors"]
-    assert "_hparams_/session_start_info" in log.summary_metadata
+    started = log.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    settings = HParamsPluginData.FromString(started).session_start_info.hparams
+    assert {"model", "scene", "seed", "trainer.max_steps"} <= set(settings)
+    assert len(settings) <= 15
+    assert "data.sample_budget" not in settings, "as by default"
+
+
+def test_tensorboard_opens_on_psnr_pictures_and_losses_and_ends_with_histograms(finished_run):
+    tags = events(finished_run).Tags()
+    groups = sorted({tag.partition("/")[0] for kind in ("scalars", "images", "histograms") for tag in tags[kind]})
+    assert groups[:3] == ["PSNR", "Pictures", "Training loss"]
+    assert groups[-2:] == ["weights_along_rays", "weights_per_ray"]
 
 
 def test_tensorboard_shows_what_lies_along_the_rays_of_each_level(finished_run):
@@ -86,9 +97,9 @@ def test_tensorboard_shows_what_lies_along_the_rays_of_each_level(finished_run):
     for level in ("coarse", "fine"):
         assert all(event.value > 0 for event in log.Scalars(f"gradients/norm_{level}"))
         assert [event.step for event in log.Scalars(f"rays/effective_samples_{level}")] == [10, 20]
-        for name in ("along_rays/weight", "per_ray/effective_samples"):
+        for name in ("weights_along_rays/weight", "weights_per_ray/effective_samples"):
             assert [event.step for event in log.Histograms(f"{name}_{level}")] == [10, 20], name
-        shares = log.Histograms(f"along_rays/weight_{level}")[-1].histogram_value
+        shares = log.Histograms(f"weights_along_rays/weight_{level}")[-1].histogram_value
         assert 0 < sum(shares.bucket) <= 1.0 + 1e-5
 
 

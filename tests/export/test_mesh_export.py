@@ -1,6 +1,7 @@
 """Meshes: the surface of known solids, in the user's frame, in every format; what cannot be meshed is refused."""
 
 import builtins
+import json
 import logging
 from dataclasses import replace
 from importlib import import_module
@@ -85,6 +86,43 @@ def test_a_ball_is_a_ball_in_every_format(tmp_path, format):
     clear = np.abs(mesh.vertices[:, 0]) > 0.2
     expected = np.where(mesh.vertices[:, :1] > 0, [[255, 0, 0]], [[0, 255, 0]])
     assert np.abs(colors - expected)[clear].max() <= 2
+
+
+def _glb_tree(path):
+    content = path.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    assert (content[:4], content[16:20]) == (b"glTF", b"JSON")
+    return json.loads(content[20 : 20 + length])
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
+def test_glb_has_y_up_and_the_others_keep_the_captures_frame(tmp_path, up):
+    """A ball whose upper half, as the photographer saw it, is red, and whose lower half is blue."""
+
+    def color(points):
+        return torch.where(points[..., 2:] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
+
+    to_user = similarity(upright_rotation(torch.tensor(up)).mT, torch.zeros(3), 1.0).float()
+    scene = record(to_user=to_user)
+    model = solid(ball(), color=color)
+    for format in ("ply", "obj"):
+        mesh = exported(tmp_path, model, scene, format=format, resolution=16)
+        height = mesh.vertices @ np.array(up)
+        red = colors_of(mesh)[:, 0] > 128
+        assert height[red].mean() > 0.2 > -0.2 > height[~red].mean()
+    exported(tmp_path, model, scene, format="glb", resolution=16)
+    # As glTF says: a node's matrix stands column by column, and is that of its parent times its own.
+    tree = _glb_tree(tmp_path / "mesh.glb")
+    (root,) = tree["scenes"][tree["scene"]]["nodes"]
+    matrix = np.array(tree["nodes"][root]["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(matrix[:3, :3] @ up, [0, 1, 0], atol=1e-6)
+    loaded = trimesh.load(tmp_path / "mesh.glb", process=False)
+    placed, name = loaded.graph[loaded.graph.nodes_geometry[0]]
+    height = trimesh.transform_points(loaded.geometry[name].vertices, placed)[:, 1]
+    red = colors_of(loaded.geometry[name])[:, 0] > 128
+    assert height[red].mean() > 0.2 > -0.2 > height[~red].mean()
 
 
 @pytest.mark.parametrize("colors", ["cameras", "normal"])

@@ -26,6 +26,7 @@ OURS = {
     "viewer/page.py": ["open"],
     "export/images.py": ["load"],
     "report/page.py": ["read_text"],
+    "report/table_page.py": ["read_text"],
     "runs/published.py": ["read_text"],
     "selftest/checks/files.py": ["read_text"],
     "machine.py": ["read_text", "read_text", "read_text"],

@@ -8,7 +8,8 @@ import yaml
 from nerf_lightning.runs.summary import read_run
 from nerf_lightning.runs.sweep_job import JobRecord, read_records
 from nerf_lightning.runs.sweep_table import job_rows
-from nerf_lightning.runs.table_files import print_rows, write_rows
+from nerf_lightning.runs.table_files import write_rows
+from nerf_lightning.runs.table_screen import print_rows
 
 
 def leave_run(folder, overrides, measured, ssim=0.5, **note):
@@ -79,7 +80,7 @@ def test_files_are_whole_and_the_text_is_short(tmp_path, capsys):
         "| 0 | 0.000125207 | 20.12 |  | a\\|b |",
         "| 1 | 1e-3 |  |  | c |",
     ]
-    print_rows(rows, "sweep of this test")
+    print_rows(rows, "sweep of this test", "")
     assert "0.000125207" in capsys.readouterr().out
 
 

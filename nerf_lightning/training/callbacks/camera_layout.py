@@ -6,6 +6,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
+from nerf_lightning.training.tensorboard import CAMERAS
 from nerf_lightning.visualization.camera_layout import layout_picture
 
 
@@ -17,4 +18,4 @@ class CameraLayout(Callback):
         if trainer.global_step == 1:
             for writer in tensorboard_writers(trainer.loggers):
                 picture = layout_picture(trainer.datamodule.scene)  # type: ignore[attr-defined]
-                writer.add_image("scene/cameras", picture.numpy(), 0, dataformats="HWC")
+                writer.add_image(CAMERAS, picture.numpy(), 0, dataformats="HWC")

@@ -1,5 +1,6 @@
 """What TensorBoard shows of a run besides its curves: the config as text, and a row in the hyper-parameter table."""
 
+from itertools import islice
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -7,11 +8,12 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.config.key_meanings import meaning_of, names_a_class
-from nerf_lightning.config.overrides import flatten
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
+from nerf_lightning.training.tensorboard import shown_name
 
-CHOICES = ("encoder", "experiment", "field", "model", "scene")
+MOST = 15
+"""Columns of the table of hyper-parameters: of more, nobody finds those that matter."""
 FINAL_METRICS = ("test/psnr", "test/ssim")
 
 
@@ -19,26 +21,30 @@ def describe_run(loggers: list[Logger], config: DictConfig) -> None:
     """Write the config and the hyper-parameters; their metrics are filled in by the scalars of the same names."""
     from torch.utils.tensorboard.summary import hparams
 
-    values = hyper_parameters(config)
+    values = hyper_parameters(config, list(HydraConfig.get().overrides.task))
     for writer in tensorboard_writers(loggers):
         text = OmegaConf.to_yaml(config, resolve=True)
         writer.add_text("config", "\n".join(f"    {for_terminal(line)}" for line in text.split("\n")), 0)
-        for summary in hparams(values, dict.fromkeys(FINAL_METRICS, 0.0)):
+        for summary in hparams(values, dict.fromkeys(map(shown_name, FINAL_METRICS), 0.0)):
             writer._get_file_writer().add_summary(summary)
 
 
-def hyper_parameters(config: DictConfig) -> dict[str, Any]:
-    """Return the settings by which runs differ, flat, as TensorBoard takes them."""
-    resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    assert isinstance(resolved, DictConfig)
-    compared = {key: value for key, value in flatten(resolved).items() if _is_compared(key)}
-    # TensorBoard sorts by name and shows the first few: what was chosen comes first.
-    chosen = {f"choice.{group}": HydraConfig.get().runtime.choices.get(group) for group in CHOICES}
-    return {name: str(choice) for name, choice in chosen.items()} | {
-        key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in compared.items()
-    }
+def hyper_parameters(config: DictConfig, given: list[str]) -> dict[str, Any]:
+    """Return scene, model and seed, and what else was given by which runs differ, as TensorBoard takes them.
+
+    Args:
+        config: all settings.
+        given: the overrides of the command line; what they leave alone is as by default.
+    """
+    choices = HydraConfig.get().runtime.choices
+    values = {"model": str(choices.get("model")), "scene": str(choices.get("scene")), "seed": config.get("seed")}
+    for key, _, text in (override.lstrip("+~").partition("=") for override in given):
+        if key not in values and _is_compared(key):
+            value = OmegaConf.select(config, key, default=text)
+            values[key] = value if isinstance(value, (bool, int, float, str)) else text
+    return dict(islice(values.items(), MOST))
 
 
 def _is_compared(key: str) -> bool:
-    meaning = meaning_of(key)
-    return (meaning.identity or meaning.learnt) and not names_a_class(key)
+    meaning = meaning_of(key.partition("@")[0])
+    return meaning.shown and (meaning.identity or meaning.learnt) and not names_a_class(key)

@@ -62,11 +62,12 @@ class Monitor(Watcher):
 
 
 def level_scalars(names: tuple[str, ...], losses: Tensor, pictures: tuple[str, ...]) -> dict[str, float]:
-    """Return the loss of each level, the PSNR of those whose loss is of a picture, and the sum that is minimised."""
+    """Return the loss of each of several levels, the PSNR where it is of a picture, and the sum that is minimised."""
     losses = losses.cpu()  # the device is read once
     values = {"train/loss": float(losses.sum())}
     for name, loss in zip(names, losses, strict=True):
-        values[f"train/loss_{name}"] = float(loss)
+        if len(names) > 1:  # else it is the sum
+            values[f"train/loss_{name}"] = float(loss)
         if name in pictures:
             values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
     return values

@@ -14,6 +14,7 @@ from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weig
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS, Watcher, tensorboard_writers
 from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.tensorboard import ALONG_RAYS, PER_RAY
 
 PARTS = 50
 
@@ -44,9 +45,9 @@ class RayHistograms(Watcher):
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:
-                write_shares(writer, f"along_rays/weight_{name}", along, step)
+                write_shares(writer, f"{ALONG_RAYS}_{name}", along, step)
                 if lit.numel():
-                    writer.add_histogram(f"per_ray/effective_samples_{name}", lit, step)
+                    writer.add_histogram(f"{PER_RAY}_{name}", lit, step)
                     writer.add_scalar(f"rays/effective_samples_{name}", lit.mean(), step)
 
 
