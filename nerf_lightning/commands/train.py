@@ -2,6 +2,7 @@
 
 import logging
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +41,20 @@ log = logging.getLogger(__name__)
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
     with preemptible():
-        return on_all_processes("train", config, train)
+        return on_all_processes("train", config, lambda config: train(config).psnr)
 
 
-def train(config: DictConfig) -> float | None:
-    """Train as the config says; return the PSNR.
+@dataclass(frozen=True)
+class Trained:
+    """What a training came to."""
+
+    folder: Path
+    psnr: float | None
+    """dB; of the test views, or the validation's where no evaluation follows."""
+
+
+def train(config: DictConfig) -> Trained:
+    """Train as the config says, in this process or as one of several.
 
     Raises:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
@@ -63,7 +73,7 @@ def train(config: DictConfig) -> float | None:
             psnr, last_step = _finish(parts, path, trainer), trainer.global_step
         for folder in held:
             folder.finish(last_step, psnr)
-        return psnr
+        return Trained(path, psnr)
     except SystemExit as stop:
         for folder in held:
             folder.stop(restarted=wants_restart(stop.code))
