@@ -8,7 +8,7 @@ from lightning.pytorch import LightningDataModule
 
 from nerf_lightning import ranks
 from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_device
-from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches
+from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, WholeViews
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import free_memory, require_memory
 from nerf_lightning.nerf.types.progress import Progress
@@ -118,6 +118,14 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> FixedRays:
         """Return the fixed validation rays."""
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
+
+    def test_dataloader(self) -> WholeViews:
+        """Return the test views, each a batch of height x width pixels."""
+        return WholeViews(self.scene, "test")
+
+    def predict_dataloader(self) -> WholeViews:
+        """Return the test views, to be rendered."""
+        return self.test_dataloader()
 
 
 def _require_room(name: str, rays: int) -> None:

@@ -258,14 +258,17 @@ class TrainStep:
                 backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
         return seen
 
-    def validate(self, batch: Batch, errors: RayErrors) -> None:
-        """Collect the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
+    def validate(self, batch: Batch, errors: RayErrors) -> Tensor:
+        """Collect and average the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
         background = background_colors(self.background, batch.num_rays, batch.weight.device, None)
         target, rays = blend(batch.rgba, background), self.rays(batch.pixels)
+        rgb = torch.empty_like(target)
         for tile in tiles(batch.num_rays, self._tile_rays(batch.num_rays)):
             behind = None if background is None else background[tile]
-            rendering = self.model(rays[tile], behind, random=None)[-1]
-            errors.add(rendering.rgb, target[tile], batch.weight[tile])
+            rgb[tile] = self.model(rays[tile], behind, random=None)[-1].rgb
+        errors.add(rgb, target, batch.weight)
+        error = (rgb - target).square().mean(dim=-1)
+        return (error * batch.weight).sum() / batch.weight.sum().clamp(min=1.0)
 
     def forget_measurements(self) -> None:
         """Undo what trial steps have left behind: gradients and counts, no weights."""
