@@ -74,6 +74,8 @@ class Parts(Run):
     num_steps: int
     signals: StopSignals
     callbacks: list[Callback]
+    loggers: dict[str, Any]
+    """What opens them in the run's folder."""
     finish: Finish
 
 
@@ -123,7 +125,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     """
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    finish = Finish.from_config(config)
+    finish, loggers = Finish.from_config(config), build(config.logger)
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
@@ -147,6 +149,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
         num_steps=num_steps,
         signals=signals,
         callbacks=callbacks,
+        loggers=loggers,
         finish=finish,
     )
 
