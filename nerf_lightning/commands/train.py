@@ -13,7 +13,8 @@ from omegaconf import DictConfig
 
 from nerf_lightning import ranks
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.console import say
+from nerf_lightning.config.tree import print_tree
+from nerf_lightning.console import StdoutConsole, say
 from nerf_lightning.errors import InputError
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
@@ -31,6 +32,7 @@ from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.loggers import opened_loggers
 from nerf_lightning.training.memory_plan import announce_memory
+from nerf_lightning.training.profile_table import profile_lines
 from nerf_lightning.training.tile_size import measured_tile
 
 MOST_VIDEO_BYTES = 20_000_000
@@ -64,6 +66,8 @@ def train(config: DictConfig) -> Trained:
     hydra = HydraConfig.get()
     parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
     asked, config = config, parts.config
+    if config.print_config and ranks.is_first():
+        print_tree(config, StdoutConsole())
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, asked, parts.num_steps, held))
@@ -126,12 +130,19 @@ def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[L
         describe_run(trainer.loggers, parts.config)
     checkpoint = None if former is None else former.checkpoint
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
-    for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
-        log.info("profile: %s", profile)
+    _show_profile(trainer, folder)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
         raise SystemExit(128 + parts.signals.received)
     return trainer
+
+
+def _show_profile(trainer: Trainer, folder: Path) -> None:
+    lines = profile_lines(trainer) if ranks.is_first() else []
+    if lines:
+        say(*lines)
+    for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
+        log.info("profile: %s", profile)
 
 
 def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:

@@ -216,4 +216,5 @@ def build_step(
         clip_norm=settings.clip_norm,
         sample_budget=config.data.sample_budget,
         start_weights=None if start is None else start.weights,
+        jitter=config.data.overfit_views is None,
     )
