@@ -76,7 +76,7 @@ def test_the_example_of_the_surface_reads_trains_loads_and_renders(tmp_path):
     ):
         assert example.count(given) == 1
         example = example.replace(given, instead)
-    process = start_code(example.replace("num_frames=2", "num_frames=2, width=4"), cwd=tmp_path)
+    process = start_code(example.replace("num_frames=2)", "num_frames=2, width=4)"), cwd=tmp_path)
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     assert output.splitlines()[-1] == "torch.Size([8, 8, 3]) torch.Size([8, 8]) torch.Size([8, 8])"
