@@ -1,6 +1,7 @@
 """nerf_lightning: learn a radiance field from photographs with known cameras, and render new views.
 
-From a notebook: `build_run`, `RadianceFieldSystem` and `RayDataModule` are here, loaded when they are asked for.
+From Python: `read` a capture, `load` a trained model, `train` one; with Lightning's own Trainer: `build_run`,
+`RadianceFieldSystem` and `RayDataModule`. They are loaded when they are asked for; `__init__.pyi` has their types.
 """
 
 import importlib
@@ -9,9 +10,18 @@ from typing import Any
 __version__ = "0.1.0"
 
 _OFFERED = {
+    "Cameras": "nerf_lightning.nerf.types.scene",
+    "InputError": "nerf_lightning.errors",
+    "Picture": "nerf_lightning.nerf.models.render_image",
     "RadianceFieldSystem": "nerf_lightning.training.system",
     "RayDataModule": "nerf_lightning.data.datamodule",
+    "Scene": "nerf_lightning.nerf.types.scene",
+    "TrainedModel": "nerf_lightning.notebook.trained_model",
+    "TrainedRun": "nerf_lightning.notebook.trained_run",
     "build_run": "nerf_lightning.training.build",
+    "load": "nerf_lightning.notebook.trained_model",
+    "read": "nerf_lightning.notebook.captures",
+    "train": "nerf_lightning.notebook.trained_run",
 }
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from support.captures import write_npz
-from support.running import start_code
+from support.captures import write_blender, write_npz
+from support.running import FAST, start_code
 
 from nerf_lightning.cli.completion import completion
 from nerf_lightning.cli.help import help_on_anything
@@ -63,6 +63,23 @@ def test_the_notebooks_example_trains_resumes_and_renders(tmp_path):
     assert steps == "5 0"
     assert "Warning" not in errors
     assert list((tmp_path / "outputs" / "notebook").rglob("*.ckpt"))
+
+
+def test_the_example_of_the_surface_reads_trains_loads_and_renders(tmp_path):
+    (example,) = [block for block in python_blocks("python.md") if "nl.train" in block]
+    capture = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
+    small = ", ".join(f'"{each}"' for each in (*FAST, "final.video=false"))
+    for given, instead in (
+        ('"data/fox", downscale=2', f'"{capture}"'),
+        ("data/fox", str(capture)),
+        ('"scene.downscale=2", "trainer.max_steps=800"', small),
+    ):
+        assert example.count(given) == 1
+        example = example.replace(given, instead)
+    process = start_code(example.replace("num_frames=2)", "num_frames=2, width=4)"), cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert output.splitlines()[-1] == "torch.Size([8, 8, 3]) torch.Size([8, 8]) torch.Size([8, 8])"
 
 
 def test_the_eight_lines_of_an_encoder_are_an_encoder():

@@ -114,7 +114,13 @@ def checkpoint(resumable: bool) -> Record:
         ),
         "lr_schedulers": Many(Plain(), 0),
     }
-    return Record(use | run) if resumable else Record(use, run)
+    # What `save_hyperparameters` of somebody's subclass adds; nothing here reads it.
+    of_subclasses: dict[str, Description] = {
+        "hyper_parameters": Named(name, Plain(most=100_000, tensors=True), 1000),
+        "hparams_name": name,
+        "hparams_type": name,
+    }
+    return Record(use | run, of_subclasses) if resumable else Record(use, run | of_subclasses)
 
 
 def require_checkpoint(content: object, resumable: bool) -> None:

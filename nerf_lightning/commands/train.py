@@ -1,9 +1,10 @@
 """Learn a radiance field from photographs with known cameras."""
 
 import logging
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Trainer
@@ -11,9 +12,9 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
 from nerf_lightning import ranks
-from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.console import say
+from nerf_lightning.config.tree import print_tree
+from nerf_lightning.console import StdoutConsole, say
 from nerf_lightning.errors import InputError
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
@@ -21,6 +22,7 @@ from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.runs.saved_overrides import to_give_again
+from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.build import Parts, build_parts
 from nerf_lightning.training.callbacks.folder_guard import require_run
 from nerf_lightning.training.callbacks.hparams import describe_run
@@ -28,7 +30,9 @@ from nerf_lightning.training.callbacks.watcher import errors_told_once
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 from nerf_lightning.training.launch.processes import on_all_processes
+from nerf_lightning.training.loggers import opened_loggers
 from nerf_lightning.training.memory_plan import announce_memory
+from nerf_lightning.training.profile_table import profile_lines
 from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
 
 MOST_VIDEO_BYTES = 20_000_000
@@ -40,11 +44,20 @@ log = logging.getLogger(__name__)
 def run(config: DictConfig) -> float | None:
     """Train, and return the test PSNR (the validation's where no evaluation follows), which sweepers may maximise."""
     with preemptible():
-        return on_all_processes("train", config, train)
+        return on_all_processes("train", config, lambda config: train(config).psnr)
 
 
-def train(config: DictConfig) -> float | None:
-    """Train as the config says; return the PSNR.
+@dataclass(frozen=True)
+class Trained:
+    """What a training came to."""
+
+    folder: Path
+    psnr: float | None
+    """dB; of the test views, or the validation's where no evaluation follows."""
+
+
+def train(config: DictConfig) -> Trained:
+    """Train as the config says, in this process or as one of several.
 
     Raises:
         SystemExit: a signal stopped the run (128 + signal), so that a sweep stops too.
@@ -53,17 +66,23 @@ def train(config: DictConfig) -> float | None:
     hydra = HydraConfig.get()
     parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
     asked, config = config, parts.config
+    if config.print_config and ranks.is_first():
+        print_tree(config, StdoutConsole())
     held: list[RunFolder] = []
     try:
         path, former = ranks.from_first(lambda: _take_folder(config, asked, parts.num_steps, held))
-        with errors_told_once(), log_file(path) if ranks.is_first() else nullcontext():
-            trainer = _fit(config, parts, path, former)
+        with (
+            errors_told_once(),
+            log_file(path) if ranks.is_first() else nullcontext(),
+            _loggers(parts, path, former) as loggers,
+        ):
+            trainer = _fit(parts, path, former, loggers)
             for folder in held:
                 folder.trained()
             psnr, last_step = _finish(parts, path, trainer), trainer.global_step
         for folder in held:
             folder.finish(last_step, psnr)
-        return psnr
+        return Trained(path, psnr)
     except SystemExit as stop:
         for folder in held:
             folder.stop(restarted=wants_restart(stop.code))
@@ -87,7 +106,7 @@ def _take_folder(
     return folder.path, folder.resume_point()
 
 
-def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | None) -> Trainer:
+def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[Logger]) -> Trainer:
     step = parts.system.step
     if former is not None:
         log.info("going on from step %d of %s", former.step, folder)
@@ -104,20 +123,27 @@ def _fit(config: DictConfig, parts: Parts, folder: Path, former: ResumePoint | N
         announce_memory(parts.settings, step, parts.data)
     if parts.settings.compile:
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
-    trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, _loggers(config, folder, former))
+    trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, loggers)
     _announce(parts, folder, former)
     if former is None and parts.config.resume == "auto":
         log.info("resume=auto: there is no unfinished run of this config to go on with; this one begins anew")
     if former is None:
-        describe_run(trainer.loggers, config)
+        describe_run(trainer.loggers, parts.config)
     checkpoint = None if former is None else former.checkpoint
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
-    for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
-        log.info("profile: %s", profile)
+    _show_profile(trainer, folder)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
         raise SystemExit(128 + parts.signals.received)
     return trainer
+
+
+def _show_profile(trainer: Trainer, folder: Path) -> None:
+    lines = profile_lines(trainer) if ranks.is_first() else []
+    if lines:
+        say(*lines)
+    for profile in sorted(folder.glob(f"fit-{PROFILE}*.txt")):
+        log.info("profile: %s", profile)
 
 
 def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
@@ -150,14 +176,15 @@ def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
     )
 
 
-def _loggers(config: DictConfig, folder: Path, former: ResumePoint | None) -> list[Logger]:
-    if not ranks.is_first():
-        return []
-    purge: dict[str, Any] = {}
+@contextmanager
+def _loggers(parts: Parts, folder: Path, former: ResumePoint | None) -> Iterator[list[Logger]]:
+    purge: dict[str, int] = {}
     if (folder / "tensorboard").exists():
         # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
         purge = {"purge_step": 0 if former is None else former.step + 1}
-    return [partial(save_dir=folder, **purge) for partial in build(config.logger).values()]
+    started = str(read_note(folder).get("started"))
+    with opened_loggers(parts.loggers if ranks.is_first() else {}, folder, started, **purge) as loggers:
+        yield loggers
 
 
 def _resume_command(folder: Path) -> str:

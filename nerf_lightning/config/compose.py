@@ -6,12 +6,12 @@ from typing import Any
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config.instantiate import require_sections
-from nerf_lightning.config.messages import paragraph
-from nerf_lightning.errors import InputError
+from nerf_lightning.config.messages import in_words
 from nerf_lightning.files.folders import conf_folder
 
 
@@ -21,21 +21,40 @@ def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, 
     Raises:
         InputError: an override that cannot be read, or names what is not there.
     """
+    config = _composed(command, overrides)
+    choices = chosen(config.hydra.runtime.choices)
+    with open_dict(config):
+        del config["hydra"]
+    return config, choices
+
+
+@contextmanager
+def composed_job(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
+    """Let a command's work be done here: its config, and Hydra's own where the command looks for it.
+
+    Raises:
+        InputError: as `compose_config`.
+    """
+    config = _composed(command, overrides)
+    job = HydraConfig.instance()
+    former = job.cfg
+    job.set_config(config)
     try:
-        with _hydra():
-            config = compose(command, overrides=list(overrides), return_hydra_config=True)
-        choices = chosen(config.hydra.runtime.choices)
         with open_dict(config):
             del config["hydra"]
+        yield config
+    finally:
+        job.cfg = former
+
+
+def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
+    """Return a command's config with Hydra's own."""
+    with in_words(command), _hydra():
+        config = compose(command, overrides=list(overrides), return_hydra_config=True)
         primary = OmegaConf.load(conf_folder() / f"{command}.yaml")
         assert isinstance(primary, DictConfig)
         require_sections(config, primary)
-    except Exception as error:
-        message = paragraph(error, command)
-        if message is None:
-            raise
-        raise InputError(message) from error
-    return config, choices
+    return config
 
 
 def chosen(choices: Mapping[str, Any]) -> dict[str, str]:

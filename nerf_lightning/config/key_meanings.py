@@ -115,7 +115,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         budget.seconds trainer.clip_norm
         data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
-        data.device_budget data.prefetch
+        data.device_budget data.prefetch data.overfit_views
         scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
         scene.images scene.masks scene.masks_keep scene.file scene.frames scene.hold_every scene.train_fraction
         scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
@@ -158,7 +158,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """,
     ),
     (CURVE, "path.**"),
-    (ONE_START, "resume paths.** sweep.** viewer.** budgets.**"),
+    (ONE_START, "resume print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
     (SWEEP_NUMBER, "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
     (SWEEP_WORD, "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction"),
@@ -186,7 +186,19 @@ THE_REST = {
 }
 
 CHOSEN_GROUPS = (
-    *("callbacks", "correction", "data", "encoder", "evaluation", "experiment", "field", "logger", "loss", "model"),
+    *(
+        "callbacks",
+        "correction",
+        "data",
+        "debug",
+        "encoder",
+        "evaluation",
+        "experiment",
+        "field",
+        "logger",
+        "loss",
+        "model",
+    ),
     *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
 """Groups of conf/ of which a file may choose an option by its name."""

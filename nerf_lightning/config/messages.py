@@ -2,6 +2,8 @@
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from traceback import extract_tb
 
@@ -15,6 +17,25 @@ from nerf_lightning.errors import InputError
 ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
+
+
+@contextmanager
+def in_words(command: str) -> Iterator[None]:
+    """Let whatever bad input causes leave as an InputError with its one paragraph.
+
+    Args:
+        command: whose settings these are, for the hints.
+
+    Raises:
+        InputError: in the place of what was raised; any other error passes.
+    """
+    try:
+        yield
+    except Exception as error:
+        message = None if isinstance(error, InputError) else paragraph(error, command)
+        if message is None:
+            raise
+        raise InputError(message) from error
 
 
 def paragraph(error: BaseException, command: str) -> str | None:

@@ -1,5 +1,6 @@
 """Values as they are written on the command line, for Hydra and for the shell."""
 
+import os
 import re
 import shlex
 from collections.abc import Iterable
@@ -15,13 +16,17 @@ OPEN_SECTIONS = re.compile(r"trainer\.lightning[.=]")
 
 
 def quoted(value: Any) -> str:
-    """Return a plain value as Hydra reads it back.
+    """Return a plain value, a path or a list of them as Hydra reads it back.
 
-    >>> quoted("it's"), quoted(None), quoted(True)
-    ("'it\\\\'s'", 'null', 'true')
+    >>> quoted("it's"), quoted(None), quoted([True, 2])
+    ("'it\\\\'s'", 'null', '[true,2]')
     """
     if value is None:
         return "null"
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(quoted, value))}]"
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
     if isinstance(value, str):
         # OmegaConf takes ${ for an interpolation, and backslashes before it for escapes; elsewhere they are plain.
         text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)

@@ -1,6 +1,7 @@
 """The LightningDataModule: flattens every picture of a scene into ray batches."""
 
 import logging
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -8,9 +9,10 @@ from lightning.pytorch import LightningDataModule
 
 from nerf_lightning import ranks
 from nerf_lightning.data.pixels.placement import budget_bytes, num_bytes, on_device
-from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches
+from nerf_lightning.data.ray_batches import BATCH_SIZES, FixedRays, RayBatches, WholeViews
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import free_memory, require_memory
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -40,6 +42,8 @@ class RayDataModule(LightningDataModule):
             help: pixels on the host and the model on a GPU, or a mapped file that memory cannot hold. The
             batches are the same.
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
+        overfit_views: train on so many of the photographs, spread over all, without jitter, and validate on the same,
+            to see whether a model can learn anything at all; None: as always.
     """
 
     def __init__(
@@ -56,6 +60,7 @@ class RayDataModule(LightningDataModule):
         device_budget: int | float | Literal["auto"] = "auto",
         prefetch: bool | Literal["auto"] = "auto",
         patch: int = 1,
+        overfit_views: int | None = None,
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
@@ -83,6 +88,8 @@ class RayDataModule(LightningDataModule):
         for split in ("train", "val"):
             if not scene.splits.get(split):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
+        if overfit_views is not None:
+            scene = _few_views(scene, overfit_views)
         self.scene = scene
         self.batches = RayBatches(scene, progress, seed, batch_rays, patch)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
@@ -118,6 +125,22 @@ class RayDataModule(LightningDataModule):
     def val_dataloader(self) -> FixedRays:
         """Return the fixed validation rays."""
         return FixedRays(self.scene, "val", self.val_rays, self.batches.batch_rays)
+
+    def test_dataloader(self) -> WholeViews:
+        """Return the test views, each a batch of height x width pixels."""
+        return WholeViews(self.scene, "test")
+
+    def predict_dataloader(self) -> WholeViews:
+        """Return the test views, to be rendered."""
+        return self.test_dataloader()
+
+
+def _few_views(scene: Scene, count: int) -> Scene:
+    """Return the scene with a few training views, which are validated on as well; the test views stay."""
+    if count < 1:
+        raise InputError(f"data.overfit_views={count}: give at least one photograph, or null for a training on all.")
+    few = tuple(evenly_spaced_subset(scene.splits["train"], count))
+    return replace(scene, splits=scene.splits | {"train": few, "val": few})
 
 
 def _require_room(name: str, rays: int) -> None:

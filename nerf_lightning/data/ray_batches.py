@@ -14,6 +14,7 @@ from torch import Tensor
 from nerf_lightning import ranks
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex
@@ -239,6 +240,27 @@ class FixedRays:
 
     def __iter__(self) -> Iterator[Batch]:
         return (gather_batch(self.scene, pixels) for pixels in self.chunks)
+
+
+class WholeViews:
+    """The loader of tests and predictions: each view of a split as one batch, shaped as its picture.
+
+    Where a run has several processes, they take turns.
+
+    Args:
+        scene: where the pixels come from.
+        split: which views.
+    """
+
+    def __init__(self, scene: Scene, split: str):
+        self.scene = scene
+        self.views = ranks.every_other(scene.splits.get(split, ()))
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return (gather_batch(self.scene, all_pixels(self.scene.cameras, view)) for view in self.views)
 
 
 Place = tuple[int, int, int]

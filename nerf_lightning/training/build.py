@@ -20,6 +20,7 @@ from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import require_sound
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.refinements.base import Refinement
@@ -74,16 +75,21 @@ class Parts(Run):
     num_steps: int
     signals: StopSignals
     callbacks: list[Callback]
+    loggers: dict[str, Any]
+    """What opens them in the run's folder."""
     finish: Finish
 
 
-def build_run(*overrides: str) -> Run:
+def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = None) -> Run:
     """Build what `nerf train OVERRIDES` trains, for `Trainer.fit(run.system, run.data)`; nothing is written.
 
     Its weights are functions of the seed. A run is fitted once; to go on from a checkpoint, another is built.
 
     Args:
         *overrides: as on the command line, like "scene=bricks" and "model=nerf_tiny".
+        model: one of your own in the place of the config's; its weights are drawn anew from the seed. A checkpoint of
+            it is opened by whoever builds it again, as here, with `ckpt_path`, and not by the commands.
+        loss: one of your own in the place of the config's.
 
     Raises:
         InputError: anything in the settings or in the capture that makes no run, or a setting of Lightning's Trainer.
@@ -96,7 +102,7 @@ def build_run(*overrides: str) -> Run:
     scene: Scene = build(config.scene).read()
     config, choices = settled(config, choices, overrides, scene)
     config, choices = corrected(config, choices, overrides, checks=None)
-    run = _run(config, choices, settings, scene)
+    run = _run(config, choices, settings, scene, {"model": model, "loss": loss})
     settings.prepare(run.system.model)
     run.system.record["precision"] = settings.precision
     return run
@@ -123,7 +129,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     """
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    finish = Finish.from_config(config)
+    finish, loggers = Finish.from_config(config), build(config.logger)
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
@@ -147,18 +153,25 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
         num_steps=num_steps,
         signals=signals,
         callbacks=callbacks,
+        loggers=loggers,
         finish=finish,
     )
 
 
-def _run(config: DictConfig, choices: Mapping[str, Any], settings: TrainerSettings, scene: Scene) -> Run:
+def _run(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    settings: TrainerSettings,
+    scene: Scene,
+    own: Mapping[str, Any] | None = None,
+) -> Run:
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
     progress = Progress()
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
-    step = build_step(config, settings, scene, progress, start)
+    step = build_step(config, settings, scene, progress, start, own)
     if start is not None:
         log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
@@ -175,9 +188,22 @@ def _chosen_callbacks(config: DictConfig) -> list[Callback]:
 
 
 def build_step(
-    config: DictConfig, settings: TrainerSettings, scene: Scene, progress: Progress, start: Checkpoint | None = None
+    config: DictConfig,
+    settings: TrainerSettings,
+    scene: Scene,
+    progress: Progress,
+    start: Checkpoint | None = None,
+    own: Mapping[str, Any] | None = None,
 ) -> TrainStep:
     """Build model, cameras, loss, correction, optimizer and schedule into the step of training.
+
+    Args:
+        config: of the run.
+        settings: of the machine.
+        scene: what is learnt.
+        progress: the run's place.
+        start: the checkpoint whose weights it begins with.
+        own: `model` and `loss` in the place of the config's, where they are not None.
 
     Raises:
         InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
@@ -185,7 +211,8 @@ def build_step(
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
-    model: Model = build(config.model)
+    parts = {name: part for name, part in (own or {}).items() if part is not None}
+    model: Model = parts["model"] if "model" in parts else build(config.model)
     refinement: Refinement = build(config.refinement)
     refinement.fit_to(scene)
     scene = replace(scene, refined=refinement.moves())
@@ -202,7 +229,7 @@ def build_step(
     return TrainStep(
         model=model,
         rays=RayGenerator(scene.cameras, scene.near, scene.far, refinement),
-        loss=build(config.loss),
+        loss=parts["loss"] if "loss" in parts else build(config.loss),
         correction=correction,
         optimizer=optimizer,
         schedule=build(config.scheduler),
@@ -213,4 +240,5 @@ def build_step(
         clip_norm=settings.clip_norm,
         sample_budget=config.data.sample_budget,
         start_weights=None if start is None else start.weights,
+        jitter=config.data.overfit_views is None,
     )

@@ -77,6 +77,8 @@ class TrainStep:
         start_weights: the model's state to start from; None draws weights, a function of (seed, attempt).
         num_steps: the length of the run, which the schedule follows; None: the trainer that runs it says so.
         correction: what photographs make of the rendered colours; None leaves them alone.
+        jitter: False: samples lie in the middles of their intervals and one background is behind all rays, as at
+            evaluation, so that steps differ in their pixels alone.
 
     Raises:
         InputError: a model that cannot be cut into tiles.
@@ -98,6 +100,7 @@ class TrainStep:
         start_weights: dict[str, Tensor] | None = None,
         num_steps: int | None = None,
         correction: Correction | None = None,
+        jitter: bool = True,
     ):
         self.model, self.rays, self.loss = model, rays, loss
         self.correction = NoCorrection() if correction is None else correction
@@ -105,7 +108,7 @@ class TrainStep:
         self.progress, self.num_steps, self.seed = progress, num_steps, seed
         self.background = background
         self.tile_points, self.clip_norm = tile_points, clip_norm
-        self.sample_budget = sample_budget
+        self.sample_budget, self.jitter = sample_budget, jitter
         self.start_weights = start_weights
         self.guard = StepGuard()
         if tile_points is not None and model.needs_whole_batch:
@@ -258,14 +261,17 @@ class TrainStep:
                 backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
         return seen
 
-    def validate(self, batch: Batch, errors: RayErrors) -> None:
-        """Collect the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
+    def validate(self, batch: Batch, errors: RayErrors) -> Tensor:
+        """Collect and average the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
         background = background_colors(self.background, batch.num_rays, batch.weight.device, None)
         target, rays = blend(batch.rgba, background), self.rays(batch.pixels)
+        rgb = torch.empty_like(target)
         for tile in tiles(batch.num_rays, self._tile_rays(batch.num_rays)):
             behind = None if background is None else background[tile]
-            rendering = self.model(rays[tile], behind, random=None)[-1]
-            errors.add(rendering.rgb, target[tile], batch.weight[tile])
+            rgb[tile] = self.model(rays[tile], behind, random=None)[-1].rgb
+        errors.add(rgb, target, batch.weight)
+        error = (rgb - target).square().mean(dim=-1)
+        return (error * batch.weight).sum() / batch.weight.sum().clamp(min=1.0)
 
     def forget_measurements(self) -> None:
         """Undo what trial steps have left behind: gradients and counts, no weights."""
@@ -294,7 +300,7 @@ class TrainStep:
     def _in_tiles(self, batch: Batch, backward: Backward, share: Share) -> dict[str, Tensor]:
         num_rays, device = batch.num_rays, batch.weight.device
         key = fold(self.seed, self.progress.attempt, self.progress.step)
-        random = batch_random(key, num_rays, device, share.first)
+        random = batch_random(key, num_rays, device, share.first) if self.jitter else None
         behind = background_colors(self.background, num_rays, device, random)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
@@ -304,7 +310,8 @@ class TrainStep:
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
             rays = replace(self.rays(pixels), photograph=pixels.view)
-            renderings = self.model(rays, None if behind is None else behind[tile], random[tile])
+            numbers = None if random is None else random[tile]
+            renderings = self.model(rays, None if behind is None else behind[tile], numbers)
             shown = [self.correction.photographed(each, pixels) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile])))
             levels = levels * ((tile.stop - tile.start) / share.num_rays)

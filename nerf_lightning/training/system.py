@@ -7,6 +7,8 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor
 from torch.optim import Optimizer
 
 from nerf_lightning import ranks
@@ -14,10 +16,14 @@ from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
 from nerf_lightning.errors import InputError
-from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, psnr
+from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
+from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
+from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
 from nerf_lightning.training.launch.devices import use_threads
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.open_checkpoint import rendering_step
@@ -70,24 +76,68 @@ class RadianceFieldSystem(LightningModule):
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
-        """Take one step, and return what it saw."""
+        """Take one step, and return what it saw, with the sum of the levels' losses as `loss`.
+
+        Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
+        """
         watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
-        return self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
+        seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
+        loss = seen["losses"].sum()
+        if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
+            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["losses"][-1])}, prog_bar=True)
+        return seen | {"loss": loss}
 
     def monitors(self) -> list[Monitor]:
         """Return the callbacks that log scalars."""
         return [each for each in self.trainer.callbacks if isinstance(each, Monitor)]  # type: ignore[attr-defined]
 
-    def validation_step(self, batch: Batch, batch_index: int) -> None:
-        """Collect the squared error of fixed rays."""
-        self.step.validate(batch, self.val_errors)
+    def validation_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
+        """Collect the squared error of fixed rays; return its mean over the batch as `loss`, and the `psnr` (dB)."""
+        loss = self.step.validate(batch, self.val_errors)
+        return {"loss": loss, "psnr": psnr(loss)}
 
     def on_validation_epoch_end(self) -> None:
-        """Log the PSNR of the fixed rays; straight to the loggers, since Lightning would count the step before."""
-        values = self.val_errors.summary()
-        self.log("val/psnr", values["val/psnr"], logger=False, sync_dist=True)
-        for logger in [] if self.trainer.sanity_checking else self.trainer.loggers:
+        """Log loss and PSNR (dB) of the fixed rays.
+
+        While it fits they go straight to the loggers, since Lightning would count the step before.
+        """
+        values, fits = self.val_errors.summary(), self.trainer.state.fn == TrainerFn.FITTING
+        shown = {"val/psnr": values["val/psnr"], "val/loss": 10.0 ** (-values["val/psnr"] / 10.0)}
+        self.log_dict(shown, prog_bar=True, logger=False if fits else None, sync_dist=True)
+        for logger in self.trainer.loggers if fits and not self.trainer.sanity_checking else []:
             logger.log_metrics(values, self.trainer.global_step)
+
+    def test_step(self, batch: Batch, batch_index: int) -> dict[str, float]:
+        """Compare a whole view with its photograph, and return and log `psnr`, `cc_psnr` (dB) and `ssim`.
+
+        The means over the views, `test/psnr` and so on, are those of `nerf eval`, which looks at more: geometry, LPIPS,
+        and, where cameras were learnt, how those of the test views have to move.
+
+        Raises:
+            InputError: the batch is no whole view.
+        """
+        picture = self.predict_step(batch, batch_index)
+        behind = background_colors(self.step.background, 1, torch.device("cpu"), random=None)
+        kept = batch.weight.cpu() > 0
+        values = image_metrics(picture.rgb, blend(batch.rgba.cpu(), behind), None if bool(kept.all()) else kept)
+        known = {name: value for name, value in values.items() if value is not None}
+        self.log_dict({f"test/{name}": value for name, value in known.items()}, batch_size=1, sync_dist=True)
+        return known
+
+    def predict_step(self, batch: Batch, batch_index: int) -> Picture:
+        """Render a whole view: colour, depth in scene units, opacity.
+
+        Raises:
+            InputError: the batch is no whole view.
+        """
+        if batch.weight.dim() != 2:
+            raise InputError(
+                "Tests and predictions are of whole views, and these are single rays: give Trainer.test and "
+                "Trainer.predict datamodule=run.data, or its test_dataloader()."
+            )
+        view = int(batch.pixels.view[0, 0])
+        tile_points = self.step.tile_points or WHOLE_BATCH_POINTS
+        return render_picture(self.model, self.rays, view, self.step.background, tile_points)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what makes the file self-contained, and the run's state beyond weights and optimizer.

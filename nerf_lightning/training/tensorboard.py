@@ -11,11 +11,12 @@ GROUPS = (
     ("test/psnr", "PSNR/test"),
     ("train/loss_", "Training loss/"),
     ("train/loss", "Training loss/sum"),
+    ("validation/picture", "Pictures/validation"),
+    ("scene/cameras", "Pictures/cameras"),
 )
 """Beginnings of names and their places. Between PSNR and losses stand the pictures, and histograms come last."""
-PICTURE, CAMERAS = "Pictures/validation", "Pictures/cameras"
 ALONG_RAYS, PER_RAY = "weights_along_rays/weight", "weights_per_ray/effective_samples"
-WHOLE = ("val/psnr", "test/psnr", "train/loss")
+WHOLE = ("val/psnr", "test/psnr", "train/loss", "validation/picture", "scene/cameras")
 """Names that are no beginnings of others."""
 
 
@@ -40,7 +41,7 @@ class OrderedTensorBoard(TensorBoardLogger):
 
 
 def shown_name(name: str) -> str:
-    """Return where TensorBoard shows a scalar.
+    """Return where TensorBoard shows a scalar or a picture.
 
     >>> [shown_name(name) for name in ("val/psnr", "val/psnr_standard_error", "train/loss_fine", "speed/rays_per_step")]
     ['PSNR/validation', 'val/psnr_standard_error', 'Training loss/fine', 'speed/rays_per_step']

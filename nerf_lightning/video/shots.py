@@ -126,21 +126,17 @@ def make_shots(
         if near is not None or crop is not None:
             box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
             clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
-        near_end, far_end = near_and_far_from(held.c2w[:, :, 3], scene)
         _check_outside(held, clip)
-        _check_near(scene, clip, far_end)
-        shots.append(
-            Shot(
-                subject=subject,
-                cameras=_bent(held, scene),
-                seen_from=moved if hold_camera else None,
-                near=near_end,
-                far=far_end,
-                clip=clip,
-                tile_points=tile_points,
-            )
-        )
+        shot = shot_of(subject, held, tile_points)
+        _check_near(scene, clip, shot.far)
+        shots.append(replace(shot, seen_from=moved if hold_camera else None, clip=clip))
     return shots
+
+
+def shot_of(subject: Subject, cameras: Cameras, tile_points: int) -> Shot:
+    """Return what cameras in a model's frame see of it."""
+    near, far = near_and_far_from(cameras.c2w[:, :, 3], subject.scene)
+    return Shot(subject, _bent(cameras, subject.scene), None, near, far, clip=None, tile_points=tile_points)
 
 
 def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from lightning.pytorch.trainer.states import TrainerFn, TrainerState
 from support.scenes import ball_scene
 from support.steps import make_step
 
@@ -21,8 +22,9 @@ def test_validation_has_no_jitter():
     system = RadianceFieldSystem(make_step(None), {})
     logged = {}
     logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
-    system._trainer = type("T", (), {"loggers": [logger], "global_step": 3, "sanity_checking": False})()
-    system.log = lambda name, value, **options: None
+    fits = {"state": TrainerState(fn=TrainerFn.FITTING), "loggers": [logger], "global_step": 3}
+    system._trainer = type("T", (), {"sanity_checking": False} | fits)()
+    system.log_dict = lambda values, **options: None
     loader = RayBatches(ball_scene(), system.step.progress, 0, 64)
     values = []
     for _ in range(2):

@@ -1,10 +1,10 @@
-"""What TensorBoard shows of a run besides its curves: the config as text, and a row in the hyper-parameter table."""
+"""What loggers show of a run besides its curves: the config as text, and a row in the hyper-parameter table."""
 
 from itertools import islice
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.config.key_meanings import meaning_of, names_a_class
@@ -18,10 +18,16 @@ FINAL_METRICS = ("test/psnr", "test/ssim")
 
 
 def describe_run(loggers: list[Logger], config: DictConfig) -> None:
-    """Write the config and the hyper-parameters; their metrics are filled in by the scalars of the same names."""
+    """Write the hyper-parameters, and for TensorBoard the config as text.
+
+    TensorBoard fills in the metrics of its table from the scalars of the same names.
+    """
     from torch.utils.tensorboard.summary import hparams
 
     values = hyper_parameters(config, list(HydraConfig.get().overrides.task))
+    for logger in loggers:
+        if not isinstance(logger, TensorBoardLogger):
+            logger.log_hyperparams(values)
     for writer in tensorboard_writers(loggers):
         text = OmegaConf.to_yaml(config, resolve=True)
         writer.add_text("config", "\n".join(f"    {for_terminal(line)}" for line in text.split("\n")), 0)

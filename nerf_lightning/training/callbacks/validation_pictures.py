@@ -5,8 +5,8 @@ from typing import Any
 
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.rendering.blending import photograph
-from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view, tensorboard_writers
-from nerf_lightning.training.tensorboard import PICTURE
+from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
+from nerf_lightning.training.loggers import show_picture
 from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
 
 
@@ -38,5 +38,4 @@ class ValidationPictures(Watcher):
         folder = Path(trainer.default_root_dir) / "images"
         save_png(folder / "validation" / f"step_{step:07d}.png", panel)
         save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))
-        for writer in tensorboard_writers(trainer.loggers):
-            writer.add_image(PICTURE, panel.numpy(), step, dataformats="HWC")
+        show_picture(trainer.loggers, "validation/picture", panel, step)

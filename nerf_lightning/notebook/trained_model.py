@@ -1,0 +1,129 @@
+"""A trained model, opened from its run or its checkpoint, and rendered from any camera."""
+
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from nerf_lightning.budgets import Budgets, allow
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.recorded_frame import as_trained
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.messages import in_words
+from nerf_lightning.config.overrides import quoted
+from nerf_lightning.data.captures.checks import known_background
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
+from nerf_lightning.training.open_checkpoint import open_checkpoint
+from nerf_lightning.video.shots import Subject, lay_path, shot_of
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A model with its weights, on its device, in evaluation mode, and what it knows of its capture."""
+
+    module: Model = field(repr=False)
+    """The network: a torch module that takes rays."""
+    checkpoint: Checkpoint = field(repr=False)
+    """The file as read: config, choices, step, precision."""
+    tile_points: int
+    """Most points that go through a field at once."""
+
+    @property
+    def scene(self) -> SceneRecord:
+        """Cameras (those that training has refined, where it did), bounds, splits and names; no photographs."""
+        return self.checkpoint.scene
+
+    def render(self, camera: Cameras | int | str, background: str | None = None) -> Picture:
+        """Render what a camera sees.
+
+        Args:
+            camera: one camera in the frame of `self.scene` (`scene.cameras[3]`, `self.path("orbit")[0]`), or the
+                number or the name of one of its views.
+            background: what lies behind the scene: white, black or none; None: as in training.
+
+        Returns:
+            On the CPU: `rgb` (height x width x 3, sRGB in [0, 1] up to rounding), `depth` (height x width, the expected
+            distance along each pixel's ray in scene units; light that escapes ends at far), `opacity` (height x width).
+
+        Raises:
+            InputError: there is no such view or background, or several cameras were given.
+        """
+        with torch.no_grad(), in_words("render"):
+            behind = known_background(background or self.scene.background)
+            if isinstance(camera, Cameras):
+                subject = Subject(self.module, self.scene, behind)
+                return shot_of(subject, _one(camera), self.tile_points).picture(0)
+            scene, view = self.scene, self._view(camera)
+            rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+            return render_picture(self.module, rays_of, view, behind, self.tile_points)
+
+    def path(self, name: str = "orbit", **settings: Any) -> Cameras:
+        """Return the cameras of a camera path around the capture, in order of time, to be rendered one by one.
+
+        Args:
+            name: of the path, in `conf/path/`: orbit, spiral, keyframes, ...
+            **settings: of the path, as `nerf help render path=...` lists them, in the capture's own frame and units:
+                `num_frames=40`, `width=320`.
+
+        Raises:
+            InputError: an unknown path or setting, or the path cannot be laid around this capture.
+        """
+        overrides = [f"path={name}", *(f"path.{key}={quoted(value)}" for key, value in settings.items())]
+        with in_words("render"):
+            config, _ = compose_config("render", overrides)
+            return lay_path(build(config.path), self.scene)
+
+    def in_frame(self, scene: Scene) -> Scene:
+        """Return a scene in the frame of this model, with its refined cameras where it has some.
+
+        A capture that is read with other settings (`frames`, `downscale`) may have another working frame.
+
+        Raises:
+            InputError: it was read with another `space` than the model was trained in.
+        """
+        return as_trained(scene, self.checkpoint)
+
+    def _view(self, camera: int | str) -> int:
+        names = self.scene.view_names
+        if isinstance(camera, str) and camera in names:
+            return names.index(camera)
+        if isinstance(camera, int) and -len(names) <= camera < len(names):
+            return camera % len(names)
+        raise InputError(
+            f"{self.scene.name} has no view {camera!r}: it has {len(names)}, numbered from 0 and named as in "
+            "model.scene.view_names."
+        )
+
+
+def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
+    """Open a trained model: the newest checkpoint of a run folder, or a checkpoint, whoever wrote it.
+
+    Nothing in the file is executed, and the capture is not needed.
+
+    Args:
+        run: the run folder or the checkpoint.
+        *overrides: settings of the machine, as on the command line: "trainer=cpu", "trainer.tile_points=4096".
+
+    Raises:
+        InputError: it is no checkpoint of this program, or is damaged.
+    """
+    with in_words("render"):
+        config, _ = compose_config("render", [f"ckpt={quoted(run)}", *overrides])
+        allow(Budgets(**config.budgets))
+        opened = open_checkpoint(config)
+    return TrainedModel(opened.model.eval(), opened.checkpoint, opened.tile_points)
+
+
+def _one(camera: Cameras) -> Cameras:
+    """Return one camera as cameras of one view."""
+    if camera.c2w.dim() == 2:
+        return camera.map(lambda tensor: tensor[None])
+    if camera.c2w.shape[0] != 1:
+        raise InputError(f"These are {camera.c2w.shape[0]} cameras, and render takes one: cameras[0].")
+    return camera

@@ -1,0 +1,72 @@
+"""A training from Python: what `nerf train` does, and what it leaves."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.budgets import Budgets, allow
+from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.commands.train import train as train_in_folder
+from nerf_lightning.config.compose import composed_job
+from nerf_lightning.config.instantiate import require_fitting_values
+from nerf_lightning.config.messages import in_words
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.notebook.trained_model import TrainedModel, load
+from nerf_lightning.runs.results import FILES
+from nerf_lightning.training.launch.devices import choose_device
+from nerf_lightning.training.launch.processes import num_processes
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A finished run."""
+
+    folder: Path
+    """The run folder: checkpoints, pictures, TensorBoard's files, the film."""
+    psnr: float | None
+    """Mean PSNR of the test views in dB; the validation's where no evaluation was asked for."""
+    metrics: dict[str, Any]
+    """The content of metrics.json: the mean of each metric, `per_image`, and how it was measured (`protocol`); empty
+    where no evaluation was asked for."""
+    model: TrainedModel
+    """As its last checkpoint has it."""
+
+
+def train(*overrides: str) -> TrainedRun:
+    """Train as `nerf train` does, in this process, and return the run.
+
+    `nl.train("scene=blender", "scene.root=data/lego", "model=fast", "trainer.max_steps=800")` takes the overrides of
+    the command line, `resume=auto` and `paths.output_dir=DIR` among them. Ctrl-C, or the notebook's stop button, ends
+    the run after the step, with a checkpoint to go on from.
+
+    Args:
+        *overrides: settings, each as one text.
+
+    Raises:
+        InputError: anything in the settings or in the capture that makes no run; nothing is left half-written.
+        KeyboardInterrupt: the run was stopped; its checkpoint is saved.
+    """
+    with in_words("train"), composed_job("train", prepared("train", list(overrides))) as config:
+        allow(Budgets(**config.budgets))
+        _require_one_process(config.trainer)
+        try:
+            done = train_in_folder(config)
+        except SystemExit as stop:
+            raise KeyboardInterrupt(f"The training was stopped (exit code {stop.code}).") from None
+    metrics = read_json_object(done.folder / FILES["run"]) if config.final.evaluate else {}
+    return TrainedRun(done.folder, done.psnr, metrics, load(done.folder, *_of_the_machine(overrides)))
+
+
+def _of_the_machine(overrides: tuple[str, ...]) -> list[str]:
+    return [each for each in overrides if each.startswith(("trainer=", "trainer.accelerator=", "trainer.num_threads="))]
+
+
+def _require_one_process(trainer: Any) -> None:
+    require_fitting_values(trainer, "trainer")
+    device_type = choose_device(trainer.accelerator)[0]
+    if trainer.launched_by != "nerf" or num_processes(trainer.devices, device_type) > 1:
+        raise InputError(
+            "nl.train trains in this one process, and this trainer wants several. Use nerf train for that, and "
+            "nl.load(RUN) afterwards; or trainer.devices=1."
+        )

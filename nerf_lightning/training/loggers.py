@@ -1,0 +1,165 @@
+"""Where curves and pictures go beside TensorBoard: Lightning's own loggers, each opened in a run's folder."""
+
+import importlib.util
+import os
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import UInt8
+from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.training.tensorboard import shown_name
+
+
+class RunLogger(ABC):
+    """Settings of a logger, which is opened once the run has its folder."""
+
+    @abstractmethod
+    def open(self, folder: Path, started: str) -> Logger:
+        """Return the logger of the run in this folder.
+
+        Args:
+            folder: of the run.
+            started: when it did; the same for each start of a run that is gone on with.
+
+        Raises:
+            InputError: it cannot be opened.
+        """
+
+
+class CsvFiles(RunLogger):
+    """Every curve in `csv/version_N/metrics.csv` of the run folder, a version for each start; it takes no pictures."""
+
+    def open(self, folder: Path, started: str) -> CSVLogger:
+        """See `RunLogger`."""
+        # Lightning's would empty the folder of an earlier start, if it had one name for all of them.
+        return CSVLogger(save_dir=folder, name="csv", flush_logs_every_n_steps=1)
+
+
+class WeightsAndBiases(RunLogger):
+    """Curves, settings and pictures in a project of Weights & Biases; a resumed run goes on in its page there.
+
+    Args:
+        project: its name.
+        entity: the user or the team that has it; None: your own.
+        offline: keep everything in the run folder (`wandb/`), for `wandb sync`; the variable WANDB_MODE=offline does
+            the same.
+
+    Raises:
+        InputError: wandb is not installed.
+    """
+
+    def __init__(self, project: str = "nerf_lightning", entity: str | None = None, offline: bool = False):
+        _require("wandb", "logger=wandb", "wandb")
+        self.project, self.entity, self.offline = project, entity, offline
+
+    def open(self, folder: Path, started: str) -> WandbLogger:
+        """See `RunLogger`."""
+        from wandb.errors import Error
+
+        logger = WandbLogger(
+            name=folder.name,
+            save_dir=folder,
+            project=self.project,
+            entity=self.entity,
+            offline=self.offline,
+            id=uuid.uuid5(uuid.NAMESPACE_URL, f"{folder.absolute()} {started}").hex[:16],
+        )
+        try:
+            _ = logger.experiment
+        except Error as error:
+            reason = " ".join(str(error).split())
+            raise InputError(
+                f"Weights & Biases cannot be used: {reason}. Log in with wandb login, keep everything here with "
+                "logger.wandb.offline=true, or leave it out with logger=tensorboard."
+            ) from error
+        return logger
+
+
+class MLflow(RunLogger):
+    """Curves, settings and pictures in an experiment of MLflow; each start of a run is a run of its own there.
+
+    Args:
+        experiment: its name.
+        tracking_uri: the server, or a database such as sqlite:///mlflow.db; None: the variable MLFLOW_TRACKING_URI,
+            else the file `mlflow.db` of the run folder.
+
+    Raises:
+        InputError: mlflow is not installed.
+    """
+
+    def __init__(self, experiment: str = "nerf_lightning", tracking_uri: str | None = None):
+        _require("mlflow", "logger=mlflow", "mlflow")
+        self.experiment, self.tracking_uri = experiment, tracking_uri
+
+    def open(self, folder: Path, started: str) -> MLFlowLogger:
+        """See `RunLogger`."""
+        from mlflow.exceptions import MlflowException
+
+        given = self.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI")
+        pictures = None if given else (folder / "mlflow").absolute().as_uri()
+        uri = given or f"sqlite:///{(folder / 'mlflow.db').absolute()}"
+        try:
+            logger = MLFlowLogger(self.experiment, run_name=folder.name, tracking_uri=uri, artifact_location=pictures)
+            _ = logger.experiment
+        except MlflowException as error:
+            reason = " ".join(str(error).split())
+            raise InputError(
+                f"MLflow cannot be used at {uri}: {reason}. Give another logger.mlflow.tracking_uri, or leave it out "
+                "with logger=tensorboard."
+            ) from error
+        return logger
+
+
+@contextmanager
+def opened_loggers(chosen: Mapping[str, Any], folder: Path, started: str, **purge: int) -> Iterator[list[Logger]]:
+    """Open what the config chose, and close it when the run ends, however it does.
+
+    Args:
+        chosen: built from the config: of this file, or Lightning's own that lack only `save_dir`.
+        folder: of the run.
+        started: when it did.
+        **purge: `purge_step`, from which TensorBoard forgets what an earlier start has logged.
+
+    Raises:
+        InputError: one cannot be opened.
+    """
+    loggers: list[Logger] = []
+    code = 1
+    try:
+        for each in chosen.values():
+            if isinstance(each, RunLogger):
+                loggers.append(each.open(folder, started))
+            else:
+                loggers.append(each(save_dir=folder, **(purge if issubclass(each.func, TensorBoardLogger) else {})))
+        yield loggers
+        code = 0
+    finally:
+        for logger in loggers:
+            if isinstance(logger, WandbLogger):
+                logger.experiment.finish(exit_code=code)  # else the next job of a sweep would go on with it
+
+
+def show_picture(loggers: list[Logger], tag: str, picture: UInt8[Tensor, "height width 3"], step: int) -> None:
+    """Give a picture to those loggers that take some: TensorBoard, Weights & Biases, MLflow."""
+    for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(shown_name(tag), picture.numpy(), step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image(tag, [picture.numpy()], step)
+        elif isinstance(logger, MLFlowLogger):
+            logger.experiment.log_image(logger.run_id, picture.numpy(), f"{tag}/step_{step:07d}.png")
+
+
+def _require(package: str, setting: str, extra: str) -> None:
+    if importlib.util.find_spec(package) is None:
+        raise InputError(
+            f"{setting} needs {package}, which is not installed: pip install 'nerf-lightning[{extra}]'. Or leave it "
+            f"out: logger=tensorboard, logger=csv, or ~logger.{package}."
+        )

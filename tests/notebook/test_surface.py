@@ -1,0 +1,153 @@
+"""What `import nerf_lightning as nl` offers: read, load and render, train."""
+
+import ast
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+from support.captures import write_blender, write_npz
+from support.running import FAST, refused
+
+import nerf_lightning as nl
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+
+SMALL = (*FAST, "trainer=cpu", "final.video=false", "callbacks=default")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return write_npz(tmp_path_factory.mktemp("capture") / "capture.npz")
+
+
+@pytest.fixture(scope="module")
+def run(capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return nl.train("scene=npz", f"scene.path={capture}", f"paths.output_dir={folder}", *SMALL)
+
+
+def test_the_types_that_are_told_are_those_of_what_is_there():
+    stub = ast.parse(Path(nl.__file__).with_suffix(".pyi").read_text())
+    told = {each.names[0].asname: each.module for each in stub.body if isinstance(each, ast.ImportFrom)}
+    assert told == nl._OFFERED
+
+
+def test_a_folder_is_read_as_its_files_tell(tmp_path):
+    scene = nl.read(write_blender(tmp_path, {"train": 3, "val": 1, "test": 1}), background="black")
+    assert isinstance(scene, nl.Scene)
+    assert scene.background == "black"
+    assert scene.pixels.view(0).shape == (8, 8, 4)
+    assert scene.cameras.c2w.shape == (5, 3, 4)
+
+
+def test_an_archive_is_read(capture):
+    assert len(nl.read(capture).view_names) == 10
+
+
+def test_a_format_may_be_named(tmp_path):
+    scene = nl.read(write_blender(tmp_path, {"train": 3, "val": 1, "test": 1}), scene="blender")
+    assert len(scene.splits["train"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        ({"capture": "nowhere"}, ("nowhere",)),
+        ({"scene": "blendr"}, ("blendr", "blender")),
+        ({"scene": "bricks", "resolutoin": 8}, ("resolutoin", "resolution")),
+        ({"scene": "bricks", "resolution": "high"}, ("scene.resolution=high", "whole number")),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_words(settings, parts):
+    with pytest.raises(nl.InputError) as caught:
+        nl.read(**settings)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_a_run_leaves_folder_metrics_and_model(run):
+    assert (run.folder / "run.json").is_file()
+    assert run.metrics["psnr"] == run.psnr
+    assert len(run.metrics["per_image"]) == 2
+    assert run.model.checkpoint.step == 4
+    assert HydraConfig.instance().cfg is None
+
+
+def test_a_run_and_its_checkpoint_are_the_same_model(run):
+    one, other = nl.load(run.folder, "trainer=cpu"), nl.load(run.folder / "checkpoints" / "last.ckpt", "trainer=cpu")
+    assert torch.equal(one.render(0).rgb, other.render(0).rgb)
+    assert not one.module.training
+
+
+def test_a_view_is_rendered_by_number_name_and_camera(run, capture):
+    model, scene = run.model, nl.read(capture)
+    picture = model.render(2)
+    assert isinstance(picture, nl.Picture)
+    assert (picture.rgb.shape, picture.depth.shape, picture.opacity.shape) == ((4, 6, 3), (4, 6), (4, 6))
+    assert torch.equal(model.render(model.scene.view_names[2]).rgb, picture.rgb)
+    assert torch.equal(model.render(-8).rgb, picture.rgb)
+    seen = model.render(model.in_frame(scene).cameras[2])
+    assert seen.rgb.shape == picture.rgb.shape
+    assert not torch.equal(model.render(2, background="black").rgb, model.render(2, background="white").rgb)
+
+
+def test_a_path_is_rendered_camera_by_camera(run):
+    cameras = run.model.path("orbit", num_frames=3, width=5, height=4)
+    assert run.model.render(cameras[1]).depth.shape == (4, 5)
+    assert run.model.render(cameras[1:2]).depth.shape == (4, 5)
+
+
+@pytest.mark.parametrize(
+    ("ask", "parts"),
+    [
+        (lambda model: model.render(10), ("no view 10", "10, numbered from 0")),
+        (lambda model: model.render("r_7"), ("'r_7'", "view_names")),
+        (lambda model: model.render(model.scene.cameras), ("10 cameras", "cameras[0]")),
+        (lambda model: model.render(0, background="blue"), ("blue",)),
+        (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
+        (lambda model: model.path(num_frames=0), ("num_frames",)),
+    ],
+)
+def test_what_cannot_be_rendered_is_told_in_words(run, ask, parts):
+    refused(ask, run.model, parts=parts)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["modle=fast"], ("modle", "model")),
+        (["trainer.max_steps=-1"], ("trainer.max_steps=-1", "positive")),
+        (["trainer.devices=2"], ("several", "nerf train", "nl.load")),
+        (["-m", "seed=0,1"], ("-m",)),
+        (["resume=nowhere"], ("nowhere",)),
+        (["init_from=nowhere"], ("nowhere",)),
+    ],
+)
+def test_what_makes_no_run_is_told_in_words_and_leaves_nothing(overrides, parts, capture, tmp_path):
+    place = (f"paths.root_dir={tmp_path / 'runs'}", "scene=npz", f"scene.path={capture}", *SMALL)
+    refused(nl.train, *place, *overrides, parts=parts)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_what_is_no_checkpoint_is_told_in_words(tmp_path):
+    refused(nl.load, tmp_path, parts=("no checkpoint",))
+
+
+def test_a_run_that_is_stopped_saves_and_goes_on(capture, tmp_path, monkeypatch):
+    settings = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={tmp_path / 'run'}", *SMALL)
+    begin = StopSignals.on_train_start
+
+    def stop(callback, trainer, module):
+        begin(callback, trainer, module)
+        signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StopSignals, "on_train_start", stop)
+        with pytest.raises(KeyboardInterrupt):
+            nl.train(*settings)
+    assert read_checkpoint(tmp_path / "run").step < 4
+    done = nl.train(*settings, "resume=auto", "final.evaluate=false")
+    assert done.model.checkpoint.step == 4
+    assert done.metrics == {}

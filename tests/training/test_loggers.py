@@ -1,0 +1,125 @@
+"""Loggers beside TensorBoard: what each keeps of a run, and what is said where its package is missing."""
+
+import csv
+import importlib.util
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hydra.errors import HydraException
+from lightning.pytorch.loggers import CSVLogger, WandbLogger
+from support.captures import write_npz
+from support.configs import composed, options
+from support.running import FAST, refused
+
+import nerf_lightning as nl
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.training.loggers import MLflow, WeightsAndBiases, opened_loggers, show_picture
+
+PICTURE = torch.zeros(4, 5, 3, dtype=torch.uint8)
+
+
+@pytest.fixture
+def trained(tmp_path):
+    capture = write_npz(tmp_path / "capture.npz")
+
+    def train(*overrides):
+        place = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={tmp_path / 'run'}", "trainer=cpu")
+        return nl.train(*place, *FAST, "final.video=false", "evaluation.num_pictures=0", *overrides)
+
+    return train
+
+
+def rows(folder):
+    return list(csv.DictReader((folder / "metrics.csv").read_text().splitlines()))
+
+
+def test_curves_are_kept_as_tables_of_each_start(trained):
+    run = trained("logger=csv", "callbacks.monitor.every_steps=2", "resume=auto")
+    first = rows(run.folder / "csv" / "version_0")
+    assert [row["step"] for row in first if row["train/loss"]] == ["2", "4"]
+    assert [float(row["test/psnr"]) for row in first if row["test/psnr"]] == [pytest.approx(run.psnr)]
+    assert (run.folder / "tensorboard").is_dir()
+    assert "choice.model: nerf_tiny" in (run.folder / "csv" / "version_0" / "hparams.yaml").read_text()
+    trained("logger=csv", "callbacks.monitor.every_steps=2", "resume=auto", "trainer.max_steps=6")
+    assert rows(run.folder / "csv" / "version_0") == first
+    assert [row["step"] for row in rows(run.folder / "csv" / "version_1") if row["train/loss"]] == ["6"]
+
+
+@pytest.mark.parametrize("option", options("logger"))
+def test_every_logger_builds_or_names_its_extra(option):
+    with pytest.raises(HydraException) if missing(option) else nullcontext() as refusal:
+        assert build(composed("train", f"logger={option}").logger) is not None
+    assert refusal is None or "pip install 'nerf-lightning[" in str(refusal.value.__cause__)
+
+
+def missing(option):
+    needed = {"wandb": ("wandb",), "mlflow": ("mlflow",), "many": ("wandb", "mlflow")}.get(option, ())
+    return [each for each in needed if importlib.util.find_spec(each) is None]
+
+
+@pytest.mark.parametrize(("logger", "package"), [("wandb", "wandb"), ("mlflow", "mlflow"), ("many", "wandb")])
+def test_a_missing_package_is_named_before_a_folder_is_taken(trained, tmp_path, monkeypatch, logger, package):
+    found = importlib.util.find_spec
+    absent = ("wandb", "mlflow")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name in absent else found(name, *rest))
+    refused(trained, f"logger={logger}", parts=(package, f"nerf-lightning[{package}]", f"~logger.{package}"))
+    assert not (tmp_path / "run").exists()
+
+
+class Takes(WandbLogger):
+    """Stands for W&B's logger: it keeps what it is given, and needs no package."""
+
+    def __init__(self):
+        self.pictures, self.codes = [], []
+
+    def log_image(self, key, images, step=None, **more):
+        self.pictures.append((key, images[0].shape, step))
+
+    @property
+    def experiment(self):
+        return SimpleNamespace(finish=lambda exit_code: self.codes.append(exit_code))
+
+
+def test_pictures_go_to_those_who_take_them(tmp_path):
+    taker = Takes()
+    show_picture([taker, CSVLogger(tmp_path)], "validation/picture", PICTURE, 7)
+    assert taker.pictures == [("validation/picture", (4, 5, 3), 7)]
+
+
+def test_a_run_of_weights_and_biases_ends_with_ours(tmp_path):
+    taker = Takes()
+    chosen = {"wandb": lambda **given: taker}
+    chosen["wandb"].func = None
+    with opened_loggers(chosen, tmp_path, "now"):
+        pass
+    with pytest.raises(KeyError), opened_loggers(chosen, tmp_path, "now"):
+        raise KeyError
+    assert taker.codes == [0, 1]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_weights_and_biases_keeps_a_run_offline(trained, monkeypatch):
+    pytest.importorskip("wandb", reason="W&B is an extra: pip install 'nerf-lightning[wandb]'")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    run = trained("logger=wandb", "callbacks.validation_pictures.every_steps=2")
+    (kept,) = (run.folder / "wandb").glob("offline-run-*")
+    assert len(list((kept / "files" / "media" / "images").rglob("*.png"))) == 3  # the cameras, and steps 2 and 4
+    first, second = (WeightsAndBiases(offline=True).open(run.folder, started) for started in ("then", "now"))
+    assert first._id != second._id
+    first.experiment.finish()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_mlflow_keeps_curves_settings_and_pictures(trained):
+    mlflow = pytest.importorskip("mlflow", reason="MLflow is an extra: pip install 'nerf-lightning[mlflow]'")
+    run = trained("logger=mlflow", "callbacks.validation_pictures.every_steps=2")
+    client = mlflow.MlflowClient(f"sqlite:///{run.folder / 'mlflow.db'}")
+    (found,) = client.search_runs([client.get_experiment_by_name("nerf_lightning").experiment_id])
+    assert found.data.metrics["test/psnr"] == pytest.approx(run.psnr)
+    assert found.data.params["choice.model"] == "nerf_tiny"
+    assert found.info.status == "FINISHED"
+    assert len(list((run.folder / "mlflow").rglob("step_*.png"))) == 3
+    refused(MLflow(tracking_uri="nowhere://x").open, run.folder, "now", parts=("nowhere://x", "logger.mlflow.tracking"))
