@@ -12,8 +12,9 @@ from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.frusta import Frusta
+from nerf_lightning.viewer.path_panel import PathPanel
 from nerf_lightning.viewer.plain_text import as_plain_markdown
-from nerf_lightning.viewer.recorded_path import LEAST_SECONDS, RecordedPath, free_name, not_saved
+from nerf_lightning.viewer.recorded_path import RecordedPath, free_name, not_saved
 from nerf_lightning.visualization.pictures import save_png
 
 Number = TypeVar("Number", int, float)
@@ -38,12 +39,12 @@ class Controls:
         self.gui = session.client.gui
         self.harmless = session.queue.complaints.harmless
         self.frusta = Frusta(session, self._enter)
-        self.path = RecordedPath(session, folder, self.frusta.add_keyframe)
+        self.path = RecordedPath(session.around, folder)
         self._wants_snapshot = False
         session.on_finest, session.on_leave = self._keep_snapshot, self._left
         self._add_view()
         self._add_photographs()
-        self._add_path()
+        PathPanel(session, self.path, self.frusta.hide)
         self._add_crop()
 
     def _add_view(self) -> None:
@@ -113,37 +114,12 @@ class Controls:
         )
         self._name.visible = self._leave.visible = True
         self._split.visible = there
-        self.frusta.hide_for_photograph(True)
+        self.frusta.hide(True)
         self.session.enter(view)
 
     def _left(self) -> None:
         self._name.visible = self._leave.visible = self._split.visible = False
-        self.frusta.hide_for_photograph(False)
-
-    def _add_path(self) -> None:
-        with self.gui.add_folder("Camera path", expand_by_default=False):
-            add = self.gui.add_button("Add keyframe", hint="The camera as it is now")
-            seconds = self.gui.add_number(
-                "Seconds between", 2.0, min=LEAST_SECONDS, max=limits.MOST_SECONDS_BETWEEN, step=0.1
-            )
-            undo = self.gui.add_button("Remove last")
-            save = self.gui.add_button("Save as yaml")
-            said = self.gui.add_markdown("No keyframes yet.")
-
-        @add.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.add(float(seconds.value))
-
-        @undo.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.remove_last()
-
-        @save.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.save()
+        self.frusta.hide(False)
 
     def _add_crop(self) -> None:
         record = self.session.photographs.record

@@ -1,6 +1,7 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
 import logging
+import math
 import threading
 import warnings
 import webbrowser
@@ -16,8 +17,9 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
+from nerf_lightning.viewer.camera_state import fov_that_holds
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.controls import Controls
+from nerf_lightning.viewer.controls import MOST_DEGREES, Controls
 from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.shown_photographs import Photographs
@@ -78,7 +80,7 @@ class Page:
         self.queue, self.photographs, self.folder = queue, photographs, folder
         self.most_height = most_height
         record = photographs.record
-        self.around = frame_of(record.cameras, record.aabb)
+        self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages are closed while a picture is on its way to them; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.admission = Admission(host, hosts)
@@ -122,12 +124,21 @@ class Page:
         if not self._has_seat(client.client_id):
             client.add_notification("Full", FULL, color="red")
             return
+        client.camera.fov = self._first_fov(client.camera.image_width / client.camera.image_height)
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
         Controls(session, self.folder)
         # Who has left meanwhile may have been seen off before being here.
         if client.client_id not in self.server.get_clients():
             self._take_leave(client)
+
+    def _first_fov(self, window: float) -> float:
+        """Return the field of view that begins: what the first photograph takes in, in a window of any shape."""
+        cameras = self.photographs.record.cameras
+        panorama = cameras.lens_model == "equirectangular"
+        shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])
+        widest = math.radians(MOST_DEGREES)
+        return min(fov_that_holds(vertical_field_of_view(cameras, 0), shape, window), widest)
 
     def _has_seat(self, client: int) -> bool:
         with self._lock:

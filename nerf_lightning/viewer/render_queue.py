@@ -40,6 +40,10 @@ class RenderQueue:
         with self._lock:
             self._refinements.pop(client, None)
 
+    def serves(self, client: int) -> bool:
+        """Tell whether this client is rendered for."""
+        return client in self._refinements
+
     def wake(self) -> None:
         """Say that a client wants another picture."""
         self._wish.set()
