@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
+from nerf_lightning.video.settings import Corner
 from nerf_lightning.viewer.camera_state import CameraState, fov_that_holds, pose_of, quaternion_of
 from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
 from nerf_lightning.viewer.occlusion import FARTHEST, planar_depth
@@ -45,6 +46,8 @@ class ViewerClient:
         self.refinement = ProgressiveRendering(self._show, most_height)
         self.channel, self.split = COLOR, 0.5
         self.crop: CropBox | None = None
+        self.crop_corners: tuple[Corner, Corner] | None = None
+        """The same, in the user's frame and units."""
         self.photograph: int | None = None
         """The view whose camera is looked through."""
         self.on_finest: Callable[[], None] = lambda: None

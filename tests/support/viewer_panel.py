@@ -64,8 +64,8 @@ class Gui:
 class Panel:
     """A person's panel over a ball, and the queue that serves them."""
 
-    def __init__(self, folder, **changed):
-        scene = ball_scene(num_views=4, size=16)
+    def __init__(self, folder, scene=None, **changed):
+        capture, scene = scene, scene or ball_scene(num_views=4, size=16)
         record = replace(scene_record(scene), **changed)
         self.queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
         self.client, self.gui = MagicMock(client_id=1), Gui()
@@ -75,7 +75,7 @@ class Panel:
         camera.image_width, camera.image_height, camera.aspect = 16, HEIGHT, 16 / HEIGHT
         camera.look_at, camera.up_direction = np.zeros(3), np.array([0.0, 0.0, 1.0])
         around = frame_of(record.cameras, record.aabb)
-        self.session = ViewerClient(self.client, self.queue, Photographs(record, None, "white"), around, HEIGHT)
+        self.session = ViewerClient(self.client, self.queue, Photographs(record, capture, "white"), around, HEIGHT)
         self.session.start()
         self.controls = Controls(self.session, folder)
 
