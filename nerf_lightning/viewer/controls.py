@@ -17,6 +17,8 @@ from nerf_lightning.viewer.path_panel import PathPanel
 from nerf_lightning.viewer.photograph_panel import PhotographPanel
 from nerf_lightning.viewer.ranges import within
 from nerf_lightning.viewer.recorded_path import RecordedPath, free_name, not_saved
+from nerf_lightning.viewer.training_panel import TrainingPanel
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 from nerf_lightning.visualization.pictures import save_png
 
 AXES = ("x", "y", "z")
@@ -31,21 +33,24 @@ class Controls:
 
     Args:
         session: theirs.
-        folder: where snapshots and camera paths are written.
+        folder: where snapshots, camera paths and films are written.
+        training: what the panel may ask of the training that is shown; None: none is shown.
     """
 
-    def __init__(self, session: ViewerClient, folder: Path):
-        self.session, self.folder = session, folder
+    def __init__(self, session: ViewerClient, folder: Path, training: TrainingSwitch | None = None):
+        self.session, self.folder, self.training = session, folder, training
         self.gui = session.client.gui
         self.harmless = session.queue.complaints.harmless
         self.frusta = Frusta(session, lambda view: self.photographs.enter(view))
         self.path = RecordedPath(session.around, folder)
         self._wants_snapshot = False
         session.on_finest = self._keep_snapshot
+        if training is not None:
+            TrainingPanel(session, training)
         self._add_view()
         self.photographs = PhotographPanel(session, self.frusta)
         PathPanel(session, self.path, self.frusta.hide)
-        self.film = FilmPanel(session, self.path, folder, lambda: None)
+        self.film = FilmPanel(session, self.path, folder, self._why_no_film)
         self._add_crop()
 
     def _add_view(self) -> None:
@@ -73,6 +78,10 @@ class Controls:
             self._wants_snapshot = True
             self.session.refinement.refresh()
             self.session.queue.wake()
+
+    def _why_no_film(self) -> str | None:
+        paused = self.training is None or self.training.wants_pause
+        return None if paused else "The model changes while it trains. Pause the training first, then film it."
 
     def _add_crop(self) -> None:
         record = self.session.photographs.record

@@ -16,6 +16,7 @@ from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.recorded_path import RecordedPath
+from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 
 # What the queue knows the film by: clients count from 0.
@@ -122,6 +123,14 @@ class FilmJob:
         with suppress(OSError):
             shutil.rmtree(self.folder)
         self.on_change(self)
+
+
+def end_film(queue: RenderQueue) -> None:
+    """Stop the film that is being made, if one is; one whose frames are all there becomes a video."""
+    job = queue.turn_of(FILM)
+    if isinstance(job, FilmJob):
+        job.stop()
+        job.work(queue.renderer)
 
 
 def new_folder(folder: Path) -> Path:

@@ -23,6 +23,7 @@ from nerf_lightning.viewer.controls import MOST_DEGREES, Controls
 from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.shown_photographs import Photographs
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 
 # The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
@@ -59,6 +60,7 @@ class Page:
         port: the port, or the first to try.
         most_height: the finest picture, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
+        training: what the page may ask of the training that it shows; None: it shows none.
 
     Raises:
         InputError: no viser, or one that cannot be guarded; no place to listen; a host that is none.
@@ -73,12 +75,13 @@ class Page:
         port: int,
         most_height: int,
         hosts: Sequence[str] | None = None,
+        training: TrainingSwitch | None = None,
     ) -> None:
         viser = require_viser()
         from nerf_lightning.viewer.guarded_server import Guard
 
         self.queue, self.photographs, self.folder = queue, photographs, folder
-        self.most_height = most_height
+        self.most_height, self.training = most_height, training
         record = photographs.record
         self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages are closed while a picture is on its way to them; that needs no warning.
@@ -101,6 +104,11 @@ class Page:
         """Where a browser finds the page; who has this address has the token."""
         place = address_of(self.server.get_host(), self.server.get_port())
         return f"{place}/?token={self.admission.token}"
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nobody looks on."""
+        return not self._seats
 
     def close(self) -> None:
         """Stop listening; open pages say that the connection is lost."""
@@ -127,7 +135,7 @@ class Page:
         client.camera.fov = self._first_fov(client.camera.image_width / client.camera.image_height)
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
-        Controls(session, self.folder)
+        Controls(session, self.folder, self.training)
         # Who has left meanwhile may have been seen off before being here.
         if client.client_id not in self.server.get_clients():
             self._take_leave(client)

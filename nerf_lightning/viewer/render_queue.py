@@ -65,6 +65,10 @@ class RenderQueue:
         """Tell whether this client is rendered for."""
         return client in self._refinements
 
+    def turn_of(self, client: int) -> Turn | None:
+        """Return what is rendered for a client, or None."""
+        return self._refinements.get(client)
+
     def wake(self) -> None:
         """Say that a client wants another picture."""
         self._wish.set()
