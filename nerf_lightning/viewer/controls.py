@@ -34,10 +34,11 @@ class Controls:
     Args:
         session: theirs.
         folder: where snapshots, camera paths and films are written.
+        fov: the vertical field of view that is shown first, in radians.
         training: what the panel may ask of the training that is shown; None: none is shown.
     """
 
-    def __init__(self, session: ViewerClient, folder: Path, training: TrainingSwitch | None = None):
+    def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
         self.session, self.folder, self.training = session, folder, training
         self.gui = session.client.gui
         self.harmless = session.queue.complaints.harmless
@@ -47,15 +48,14 @@ class Controls:
         session.on_finest = self._keep_snapshot
         if training is not None:
             TrainingPanel(session, training)
-        self._add_view()
+        self._add_view(round(math.degrees(fov)))
         self.photographs = PhotographPanel(session, self.frusta)
         PathPanel(session, self.path, self.frusta.hide)
         self.film = FilmPanel(session, self.path, folder, self._why_no_film)
         self._add_crop()
 
-    def _add_view(self) -> None:
+    def _add_view(self, degrees: int) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
-        degrees = round(math.degrees(self.session.client.camera.fov))
         shown = within(float(degrees), LEAST_DEGREES, MOST_DEGREES)
         fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, shown)
         snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")

@@ -41,7 +41,9 @@ class FilmPanel:
         self.width = self.gui.add_number(
             "Width", width, min=limits.LEAST_FILM_WIDTH, max=limits.MOST_FILM_WIDTH, step=1, hint="In pixels"
         )
-        self.rate = self.gui.add_number("Frames a second", USUAL_RATE, min=1, max=limits.MOST_FILM_RATE, step=1)
+        self.rate = self.gui.add_number(
+            "Frame rate", USUAL_RATE, min=1, max=limits.MOST_FILM_RATE, step=1, hint="Per second"
+        )
         self.render = self.gui.add_button("Render film", hint="Along the camera path, with the crop box if it is on")
         self.halt = self.gui.add_button("Stop the film", visible=False, color="gray")
         self.bar = self.gui.add_progress_bar(0.0, visible=False)

@@ -132,10 +132,11 @@ class Page:
         if not self._has_seat(client.client_id):
             client.add_notification("Full", FULL, color="red")
             return
-        client.camera.fov = self._first_fov(client.camera.image_width / client.camera.image_height)
+        fov = client.camera.fov = self._first_fov(client.camera.image_width / client.camera.image_height)
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
-        Controls(session, self.folder, self.training)
+        # The browser may have said once more what its field was, before it heard of this one.
+        Controls(session, self.folder, fov, self.training)
         # Who has left meanwhile may have been seen off before being here.
         if client.client_id not in self.server.get_clients():
             self._take_leave(client)

@@ -77,7 +77,7 @@ class Panel:
         around = frame_of(record.cameras, record.aabb)
         self.session = ViewerClient(self.client, self.queue, Photographs(record, capture, "white"), around, HEIGHT)
         self.session.start()
-        self.controls = Controls(self.session, folder)
+        self.controls = Controls(self.session, folder, 0.6)
 
     def work(self):
         while self.queue.work():

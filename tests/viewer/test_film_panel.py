@@ -103,7 +103,7 @@ def test_a_frame_that_cannot_be_rendered_ends_the_film_alone(panel, tmp_path, mo
 
 
 def test_numbers_that_no_control_has_are_clamped_and_large_films_are_not_sent(panel, tmp_path, monkeypatch):
-    panel.gui.made["Width"].value, panel.gui.made["Frames a second"].value = -(10**9), -5
+    panel.gui.made["Width"].value, panel.gui.made["Frame rate"].value = -(10**9), -5
     panel.press("Render film")
     finished(panel)
     assert read_video(tmp_path / "viewer" / "film_001" / "video.mp4")[1].shape == (1, 32, 32, 3)
