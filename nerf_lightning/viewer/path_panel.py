@@ -213,7 +213,7 @@ class PathPanel:
         marks = [(round(time, 2), str(number + 1)) for number, time in enumerate(self.path.times)][::every]
         at, before = round(self.path.times[self.chosen], 2), self.line
         with self.folder:  # viser's marks are fixed, so it is another one
-            self.line = self._time_line(end, min(at, end), tuple(marks), before.order)
+            self.line = self._time_line(end, min(at, end), tuple(marks), float(before.order))
         before.remove()
 
     def _time_line(self, end: float, at: float, marks: Any = None, order: float | None = None) -> Any:

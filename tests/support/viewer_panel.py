@@ -26,7 +26,7 @@ class Handle:
 
     def __init__(self, value, **options):
         self.value, self.options, self.visible = value, (), True
-        vars(self).update(options)
+        vars(self).update({name: value for name, value in options.items() if value is not None})
         self.act = lambda event: None
 
     def on_update(self, function):

@@ -92,4 +92,4 @@ def test_without_a_crop_box_it_is_said_why(tmp_path):
     panel = Panel(tmp_path, space="ndc")
     assert "Show only what is in the box" not in panel.gui.made
     assert "Crop box" in panel.gui.made
-    assert any("forward-facing capture" in label for label in panel.gui.made)
+    assert any("forward-facing capture" in label for label in map(str, panel.gui.made))
