@@ -51,7 +51,7 @@ def test_the_page_works_behind_its_policy_and_a_strangers_name_is_text(page):
         assert complaints_of(browser) == []
         title = browser.title
         press(browser, "xpath", "//*[text()='Photographs']")
-        press(browser, "css selector", "img.nerf-photograph")
+        press(browser, "xpath", "(//img[@class='nerf-photograph'])[1]")
         wait(lambda: NAME in browser.find_element("css selector", "body").text)
         assert browser.find_elements("css selector", "iframe") == []
         assert browser.title == title
