@@ -2,16 +2,17 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
+from rich.progress import Progress
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.console import tracked
+from nerf_lightning.console import ProgressLines, stderr_console
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
@@ -42,21 +43,60 @@ def film(
     Raises:
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
-    settings = FilmSettings() if settings is None else settings
+    steps = film_steps(subjects, path, tile_points, folder, FilmSettings() if settings is None else settings)
+    with Progress(transient=True, console=stderr_console()) as bar:
+        task, lines = bar.add_task("filming", total=None), ProgressLines()
+        for done, total in steps:
+            bar.update(task, completed=done, total=total)
+            lines("filming", done / max(total, 1))
+            if done == total:
+                break
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return list(end.value)
+
+
+def film_steps(
+    subjects: list[Subject],
+    path: CameraPath,
+    tile_points: int,
+    folder: Path,
+    settings: FilmSettings,
+    shows_encoding: bool = True,
+) -> Generator[tuple[int, int], None, list[Path]]:
+    """Film a frame at a time, for who has something else to do between two; what is not said here is as in `film`.
+
+    Yields how many frames of how many are there: at first, and after each. After the last one, the films are made.
+
+    Args:
+        subjects: models of one capture.
+        path: where the cameras are.
+        tile_points: most points that go through a field at once.
+        folder: where to.
+        settings: what is filmed.
+        shows_encoding: show in the terminal how far the making of the films is.
+
+    Raises:
+        InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
+    """
     _check(subjects, settings)
     shots = make_shots(
         subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
     )
     require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
-    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form)
+    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form, shows_encoding)
     try:
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         mine = ranks.every_other(missing)
-        for number in tracked(mine, "filming"):
+        yield 0, len(mine)
+        for done, number in enumerate(mine, start=1):
             for name, picture in _frame(shots, settings, number, seen).items():
                 frames.save(name, number, picture)
+            yield done, len(mine)
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
             frames.finish(path.fps)

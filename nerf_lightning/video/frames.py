@@ -42,9 +42,11 @@ class FilmFrames:
         count: how many frames each has.
         form: `video` and `animation` keep frames in a hidden folder until one file is made of them; `frames` are the
             result.
+        shows_encoding: show in the terminal how far `finish` is.
     """
 
-    def __init__(self, folder: Path, films: Sequence[str], count: int, form: Form) -> None:
+    def __init__(self, folder: Path, films: Sequence[str], count: int, form: Form, shows_encoding: bool = True) -> None:
+        self.shows_encoding = shows_encoding
         self.folder, self.films, self.count, self.form = folder, films, count, form
         self.hidden = folder / ".frames"
         self.root = folder if form == "frames" else self.hidden
@@ -122,7 +124,7 @@ class FilmFrames:
 
     def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width 3"]]:
         numbers = range(self.count)
-        for number in tracked(numbers, f"encoding {film}"):
+        for number in tracked(numbers, f"encoding {film}") if self.shows_encoding else numbers:
             file = self._file(film, number)
             try:
                 yield torch.from_numpy(read_rgba(file)[..., :3].copy())

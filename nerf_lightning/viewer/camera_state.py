@@ -1,7 +1,9 @@
 """What a person wants to see: a place to look from, in a window of some size; and the cameras that show it."""
 
+import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -30,6 +32,29 @@ class CameraState:
     """Look through the camera of this view, lens included, with its picture in the middle of the window."""
 
 
+def fov_that_holds(fov: float, shape: float, window: float) -> float:
+    """Return the vertical field of view (radians) at which a window shows a photograph to its edges.
+
+    Args:
+        fov: what the photograph takes in from top to bottom, in radians.
+        shape: its width over its height.
+        window: that of the window.
+
+    >>> round(fov_that_holds(1.0, 1.5, 2.0), 3), round(fov_that_holds(math.pi / 2, 2.0, 1.0), 3)
+    (1.0, 2.214)
+    """
+    return 2 * math.atan(math.tan(0.5 * fov) * max(1.0, shape / window))
+
+
+def fov_held_by(fov: float, shape: float, window: float) -> float:
+    """Return the vertical field of view of pictures of this shape that a window of this field shows to their edges.
+
+    >>> round(fov_held_by(fov_that_holds(0.7, 2.0, 1.0), 2.0, 1.0), 3)
+    0.7
+    """
+    return 2 * math.atan(math.tan(0.5 * fov) / max(1.0, shape / window))
+
+
 def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
     """Return the pose of a camera whose rotation is given with axes right, down, forward (OpenCV's).
 
@@ -39,6 +64,13 @@ def pose_of(wxyz: Float[Tensor, "4"], position: Float[Tensor, "3"]) -> Float[Ten
     """
     turned = rotation_from_quaternion(wxyz) * torch.tensor([1.0, -1.0, -1.0]).to(wxyz)
     return torch.cat([turned, position[:, None]], dim=-1)
+
+
+def quaternion_of(c2w: Tensor) -> np.ndarray:
+    """Return the rotation of a pose as viser wants it: w, x, y, z for the axes right, down, forward."""
+    from viser.transforms import SO3
+
+    return SO3.from_matrix((c2w[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()).wxyz
 
 
 def camera_of(look: CameraState, record: SceneRecord, height: int) -> tuple[Cameras, Tensor, Tensor]:

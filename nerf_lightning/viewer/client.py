@@ -5,13 +5,15 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
-from nerf_lightning.viewer.camera_state import CameraState, pose_of
+from nerf_lightning.video.settings import Corner
+from nerf_lightning.viewer.camera_state import CameraState, fov_that_holds, pose_of, quaternion_of
 from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
+from nerf_lightning.viewer.occlusion import FARTHEST, planar_depth
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import View
@@ -19,6 +21,9 @@ from nerf_lightning.viewer.shown_photographs import Photographs
 
 # Coarse pictures are sent often, fine ones once.
 COARSE_QUALITY, FINE_QUALITY = 75, 92
+# Cameras lie this many times as far as the photographs were taken, at most: where depths cannot be told so far, nothing
+# is hidden.
+FARTHER = 4
 # Who stands this near (share of the photographs' distance) to a photograph's place, looking the same way, is there.
 NEAR, SAME_WAY = 2e-3, 1 - 1e-5
 
@@ -41,10 +46,15 @@ class ViewerClient:
         self.refinement = ProgressiveRendering(self._show, most_height)
         self.channel, self.split = COLOR, 0.5
         self.crop: CropBox | None = None
+        self.crop_corners: tuple[Corner, Corner] | None = None
+        """The same, in the user's frame and units."""
         self.photograph: int | None = None
         """The view whose camera is looked through."""
         self.on_finest: Callable[[], None] = lambda: None
         self.on_leave: Callable[[], None] = lambda: None
+        self.on_move: Callable[[], None] = lambda: None
+        """Called when the camera may have moved, before the picture."""
+        self._drawn_over: set[str] = set()
         self._arrived = False
         self._seen: tuple[View, CameraState] | None = None
         self._shown: UInt8[Tensor, "h w 3"] | None = None
@@ -61,6 +71,7 @@ class ViewerClient:
         camera = self.client.camera
         if self.photograph is not None:
             self._notice_leaving()
+        self.on_move()
         self.refinement.ask(
             CameraState(
                 c2w=self.pose(),
@@ -77,6 +88,22 @@ class ViewerClient:
         """Return viser's camera as ours."""
         camera = self.client.camera
         return pose_of(torch.tensor(camera.wxyz).float(), torch.tensor(camera.position).float())
+
+    def go(self, c2w: Float[Tensor, "3 4"], fov: float) -> None:
+        """Take the person's camera there; the window shows all of a picture of this vertical field (radians)."""
+        camera, shape = self.client.camera, self.around.width / self.around.height
+        with self.client.atomic():
+            camera.position = c2w[:, 3].double().numpy()
+            camera.wxyz = quaternion_of(c2w)
+            camera.fov = fov_that_holds(fov, shape, camera.aspect)
+
+    def level(self) -> None:
+        """Let the person's camera turn about the capture's up again, after it has been taken elsewhere."""
+        self.client.camera.up_direction = self.around.up.double().numpy()
+
+    def is_here(self) -> bool:
+        """Tell whether the person has not left."""
+        return self.queue.serves(self.client.client_id)
 
     def enter(self, view: int) -> None:
         """Look through the camera of a photograph."""
@@ -110,6 +137,13 @@ class ViewerClient:
             finally:
                 self._presenting.release()
 
+    def draw_over(self, what: str, drawn: bool) -> None:
+        """Say what is drawn over the picture: then its depth is sent too, so that the content hides parts of it."""
+        had = bool(self._drawn_over)
+        (self._drawn_over.add if drawn else self._drawn_over.discard)(what)
+        if bool(self._drawn_over) != had:
+            self.present()
+
     def latest(self) -> UInt8[Tensor, "h w 3"] | None:
         """Return the picture that was sent last."""
         return self._shown
@@ -121,15 +155,17 @@ class ViewerClient:
             self.on_finest()
 
     def _send(self, view: View, look: CameraState, quality: int) -> None:
-        picture = picture_of(view, self.channel)
+        picture, depth = picture_of(view, self.channel), None
         if look.photograph is not None:
             height, width, _ = picture.shape
             if self.photographs.has(look.photograph):
                 truth = self.photographs.picture(look.photograph, width, height)
                 picture = wiped(truth, picture, self.split)
             picture = in_window(picture, look.width / look.height)
+        elif self._drawn_over and self.around.radius < FARTHEST / FARTHER:
+            depth = planar_depth(view)
         self._shown = picture
-        self.client.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality)
+        self.client.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality, depth=depth)
         self.client.flush()
 
     def _notice_leaving(self) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -11,12 +11,15 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
+from nerf_lightning.viewer.film_panel import FilmPanel
 from nerf_lightning.viewer.frusta import Frusta
-from nerf_lightning.viewer.plain_text import as_plain_markdown
-from nerf_lightning.viewer.recorded_path import LEAST_SECONDS, RecordedPath, free_name, not_saved
+from nerf_lightning.viewer.path_panel import PathPanel
+from nerf_lightning.viewer.photograph_panel import PhotographPanel
+from nerf_lightning.viewer.ranges import within
+from nerf_lightning.viewer.recorded_path import RecordedPath, free_name, not_saved
+from nerf_lightning.viewer.training_panel import TrainingPanel
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 from nerf_lightning.visualization.pictures import save_png
-
-Number = TypeVar("Number", int, float)
 
 AXES = ("x", "y", "z")
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
@@ -30,25 +33,29 @@ class Controls:
 
     Args:
         session: theirs.
-        folder: where snapshots and camera paths are written.
+        folder: where snapshots, camera paths and films are written.
+        fov: the vertical field of view that is shown first, in radians.
+        training: what the panel may ask of the training that is shown; None: none is shown.
     """
 
-    def __init__(self, session: ViewerClient, folder: Path):
-        self.session, self.folder = session, folder
+    def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
+        self.session, self.folder, self.training = session, folder, training
         self.gui = session.client.gui
         self.harmless = session.queue.complaints.harmless
-        self.frusta = Frusta(session, self._enter)
-        self.path = RecordedPath(session, folder, self.frusta.add_keyframe)
+        self.frusta = Frusta(session, lambda view: self.photographs.enter(view))
+        self.path = RecordedPath(session.around, folder)
         self._wants_snapshot = False
-        session.on_finest, session.on_leave = self._keep_snapshot, self._left
-        self._add_view()
-        self._add_photographs()
-        self._add_path()
+        session.on_finest = self._keep_snapshot
+        if training is not None:
+            TrainingPanel(session, training)
+        self._add_view(round(math.degrees(fov)))
+        self.photographs = PhotographPanel(session, self.frusta)
+        PathPanel(session, self.path, self.frusta.hide)
+        self.film = FilmPanel(session, self.path, folder, self._why_no_film)
         self._add_crop()
 
-    def _add_view(self) -> None:
+    def _add_view(self, degrees: int) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
-        degrees = round(math.degrees(self.session.client.camera.fov))
         shown = within(float(degrees), LEAST_DEGREES, MOST_DEGREES)
         fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, shown)
         snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
@@ -72,78 +79,9 @@ class Controls:
             self.session.refinement.refresh()
             self.session.queue.wake()
 
-    def _add_photographs(self) -> None:
-        names = self.session.photographs.record.view_names
-        with self.gui.add_folder("Photographs"):
-            visible = self.gui.add_checkbox("Show cameras", False)
-            number = self.gui.add_slider("View", 0, max(1, len(names) - 1), 1, 0)
-            enter = self.gui.add_button("Look through it", hint="Or click a camera in the scene")
-            self._name = self.gui.add_markdown("", visible=False)
-            self._split = self.gui.add_slider(
-                "Photograph | render", 0.0, 1.0, 0.01, self.session.split, visible=False, hint="Left is the photograph"
-            )
-            self._leave = self.gui.add_button("Leave", visible=False)
-
-        @visible.on_update
-        @self.harmless
-        def _(_: Any) -> None:
-            self.frusta.show(visible.value)
-
-        @enter.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            self._enter(within(number.value, 0, len(names) - 1))
-
-        @self._split.on_update
-        @self.harmless
-        def _(_: Any) -> None:
-            self.session.split = within(self._split.value, 0.0, 1.0)
-            self.session.present()
-
-        @self._leave.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            self.session.leave()
-
-    def _enter(self, view: int) -> None:
-        photographs = self.session.photographs
-        there = photographs.has(view)
-        self._name.content = f"Through the camera of {as_plain_markdown(photographs.record.view_names[view])}" + (
-            "" if there else " (its photograph is not at hand)"
-        )
-        self._name.visible = self._leave.visible = True
-        self._split.visible = there
-        self.frusta.hide_for_photograph(True)
-        self.session.enter(view)
-
-    def _left(self) -> None:
-        self._name.visible = self._leave.visible = self._split.visible = False
-        self.frusta.hide_for_photograph(False)
-
-    def _add_path(self) -> None:
-        with self.gui.add_folder("Camera path", expand_by_default=False):
-            add = self.gui.add_button("Add keyframe", hint="The camera as it is now")
-            seconds = self.gui.add_number(
-                "Seconds between", 2.0, min=LEAST_SECONDS, max=limits.MOST_SECONDS_BETWEEN, step=0.1
-            )
-            undo = self.gui.add_button("Remove last")
-            save = self.gui.add_button("Save as yaml")
-            said = self.gui.add_markdown("No keyframes yet.")
-
-        @add.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.add(float(seconds.value))
-
-        @undo.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.remove_last()
-
-        @save.on_click
-        @self.harmless
-        def _(_: Any) -> None:
-            said.content = self.path.save()
+    def _why_no_film(self) -> str | None:
+        paused = self.training is None or self.training.wants_pause
+        return None if paused else "The model changes while it trains. Pause the training first, then film it."
 
     def _add_crop(self) -> None:
         record = self.session.photographs.record
@@ -162,6 +100,7 @@ class Controls:
             ends = (ends_within(slider.value, a, b) for slider, a, b in zip(sliders, low, high, strict=True))
             lower, upper = zip(*ends, strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
+            self.session.crop_corners = (lower, upper) if on.value else None
             self.frusta.draw_box(self.session.crop)
             self.session.look()
 
@@ -180,15 +119,6 @@ class Controls:
             self.session.client.add_notification("Snapshot", not_saved(error), color="red")
         else:
             self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
-
-
-def within(value: Number, least: Number, most: Number) -> Number:
-    """Return the nearest number in a range: a browser may send what its slider does not have.
-
-    >>> within(7, 0, 5)
-    5
-    """
-    return min(max(value, least), most)
 
 
 def ends_within(ends: tuple[float, ...], least: float, most: float) -> tuple[float, float]:

@@ -1,25 +1,25 @@
-"""What is drawn over the picture: the cameras of the photographs, keyframes, and the crop box."""
+"""What is drawn over the picture: the cameras of the photographs, and the crop box."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.viewer.camera_state import quaternion_of
 from nerf_lightning.viewer.client import ViewerClient
 
-ROOT, CAMERAS, KEYFRAMES, BOX = "/overlay", "/overlay/cameras", "/overlay/keyframes", "/overlay/crop"
-GREY, ORANGE, BLUE = (90, 90, 90), (240, 120, 20), (40, 110, 220)
+ROOT, CAMERAS, BOX = "/overlay", "/overlay/cameras", "/overlay/crop"
+GREY, BLUE = (90, 90, 90), (40, 110, 220)
 # Size of a frustum as a share of the photographs' distance.
 SCALE = 0.03
 
 
 class Frusta:
-    """Draw the photographs' cameras, keyframes and the crop box into what one person sees.
+    """Draw the photographs' cameras and the crop box into what one person sees.
 
     Args:
         session: of that person.
@@ -41,9 +41,10 @@ class Frusta:
             for view in self.session.photographs.shown:
                 self._add_camera(view)
         self.cameras.visible = visible
+        self.session.draw_over("cameras", visible)
 
-    def hide_for_photograph(self, hidden: bool) -> None:
-        """Hide everything while a photograph is compared with its render, pixel by pixel."""
+    def hide(self, hidden: bool) -> None:
+        """Hide everything while a photograph is compared with its render pixel by pixel, or a path is played."""
         self.root.visible = not hidden
 
     def draw_box(self, box: CropBox | None) -> None:
@@ -58,10 +59,7 @@ class Frusta:
             middle = (box.corner + 0.5 * box.size @ box.axes).double().numpy()
             size = tuple(box.size.tolist())
             self.box = self.scene.add_box(BOX, BLUE, size, wireframe=True, wxyz=turned, position=middle)
-
-    def add_keyframe(self, number: int, c2w: Float[Tensor, "3 4"], fov: float, aspect: float) -> Any:
-        """Draw a keyframe's camera (`fov` from top to bottom in radians, width over height); return viser's handle."""
-        return self._frustum(f"{KEYFRAMES}/{number}", c2w, fov, aspect, ORANGE, None)
+        self.session.draw_over("crop box", box is not None)
 
     def _add_camera(self, view: int) -> None:
         photographs = self.session.photographs
@@ -70,35 +68,43 @@ class Frusta:
         fov = vertical_field_of_view(cameras, view)
         thumbnail = photographs.thumbnail(view)
         image = None if thumbnail is None else thumbnail.numpy()
-        handle = self._frustum(f"{CAMERAS}/{view}", cameras.c2w[view], fov, width / height, GREY, image)
+        name, shape = f"{CAMERAS}/{view}", width / height
+        handle = draw_camera(self.scene, name, cameras.c2w[view], fov, shape, self.size, GREY, image)
         handle.on_click(self.session.queue.complaints.harmless(lambda _: self.on_click(view)))
 
-    def _frustum(
-        self,
-        name: str,
-        c2w: Float[Tensor, "3 4"],
-        fov: float,
-        aspect: float,
-        color: tuple[int, int, int],
-        image: UInt8[np.ndarray, "height width 3"] | None,
-    ) -> Any:
-        return self.scene.add_camera_frustum(
-            name,
-            fov,
-            aspect,
-            scale=self.size,
-            thickness=0.02 * self.size,
-            color=color,
-            image=image,
-            wxyz=quaternion_of(c2w),
-            position=c2w[:, 3].double().numpy(),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
 
+def draw_camera(
+    scene: Any,
+    name: str,
+    c2w: Float[Tensor, "3 4"],
+    fov: float,
+    aspect: float,
+    size: float,
+    color: tuple[int, int, int],
+    image: UInt8[np.ndarray, "height width 3"] | None = None,
+) -> Any:
+    """Draw a camera as the pyramid that it sees; return viser's handle.
 
-def quaternion_of(c2w: Tensor) -> np.ndarray:
-    """Return the rotation of a pose as viser wants it: w, x, y, z for the axes right, down, forward."""
-    from viser.transforms import SO3
-
-    return SO3.from_matrix((c2w[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()).wxyz
+    Args:
+        scene: viser's, of one person.
+        name: where in viser's tree.
+        c2w: where it stands.
+        fov: from top to bottom, in radians.
+        aspect: width over height.
+        size: how far its picture lies from its place (scene units).
+        color: red, green and blue, each up to 255.
+        image: its picture.
+    """
+    return scene.add_camera_frustum(
+        name,
+        fov,
+        aspect,
+        scale=size,
+        thickness=0.02 * size,
+        color=color,
+        image=image,
+        wxyz=quaternion_of(c2w),
+        position=c2w[:, 3].double().numpy(),
+        cast_shadow=False,
+        receive_shadow=False,
+    )

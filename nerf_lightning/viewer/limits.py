@@ -36,6 +36,14 @@ MOST_SNAPSHOTS = 1000
 """Files of snapshots in one folder."""
 MOST_PATHS = 200
 """Files of camera paths in one folder."""
+MOST_FILMS = 50
+"""Folders of films in one folder; one film is made at a time."""
+LEAST_FILM_WIDTH, MOST_FILM_WIDTH = 32, 1920
+"""Pixels across a film."""
+MOST_FILM_RATE = 60
+"""Frames per second of a film."""
+MOST_DOWNLOAD_BYTES = 64 * 1024 * 1024
+"""A larger film is not sent to a browser: what waits for a browser lies in memory."""
 MOST_KEYFRAMES = 1000
 """Keyframes of one path; each is drawn in the page."""
 MOST_SECONDS_BETWEEN = 3600.0

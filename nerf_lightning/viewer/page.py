@@ -1,6 +1,7 @@
 """The page in the browser: viser's server, and a session for everybody who opens it."""
 
 import logging
+import math
 import threading
 import warnings
 import webbrowser
@@ -16,11 +17,13 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
+from nerf_lightning.viewer.camera_state import fov_that_holds
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.controls import Controls
+from nerf_lightning.viewer.controls import MOST_DEGREES, Controls
 from nerf_lightning.viewer.ports import free_port
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.shown_photographs import Photographs
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 
 # The view begins this many times as far from the middle as the first photograph: behind the cameras, not among them.
 START = 1.4
@@ -57,6 +60,7 @@ class Page:
         port: the port, or the first to try.
         most_height: the finest picture, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
+        training: what the page may ask of the training that it shows; None: it shows none.
 
     Raises:
         InputError: no viser, or one that cannot be guarded; no place to listen; a host that is none.
@@ -71,14 +75,15 @@ class Page:
         port: int,
         most_height: int,
         hosts: Sequence[str] | None = None,
+        training: TrainingSwitch | None = None,
     ) -> None:
         viser = require_viser()
         from nerf_lightning.viewer.guarded_server import Guard
 
         self.queue, self.photographs, self.folder = queue, photographs, folder
-        self.most_height = most_height
+        self.most_height, self.training = most_height, training
         record = photographs.record
-        self.around = frame_of(record.cameras, record.aabb)
+        self.around = frame_of(record.cameras, record.aabb, to_user=record.to_user)
         # Pages are closed while a picture is on its way to them; that needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self.admission = Admission(host, hosts)
@@ -99,6 +104,11 @@ class Page:
         """Where a browser finds the page; who has this address has the token."""
         place = address_of(self.server.get_host(), self.server.get_port())
         return f"{place}/?token={self.admission.token}"
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nobody looks on."""
+        return not self._seats
 
     def close(self) -> None:
         """Stop listening; open pages say that the connection is lost."""
@@ -122,12 +132,22 @@ class Page:
         if not self._has_seat(client.client_id):
             client.add_notification("Full", FULL, color="red")
             return
+        fov = client.camera.fov = self._first_fov(client.camera.image_width / client.camera.image_height)
         session = ViewerClient(client, self.queue, self.photographs, self.around, self.most_height)
         session.start()  # the first picture is on its way while the panel is made
-        Controls(session, self.folder)
+        # The browser may have said once more what its field was, before it heard of this one.
+        Controls(session, self.folder, fov, self.training)
         # Who has left meanwhile may have been seen off before being here.
         if client.client_id not in self.server.get_clients():
             self._take_leave(client)
+
+    def _first_fov(self, window: float) -> float:
+        """Return the field of view that begins: what the first photograph takes in, in a window of any shape."""
+        cameras = self.photographs.record.cameras
+        panorama = cameras.lens_model == "equirectangular"
+        shape = 1.0 if panorama else int(cameras.width[0]) / int(cameras.height[0])
+        widest = math.radians(MOST_DEGREES)
+        return min(fov_that_holds(vertical_field_of_view(cameras, 0), shape, window), widest)
 
     def _has_seat(self, client: int) -> bool:
         with self._lock:

@@ -5,14 +5,35 @@ import signal
 import threading
 import time
 from types import FrameType
+from typing import Protocol, runtime_checkable
 
 from nerf_lightning.viewer.complaints import Complaints
-from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.renderer import SlicedRenderer
 
 IDLE_SECONDS = 0.2
 
 log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class Turn(Protocol):
+    """Something that is rendered slice by slice, in turn with others."""
+
+    served: float
+    """When it last had a turn (queue's clock)."""
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether somebody waits for it more than for others."""
+
+    def work(self, renderer: SlicedRenderer) -> bool:
+        """Render a slice; return False where nothing is left to do."""
+
+    def refresh(self) -> None:
+        """Render again: the model has changed."""
+
+    def give_up(self) -> None:
+        """Drop what could not be rendered."""
 
 
 class RenderQueue:
@@ -25,12 +46,12 @@ class RenderQueue:
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
         self.complaints = Complaints(log)
-        self._refinements: dict[int, ProgressiveRendering] = {}
+        self._refinements: dict[int, Turn] = {}
         self._lock = threading.Lock()
         self._wish = threading.Event()
 
-    def add(self, client: int, refinement: ProgressiveRendering) -> None:
-        """Render for a client from now on."""
+    def add(self, client: int, refinement: Turn) -> None:
+        """Render for a client from now on, or a film (`film_job.FILM`)."""
         with self._lock:
             self._refinements[client] = refinement
         self.wake()
@@ -39,6 +60,14 @@ class RenderQueue:
         """Stop rendering for a client that has left."""
         with self._lock:
             self._refinements.pop(client, None)
+
+    def serves(self, client: int) -> bool:
+        """Tell whether this client is rendered for."""
+        return client in self._refinements
+
+    def turn_of(self, client: int) -> Turn | None:
+        """Return what is rendered for a client, or None."""
+        return self._refinements.get(client)
 
     def wake(self) -> None:
         """Say that a client wants another picture."""
@@ -83,7 +112,7 @@ class RenderQueue:
         """Whether there is no client."""
         return not self._refinements
 
-    def _in_order(self) -> list[ProgressiveRendering]:
+    def _in_order(self) -> list[Turn]:
         with self._lock:
             return sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))
 

@@ -76,3 +76,19 @@ def drag(driver, right: int, down: int) -> None:
 
     canvas = driver.find_element("css selector", "canvas")
     ActionChains(driver).move_to_element(canvas).click_and_hold().move_by_offset(right, down).release().perform()
+
+
+def press(driver, by: str, what: str, seconds: float = 40.0) -> None:
+    """Click on something as soon as it can be clicked: folders of the panel take a while to open."""
+    from selenium.common.exceptions import WebDriverException
+
+    end = time.monotonic() + seconds
+    while True:
+        for element in driver.find_elements(by, what):
+            try:
+                element.click()
+            except WebDriverException:
+                continue
+            return
+        assert time.monotonic() < end, f"{what} cannot be clicked"
+        time.sleep(0.1)

@@ -66,11 +66,14 @@ class ServedPage:
 
 
 @contextmanager
-def served(folder: Path, record: dict | None = None, **options):
-    """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture."""
-    record = replace(scene_record(ball_scene(num_views=4, size=16)), **(record or {}))
-    queue = RenderQueue(SlicedRenderer(tiny_model().eval(), record, "white", 4096))
-    page = Page(queue, Photographs(record, None, "white"), folder, "127.0.0.1", unused_port(), HEIGHT, **options)
+def served(folder: Path, record: dict | None = None, model=None, scene=None, height: int = HEIGHT, **options):
+    """Serve a page until the end of the block; `record` changes what the checkpoint says of the capture.
+
+    `scene` has the photographs, which are not at hand otherwise.
+    """
+    record = replace(scene_record(scene or ball_scene(num_views=4, size=16)), **(record or {}))
+    queue = RenderQueue(SlicedRenderer(model or tiny_model().eval(), record, "white", 4096))
+    page = Page(queue, Photographs(record, scene, "white"), folder, "127.0.0.1", unused_port(), height, **options)
     over = threading.Event()
 
     def work() -> None:

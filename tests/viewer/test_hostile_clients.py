@@ -140,21 +140,30 @@ UPDATES = [
 ]
 
 
-@pytest.mark.parametrize("label", ["Show", "Field of view", "View", "x", "Seconds between", "Add keyframe"])
+@pytest.mark.parametrize(
+    "label",
+    ["Show", "Field of view", "1-4 of 4", "Find", "x", "Seconds to it", "Change it", "Time", "Saved", "Add keyframe"],
+)
 def test_impossible_values_on_the_panel_are_dropped(page, client, label):
     client.look_from(0)
     for updates in UPDATES:
         client.update(label, updates)
-    client.set("Look through it", True)
+    client.set("ball_0", True)
     client.look_from(90)
     client.wait_for_height(HEIGHT)
 
 
 def test_out_of_range_on_the_panel_is_clamped(page, client):
     client.look_from(0)
-    for label, value in {"Field of view": 1e9, "View": 10**6, "Seconds between": -1e9, "Show": "no channel"}.items():
+    for label, value in {"Field of view": 1e9, "Show": "no channel", "Saved": "../x"}.items():
         client.set(label, value)
-    client.set("Look through it", True)
+    client.set("Add keyframe", True)
+    client.set("Add keyframe", True)
+    for label, value in {"Seconds to it": -1e9, "Keyframe": "-7", "Change it": "x", "Move it": "", "Time": 1e9}.items():
+        client.set(label, value)
+    client.set("Load", True)
+    client.set("Play", True)
+    client.set("ball_0", True)
     client.set("x", [9e8, -9e8])
     client.set("Show only what is in the box", True)
     client.look_from(90)

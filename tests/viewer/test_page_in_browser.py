@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from support.browser import opened, wait_until
+from support.browser import opened, press, wait_until
 from support.served_page import served
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,8 @@ def test_the_page_works_behind_its_policy_and_a_strangers_name_is_text(page):
         wait_until(browser, lambda picture: picture.std() > 5)
         assert complaints_of(browser) == []
         title = browser.title
-        wait(lambda: browser.find_elements("xpath", "//*[text()='Look through it']"))[0].click()
+        press(browser, "xpath", "//*[text()='Photographs']")
+        press(browser, "xpath", "(//img[@class='nerf-photograph'])[1]")
         wait(lambda: NAME in browser.find_element("css selector", "body").text)
         assert browser.find_elements("css selector", "iframe") == []
         assert browser.title == title

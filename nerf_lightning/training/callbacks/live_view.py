@@ -1,27 +1,44 @@
 """The page of `nerf view` while training."""
 
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.console import spoken
 from nerf_lightning.errors import InputError
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.admission import named_places
+from nerf_lightning.viewer.film_job import FILM, end_film
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address
-from nerf_lightning.viewer.render_queue import RenderQueue
+from nerf_lightning.viewer.render_queue import IDLE_SECONDS, RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 
 # Steps take their time, so a picture may as well.
 MOVING_SECONDS = 0.5
 # How much unused time for pictures is saved up at most (seconds).
 MOST_CREDIT = 0.1
+
+
+log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A callback that measures time, in which pauses of the training are not to be counted."""
+
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds."""
 
 
 class LiveView(Callback):
@@ -61,6 +78,7 @@ class LiveView(Callback):
         self.share, self.refresh_seconds, self.max_height = share, refresh_seconds, max_height
         self.page: Page | None = None
         self.credit, self.last, self.refreshed = 0.0, 0.0, 0.0
+        self.switch, self.said = TrainingSwitch(), ""
 
     def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
         """Open the page, and say where it is."""
@@ -77,16 +95,24 @@ class LiveView(Callback):
         )
         photographs = Photographs(renderer.scene, scene, scene.background)
         folder = Path(trainer.default_root_dir) / "viewer"
+        # Other processes would wait for this one at their next step, and only for so long.
+        self.switch = TrainingSwitch(can_pause=ranks.world_size() == 1)
         where = self.host, self.port, self.max_height, self.hosts
-        self.page = Page(RenderQueue(renderer), photographs, folder, *where)
+        self.page = Page(RenderQueue(renderer), photographs, folder, *where, self.switch)
         self.last = self.refreshed = time.perf_counter()
         # Its token is for this terminal: others may read train.log.
         print(f"Watch the training at {self.page.address}", flush=True)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Render for as long as the share allows."""
+        """Render for as long as the share allows; pause or stop where somebody in the page has asked for it."""
+        if ranks.largest(float(self.switch.wants_stop)):
+            trainer.should_stop = True
+            self._say(f"the training was stopped in the page at step {trainer.global_step}")
         if self.page is None:
             return
+        self.switch.count(trainer.global_step, pl_module.step.num_steps)
+        if self.switch.wants_pause:
+            self._pause(trainer, pl_module, self.page)
         now = time.perf_counter()
         self.credit = min(MOST_CREDIT, self.credit + self.share * (now - self.last))
         self.last = now
@@ -96,6 +122,7 @@ class LiveView(Callback):
         if now - self.refreshed > self.refresh_seconds:
             self.refreshed = now
             queue.refresh()
+            self.switch.show()
         self._spend(pl_module, queue)
 
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
@@ -105,6 +132,41 @@ class LiveView(Callback):
     def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
         """Close the page."""
         self._close()
+
+    def _pause(self, trainer: Trainer, system: Any, page: Page) -> None:
+        """Render for those who look on, and take no step, until somebody lets the training go on."""
+        self._say(f"the training pauses at step {trainer.global_step}: somebody has asked for it in the page")
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        signals = [each for each in callbacks if isinstance(each, StopSignals)]
+        share, renderer = self.share, page.queue.renderer
+        system.eval()
+        self.switch.show()
+        try:
+            renderer.share = 1.0
+
+            def work() -> None:
+                if not page.queue.work():
+                    page.queue.wait(IDLE_SECONDS)
+
+            seconds = self.switch.pause_while(
+                work,
+                lambda: not page.is_empty or page.queue.serves(FILM),
+                lambda: any(each.received is not None for each in signals),
+            )
+        finally:
+            renderer.share = share
+            system.train()
+        end_film(page.queue)
+        for callback in callbacks:
+            if isinstance(callback, Clocked):
+                callback.leave_out(seconds)
+        self.last = time.perf_counter()
+        self._say(f"the training goes on, after a pause of {spoken(seconds)}")
+
+    def _say(self, text: str) -> None:
+        if self.page is not None and text != self.said:
+            log.info("%s", text)
+            self.said = text
 
     def _spend(self, system: Any, queue: RenderQueue) -> None:
         # A slice that took longer is paid back before the next one begins.

@@ -32,6 +32,10 @@ class Monitor(Watcher):
         self.since = time.perf_counter()
         self.rays_seen = pl_module.step.progress.rays_seen
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds: the training paused."""
+        self.since += seconds
+
     def wants_gradients(self, trainer: Trainer, system: Any) -> bool:
         """Tell whether the step that begins gets a row, and so has to measure the norms of its gradients."""
         # XLA would compile the steps that get a row and those that do not as two programs.

@@ -77,6 +77,11 @@ class TrainingProgress(ProgressBar):
             left = (pl_module.step.num_steps - step) / per_second
             log.info("step %d/%d  %s  about %s left", step, pl_module.step.num_steps, text, spoken(left))
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds: the training paused."""
+        self.started += seconds
+        self.shown += seconds
+
     def _warn_of_days(self, left: float) -> None:
         if left > DAY and not self.warned:
             self.warned = True

@@ -53,6 +53,10 @@ class TimeBudget(Callback):
         if self.used >= self.seconds:
             trainer.should_stop = True
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds: the training paused."""
+        self.since += seconds
+
     def teardown(self, trainer: Trainer, pl_module: Any, stage: str) -> None:
         """Give the handler back."""
         if self.former is not None:

@@ -16,10 +16,15 @@ from support.viser_client import ViserClient
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.callbacks.live_view import LiveView
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.viewer import training_switch
 from nerf_lightning.viewer.camera_state import CameraState
+from nerf_lightning.viewer.page import Page
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
+from nerf_lightning.viewer.training_switch import TrainingSwitch
 
 
 @pytest.fixture
@@ -118,6 +123,8 @@ class Clock:
 
 
 class FakeSystem:
+    step = SimpleNamespace(num_steps=1)
+
     def eval(self):
         pass
 
@@ -182,3 +189,122 @@ def test_what_cannot_be_drawn_ends_no_training(trainer, caplog):
         callback.on_train_batch_end(trainer, FakeSystem(), None, None, 0)
     assert renderer.slices.call_count > 1
     assert caplog.text.count("could not be drawn: ZeroDivisionError") == 1
+
+
+class Watched:
+    """A callback whose page is looked at by as many people as `seats`."""
+
+    def __init__(self, trainer, monkeypatch):
+        renderer = MagicMock(spec=SlicedRenderer)
+        renderer.share = 0.15
+        self.page = MagicMock(spec=Page, queue=RenderQueue(renderer), is_empty=False)
+        self.callback, self.trainer, self.turns = LiveView(), trainer, 0
+        self.callback.page = self.page
+        self.at_turn = {}
+        """What happens at which turn of the pause."""
+        monkeypatch.setattr(self.page.queue, "work", self.work)
+
+    def work(self):
+        self.turns += 1
+        assert self.turns < 2000, "it waits for ever"
+        self.at_turn.get(self.turns, lambda: None)()
+        return True
+
+    def step(self):
+        self.callback.on_train_batch_end(self.trainer, FakeSystem(), None, None, 0)
+
+
+@pytest.fixture
+def watched(trainer, monkeypatch):
+    return Watched(trainer, monkeypatch)
+
+
+def test_a_paused_training_waits_until_somebody_lets_it_go_on(watched, caplog):
+    caplog.set_level("INFO")
+    watched.callback.switch.pause()
+    watched.at_turn[5] = watched.callback.switch.go_on
+    watched.step()
+    assert watched.turns == 5
+    assert "the training pauses at step 0" in caplog.text
+    assert "the training goes on" in caplog.text
+    watched.step()
+    assert watched.trainer.should_stop is False
+
+
+def test_a_pause_costs_no_budget_and_no_speed(watched, monkeypatch):
+    budget = TimeBudget(seconds=100.0)
+    budget.since = 0.0
+    watched.trainer.callbacks.append(budget)
+    now = [0.0]
+    monkeypatch.setattr(training_switch.time, "monotonic", lambda: now[0])
+    watched.callback.switch.pause()
+
+    def an_hour_later():
+        now[0] = 3600.0
+        watched.callback.switch.go_on()
+
+    watched.at_turn[1] = an_hour_later
+    watched.step()
+    assert budget.since == 3600.0
+
+
+def test_a_training_that_nobody_watches_any_more_goes_on(watched, monkeypatch):
+    """A browser that is closed, or whose machine sleeps, must not hold a training for ever."""
+    now = [0.0]
+    monkeypatch.setattr(training_switch.time, "monotonic", lambda: now[0])
+    watched.callback.switch.pause()
+
+    def leave():
+        watched.page.is_empty = True
+
+    def pass_time():
+        now[0] += training_switch.AWAY_SECONDS / 2
+
+    watched.at_turn |= {3: leave, 4: pass_time, 6: pass_time, 8: pass_time}
+    watched.step()
+    assert watched.turns == 8
+
+
+def test_ctrl_c_ends_a_pause(watched):
+    signals = StopSignals()
+    watched.trainer.callbacks.append(signals)
+    watched.callback.switch.pause()
+    watched.at_turn[2] = lambda: signals._handle(2, None)
+    watched.step()
+    assert watched.turns == 2
+
+
+def test_several_processes_are_not_paused():
+    switch = TrainingSwitch(can_pause=False)
+    switch.pause()
+    assert not switch.wants_pause
+
+
+def test_a_stop_ends_the_training_and_a_pause(watched):
+    watched.callback.switch.pause()
+    watched.at_turn[2] = watched.callback.switch.stop
+    watched.step()
+    watched.step()
+    assert watched.trainer.should_stop is True
+
+
+@pytest.mark.slow
+def test_a_training_stopped_in_the_page_is_saved_and_evaluated(capture, tmp_path):
+    watched = start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "final.video=false", "logger=none", "viewer=on",
+        "trainer.num_threads=1", "trainer.max_steps=1000000", f"viewer.live_view.port={unused_port()}",
+        "viewer.live_view.max_height=32", f"paths.output_dir={tmp_path / 'run'}",
+    )  # fmt: skip
+    client = ViserClient(address_in(watched), 32, 24)
+    client.look_from(0)
+    client.set("Pause", True)
+    client.wait_until(lambda: any("It pauses" in str(each) for each in client.said))
+    client.set("Stop training", True)
+    client.set("Stop training", True)
+    output, _ = watched.communicate(timeout=120)
+    assert watched.returncode == 0, output
+    assert "the training was stopped in the page at step" in output
+    assert "Traceback" not in output
+    assert (tmp_path / "run" / "metrics.json").is_file()
+    content = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert f"at step {content['global_step']}" in output

@@ -1,0 +1,100 @@
+"""The smooth curve through keyframes: where a camera stands at any time, and how much it sees."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.geometry.cameras import focal_from_fov
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.video.paths.base import PathFrame
+from nerf_lightning.video.paths.keyframes import Keyframe
+from nerf_lightning.video.paths.spline import along, even_speed, poses_along
+
+# Of the angle between where a keyframe looks and its up: less is rounding.
+LEAST_SINE = 1e-6
+
+
+class KeyframeCurve:
+    """Pass through keyframes (`geometry.paths.spline`).
+
+    Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
+    stays in the middle.
+
+    Args:
+        keyframes: two or more.
+        around: the capture.
+        times: when each is passed, and for a closed curve when the first one is again (seconds); empty: at about one
+            speed, from 0 to 1.
+        closed: go back to the first keyframe.
+
+    Raises:
+        InputError: a keyframe that looks straight along its up.
+    """
+
+    def __init__(self, keyframes: Sequence[Keyframe], around: PathFrame, times: Sequence[float], closed: bool = False):
+        # Times may lie close together for a long path.
+        self._keys = keyframe_poses(keyframes, around).double()
+        even = even_speed(self._keys, around.radius, closed)
+        self.knots = torch.tensor(times, dtype=self._keys.dtype) if times else even
+        targets = [around.point("file", each.look_at) for each in keyframes]
+        held = [target for target in targets if target is not None]
+        self._targets = torch.stack(held).double() if len(held) == len(targets) else None
+        logs = [[math.log(keyframe_focal(each, around))] for each in keyframes]
+        self._log_focal = torch.tensor(logs, dtype=self.knots.dtype)
+
+    def poses(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames 3 4"]:
+        """Return the cameras to world at some times."""
+        c2w = poses_along(self.knots, self._keys, at)
+        if self._targets is None:
+            return c2w
+        eyes = c2w[:, :, 3]
+        back = normalize(eyes - along(self.knots, self._targets, at), dim=-1)
+        right = normalize(torch.linalg.cross(c2w[:, :, 1], back), dim=-1)
+        return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
+
+    def focal(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
+        """Return the focal lengths at some times, between keyframes even in ratio (pixels, of the photographs' width).
+
+        Raises:
+            InputError: the curve leaves all that is a focal length.
+        """
+        focal = along(self.knots, self._log_focal, at).exp()[:, 0].float()
+        if not bool(((focal > 0) & torch.isfinite(focal)).all()):
+            raise InputError(
+                "path.file: the curve through the keyframes' fields of view swings beyond all cameras, since their "
+                "times are very uneven. Give times that are more alike, or leave them out."
+            )
+        return focal
+
+
+def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "keys 3 4"]:
+    """Return the cameras to world of keyframes.
+
+    Raises:
+        InputError: one of them looks straight along its up.
+    """
+    poses = [torch.zeros(0, 3, 4).to(around.center)]
+    for number, each in enumerate(keyframes, start=1):
+        eye = around.point("file", each.position)
+        assert eye is not None
+        up = normalize(around.up, dim=0) if each.up is None else around.direction(each.up)
+        ahead = around.direction(each.ahead)
+        if float(torch.linalg.cross(ahead, up).norm()) < LEAST_SINE:
+            raise InputError(
+                f"path.file: keyframe {number} looks straight along its up, so its picture has no top. Give it another "
+                "`up`, for instance one that is horizontal."
+            )
+        poses.append(look_at(eye, eye + ahead, up)[None])
+    return torch.cat(poses)
+
+
+def keyframe_focal(keyframe: Keyframe, around: PathFrame) -> float:
+    """Return a keyframe's focal length in pixels of a picture as wide as the photographs."""
+    if keyframe.fov is not None:
+        return focal_from_fov(around.width, math.radians(keyframe.fov))
+    return around.focal if keyframe.focal is None else keyframe.focal
