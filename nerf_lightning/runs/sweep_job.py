@@ -19,7 +19,6 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.config.messages import paragraph
-from nerf_lightning.console import label_lines
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
@@ -64,6 +63,8 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     sweep_folder, own = Path(hydra.sweep.dir), Path(hydra.runtime.output_dir)
     elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
     if elsewhere:
+        from nerf_lightning.console import label_lines  # rich takes its time, and this file is read before any command
+
         _behave_as_one_of_many()
         label_lines(job_label(int(hydra.job.num), own, list(hydra.overrides.task)))
         if stop_file(sweep_folder).exists():

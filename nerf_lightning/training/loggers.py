@@ -137,7 +137,8 @@ def opened_loggers(chosen: Mapping[str, Any], folder: Path, started: str, **purg
             if isinstance(each, RunLogger):
                 loggers.append(each.open(folder, started))
             else:
-                loggers.append(each(save_dir=folder, **(purge if issubclass(each.func, TensorBoardLogger) else {})))
+                forgets = isinstance(each.func, type) and issubclass(each.func, TensorBoardLogger)
+                loggers.append(each(save_dir=folder, **(purge if forgets else {})))
         yield loggers
         code = 0
     finally:

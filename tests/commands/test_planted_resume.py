@@ -118,7 +118,7 @@ CASES = {
     "an extra weight": (lambda c: c["state_dict"].update({"model.more": torch.zeros(1)}), "belongs to no part"),
     "a weight less": (lambda c: c["state_dict"].popitem(), "is missing"),
     "a schedule": (top(lr_schedulers=[{"x": 1}]), "lr_schedulers has 1 entries"),
-    "a stranger's key": (top(hyper_parameters={"x": 1}), "holds 'hyper_parameters'"),
+    "a stranger's key": (top(stranger={"x": 1}), "holds 'stranger'"),
     "a negative step": (top(global_step=-1), "global_step is -1"),
 }
 

@@ -38,6 +38,7 @@ from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.types.rays import PackedSamples, RaySamples
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.video.paths.base import frame_of
+from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 
 PACKAGE = Path(nerf_lightning.__file__).parent
@@ -266,6 +267,10 @@ def instances(tmp_path_factory) -> list[Any]:
     crop = CropBox.from_user((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8), known()["to_user"])
     others = [grid, crop, Clip(3.1, crop), Contracted(), RayErrors(), LPIPS(), known()["around"]]
     encoders = [instantiate(loaded("encoder", option)) for option in options("encoder")]
+    passed = [
+        Keyframe(place, look_at=(0.1, 0.2, 0.1)) for place in ((2.0, 0.3, 0.4), (0.2, 2.1, 0.5), (-1.9, 0.1, 0.6))
+    ]
+    others.append(KeyframeCurve(passed, known()["around"], []))
     return [*encoders, *samplers, *walks, *paths(tmp_path_factory.mktemp("paths")), *others]
 
 

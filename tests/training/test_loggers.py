@@ -41,7 +41,7 @@ def test_curves_are_kept_as_tables_of_each_start(trained):
     assert [row["step"] for row in first if row["train/loss"]] == ["2", "4"]
     assert [float(row["test/psnr"]) for row in first if row["test/psnr"]] == [pytest.approx(run.psnr)]
     assert (run.folder / "tensorboard").is_dir()
-    assert "choice.model: nerf_tiny" in (run.folder / "csv" / "version_0" / "hparams.yaml").read_text()
+    assert "model: nerf_tiny" in (run.folder / "csv" / "version_0" / "hparams.yaml").read_text()
     trained("logger=csv", "callbacks.monitor.every_steps=2", "resume=auto", "trainer.max_steps=6")
     assert rows(run.folder / "csv" / "version_0") == first
     assert [row["step"] for row in rows(run.folder / "csv" / "version_1") if row["train/loss"]] == ["6"]
