@@ -8,13 +8,15 @@ from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
 from nerf_lightning.machine import free_memory, held_memory
 from nerf_lightning.nerf.encoders.base import matrices_of
+from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.memory_trial import Trial, try_out
 from nerf_lightning.training.step import TrainStep
 
 # What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.
-GAPS = 0.25
+# Each thread has a heap of its own, and what one has freed no other takes: two threads leave twice as much.
+GAPS, MOST_HEAPS = 0.25, 2
 # A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
 # rows as a rule (products.py: few_sizes), and kept: 0.7 MB each.
 COMPILED_PER_MATRIX = 3 * 2 * 700_000
@@ -22,6 +24,9 @@ COMPILED_PER_MATRIX = 3 * 2 * 700_000
 NOTICEABLE = 1.05
 # A run that takes a smaller share of what is free needs no word.
 SMALL = 0.1
+# A bound that needs no trial: bytes per ray, per pixel, and per point beside its features, each of which is kept a few
+# times over; what models take lies below the half of it.
+RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 1_024, 1_024, 6
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +102,8 @@ def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule)
         row = Row("pixels", num_bytes(pixels), there, counts=False)
     weights = sum(tensor.nbytes for tensor in [*step.model.parameters(), *step.model.buffers()])
     steps = [_step(trial, tile, where), _picture(trial, data, where)]
-    gaps = 0 if device.type == "cuda" else int(GAPS * max(row.num_bytes for row in steps))
+    heaps = 0 if device.type == "cuda" else min(MOST_HEAPS, threads_on(device))
+    gaps = int(heaps * GAPS * max(row.num_bytes for row in steps))
     tables = "lower encoder.log2_table_size or field.width, or choose a smaller model"
     return MemoryPlan(
         [
@@ -121,8 +127,22 @@ def _compiled(step: TrainStep) -> int:
     return COMPILED_PER_MATRIX * len(matrices_of(step.model))
 
 
+def at_most(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> int:
+    """Return bytes that a run surely does not exceed, without a trial: several times what it takes."""
+    model, pixels, batch = step.model, data.scene.pixels, data.batches.progress.largest_batch
+    whole = batch * model.points_per_ray(training=True)
+    points = whole if settings.tile_points is None else threads_on(settings.device) * settings.tile_points
+    features = 4 * sum(sum(matrix.shape) for matrix in matrices_of(model))
+    weights = sum(tensor.nbytes for tensor in [*model.parameters(), *model.buffers()])
+    picture = int((pixels.width * pixels.height).max()) * PIXEL_BYTES
+    held = num_bytes(pixels) + 4 * weights + _compiled(step) + batch * RAY_BYTES + picture
+    return int(held + KEPT * points * (features + POINT_BYTES))
+
+
 def announce_memory(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> None:
     """Log one line of the plan where it is not small, its rows for who asks for details (-v), and where it is short."""
+    if not log.isEnabledFor(logging.DEBUG) and at_most(settings, step, data) < SMALL * free_memory(settings.device):
+        return
     plan = memory_plan(settings, step, data)
     for line in str(plan).splitlines():
         log.debug("%s", line)

@@ -16,7 +16,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.geometry.cameras import resized
+from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -63,9 +65,10 @@ def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, til
     step.to(settings.device)
     trainable = [parameter for parameter in step.model.parameters() if parameter.requires_grad]
     gradients = sum(parameter.nbytes for parameter in trainable)
-    with _untouched(step):
-        batch, activations = _step(settings, step, batches, tile, gradients)
-        picture = _picture(settings, step, batches, tile)
+    beside = threads_on(settings.device)
+    with _untouched(step), _one_thread():
+        batch, activations = _step(settings, step, batches, tile, gradients, beside)
+        picture = _picture(settings, step, batches, tile, beside)
     return Trial(gradients, _optimizer_bytes(step, trainable), batch, activations, picture)
 
 
@@ -83,10 +86,21 @@ def _untouched(step: TrainStep) -> Iterator[None]:
             buffer.copy_(value)
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let tiles go one after the other: what other threads allocate is not seen, and is counted by their number."""
+    former = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(former)
+
+
 def _step(
-    settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, gradients: int
+    settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, gradients: int, beside: int
 ) -> tuple[int, int]:
-    """Return what grows with the batch, and what grows with the tile."""
+    """Return what grows with the batch, and what grows with the tiles, of which so many are beside each other."""
     model, optimizer = step.model, step.new_optimizer()
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = batch.num_rays
@@ -110,6 +124,9 @@ def _step(
     per_batch_ray, per_tile_ray = (four - two) / (2 * few), (larger - four) / few
     copies = max(0.0, two - few * (2 * per_batch_ray + per_tile_ray) - gradients)
     tile_rays = num_rays if tile is None else min(num_rays, tile / model.points_per_ray(training=True))
+    if tile is not None and beside > 1:  # each tile's gradients of the matrices are kept, and added up in order
+        copies += num_rays / tile_rays * sum(matrix.nbytes for matrix in matrices_of(model))
+        tile_rays = min(num_rays, beside * tile_rays)
     tensors = _tensors_in([batch.rgba, batch.weight, vars(batch.pixels)])
     loaded = sum(tensor.nbytes for tensor in tensors) * (2 if batches.prefetch_for is not None else 1)
     return int(loaded + num_rays * per_batch_ray), int(copies + tile_rays * per_tile_ray)
@@ -119,7 +136,7 @@ def _few_rays(model: Model, training: bool) -> int:
     return max(FEWEST_RAYS, int(TRIAL_POINTS / model.points_per_ray(training)))
 
 
-def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> int:
+def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, beside: int) -> int:
     """Return what the largest picture of the scene holds while it is rendered and measured."""
     model, scene = step.model, batches.scene
     few = _few_rays(model, training=False)
@@ -133,7 +150,8 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
 
     per_ray = (rendered(2 * few) - rendered(few)) / few
     num_pixels = int((scene.pixels.width * scene.pixels.height).max())
-    tile_rays = min(num_pixels, tile_rays_for(model, settings.inference_tile_points if tile is None else tile))
+    tile_points = settings.inference_tile_points if tile is None else tile
+    tile_rays = min(num_pixels, beside * tile_rays_for(model, tile_points))
     # A small picture, cut into as many tiles by a stand-in that holds as much for each ray.
     share = TRIAL_SIDE**2 / num_pixels
     side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
