@@ -1,6 +1,7 @@
 """Learn a radiance field from photographs with known cameras."""
 
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from omegaconf import DictConfig
 from nerf_lightning import ranks
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.tree import print_tree
-from nerf_lightning.console import StdoutConsole, say
+from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.errors import InputError
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
@@ -130,7 +131,11 @@ def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[L
     if former is None:
         describe_run(trainer.loggers, parts.config)
     checkpoint = None if former is None else former.checkpoint
+    began = time.monotonic()
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
+    if ranks.is_first():
+        steps = trainer.global_step - (0 if former is None else former.step)
+        log.info("%d steps in %s", steps, spoken(time.monotonic() - began))
     _show_profile(trainer, folder)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
@@ -165,10 +170,11 @@ def _write_report(parts: Parts, folder: Path) -> None:
 def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
     parameters = sum(parameter.numel() for parameter in parts.system.model.parameters())
     tile = parts.system.step.tile_points
+    seconds = parts.config.budget.seconds
     log.info(
-        "run folder %s: %d steps of %d rays, %s parameters, %s, %s",
+        "run folder %s: %s of %d rays, %s parameters, %s, %s",
         folder,
-        parts.num_steps,
+        f"{parts.num_steps} steps" if seconds is None else f"{spoken(seconds)} (budget.seconds) of steps",
         parts.data.batches.batch_rays,
         f"{parameters:,}",
         parts.settings.describe(),

@@ -100,7 +100,13 @@ def explain(error: BaseException, command: str) -> str:
     if isinstance(error, InstantiationException):
         where = re.search(r"full_key: (\S+)", str(error))
         reason = str(chain[-1]).splitlines()[0]
-        return f"{where.group(1) if where else 'The config'} cannot be built: {reason}. See nerf {command} --help."
+        part = where.group(1) if where else "The config"
+        if isinstance(chain[-1], ModuleNotFoundError):
+            return (
+                f"{part} cannot be built: {reason}. Python looks among the installed packages and in the folders of "
+                f"the variable PYTHONPATH: for a file of your own put PYTHONPATH=FOLDER before nerf {command}."
+            )
+        return f"{part} cannot be built: {reason}. See nerf {command} --help."
     message = " ".join(str(error).split())
     unread = re.match(r"LexerNoViableAltException: ([^=\s]+)=(.*) \^ See https", message)
     unread = unread or re.match(r"Error parsing override '([^=\s]+)=(.*)' HydraException while evaluating", message)

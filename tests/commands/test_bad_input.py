@@ -286,3 +286,8 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
 @pytest.mark.parametrize("ckpt", ["5", "[1]"])
 def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command, ckpt):
     said(nerf(*command.split(), f"ckpt={ckpt}", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
+
+
+def test_a_part_of_ones_own_that_is_not_found_says_where_python_looks(nerf, capture):
+    result = nerf("train", "scene=npz", f"scene.path={capture}", "model=nerf_tiny", "loss._target_=my_losses.L1")
+    said(result, "loss cannot be built: No module named 'my_losses'", "PYTHONPATH=FOLDER before nerf train")

@@ -80,6 +80,8 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
     used = [state["used"] for state in content["callbacks"].values() if "used" in state]
     assert used
     assert used[0] >= 3.0
+    assert "4 s (budget.seconds) of steps of" in output
+    assert f"{content['global_step']} steps in " in output
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The embedded scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
 
+import logging
 import math
 import multiprocessing
 import os
@@ -34,6 +35,8 @@ MOST_THREADS = 4
 """Each takes about half a gigabyte."""
 MARGIN = 0.02
 """Room between the model and the box handed out, in world units."""
+
+log = logging.getLogger(__name__)
 
 
 class BricksReader(Reader):
@@ -155,6 +158,7 @@ def render(cameras: Cameras) -> Rendered:
     step = max(1, CHUNK // (16 * resolution**2))
     chunks = [views[i : i + step] for i in range(0, len(views), step)]
     parts = []
+    log.info("%d views of %d x %d pixels are rendered, and kept for the next time", len(views), resolution, resolution)
     with _progress() as progress, ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
         task = progress.add_task("Rendering the bricks scene (once)", total=len(views))
         for chunk, part in zip(chunks, pool.map(lambda chunk: _render_chunk(tracer, chunk), chunks), strict=True):
