@@ -1,6 +1,5 @@
 """The embedded scene: a fire engine of bricks and the cameras around it, rendered on first use and cached."""
 
-import logging
 import math
 import multiprocessing
 import os
@@ -15,7 +14,7 @@ from numpy import ndarray
 from rich.progress import Progress
 from torch import Tensor
 
-from nerf_lightning.console import progress_bar
+from nerf_lightning.console import ProgressLines, progress_bar
 from nerf_lightning.cores import num_cores
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
@@ -35,8 +34,6 @@ MOST_THREADS = 4
 """Each takes about half a gigabyte."""
 MARGIN = 0.02
 """Room between the model and the box handed out, in world units."""
-
-log = logging.getLogger(__name__)
 
 
 class BricksReader(Reader):
@@ -158,12 +155,12 @@ def render(cameras: Cameras) -> Rendered:
     step = max(1, CHUNK // (16 * resolution**2))
     chunks = [views[i : i + step] for i in range(0, len(views), step)]
     parts = []
-    log.info("%d views of %d x %d pixels are rendered, and kept for the next time", len(views), resolution, resolution)
     with _progress() as progress, ThreadPoolExecutor(min(MOST_THREADS, num_cores())) as pool:
-        task = progress.add_task("Rendering the bricks scene (once)", total=len(views))
+        task, lines = progress.add_task("Rendering the bricks scene (once)", total=len(views)), ProgressLines()
         for chunk, part in zip(chunks, pool.map(lambda chunk: _render_chunk(tracer, chunk), chunks), strict=True):
             parts.append(part)
             progress.advance(task, len(chunk))
+            lines("rendering the bricks scene (once)", len(parts) / len(chunks))
     return Rendered(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
