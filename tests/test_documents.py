@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from lightning import Trainer
 from support.captures import write_blender, write_npz
 from support.running import FAST, start_code
 
+from nerf_lightning import build_run
 from nerf_lightning.cli.completion import completion
 from nerf_lightning.cli.help import help_on_anything
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
@@ -91,6 +93,20 @@ def test_the_eight_lines_of_an_encoder_are_an_encoder():
     encoder = next(value for name, value in scope.items() if name.endswith("Encoder") and name != "Encoder")()
     assert encoder(torch.rand(5, 3)).shape == (5, encoder.out_dim)
     assert len([line for line in example.splitlines() if line.strip()]) <= 14
+
+
+def test_the_loss_in_a_file_of_ones_own_trains(tmp_path, monkeypatch):
+    text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    assert "PYTHONPATH=. nerf train loss._target_=my_losses.L1\n" in text
+    (example,) = [block for block in python_blocks("extending.md") if "(Loss)" in block]
+    (tmp_path / "my_losses.py").write_text(example, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    capture = write_npz(tmp_path / "capture.npz")
+    small = ("scene=npz", f"scene.path={capture}", "model=nerf_tiny", "data.batch_rays=32", "data.val_rays=32")
+    run = build_run(*small, "loss._target_=my_losses.L1")
+    Trainer(max_steps=3, accelerator="cpu", logger=False, default_root_dir=tmp_path).fit(run.system, run.data)
+    assert type(run.system.step.loss).__name__ == "L1"
+    assert run.system.step.progress.step == 3
 
 
 def commands():

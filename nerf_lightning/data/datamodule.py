@@ -31,7 +31,8 @@ class RayDataModule(LightningDataModule):
         seed: the run's seed.
         batch_rays: rays per training step; the most, with a budget.
         sample_budget: rays per step adapt, in a few fixed sizes, so that a step has about so many samples; None: they
-            do not. It needs a model that skips empty space.
+            do not. Steps then stay equally long once empty space is skipped, and see more rays; larger budgets make
+            them steadier and slower. It needs a model that skips empty space.
         crop_steps: steps at the start that see only the pictures' centres.
         crop_fraction: share of each side that the crop keeps.
         restart_crop_steps: the least crop after a restart by the collapse guard.
