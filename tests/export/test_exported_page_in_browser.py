@@ -25,7 +25,7 @@ MESSAGE = "return document.getElementById('message').textContent"
 WITHOUT = "HTMLCanvasElement.prototype.getContext = () => null;"
 
 
-@pytest.fixture(scope="module", params=["small", "large"])
+@pytest.fixture(scope="module", params=["small", pytest.param("large", marks=pytest.mark.exhaustive)])
 def page(request, tmp_path_factory):
     """With harmonics of degree 1, and of degree 2."""
     what, scene = PageExport(request.param, 32, photographs=3, max_views=0), all_around()

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
-STEPS, SIDE, TILE_POINTS = 40, 16, 8192
+STEPS, SIDE, TILE_POINTS = 30, 16, 8192
 RAYS = {"nerf": 10, "nerf_occupancy": 16}
 MOST_RAYS = 64
 # Two of four: from both sides.
