@@ -28,8 +28,9 @@ def evaluate(config: DictConfig) -> float:
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
     with filled_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation")) as folder:
         scene = as_trained(build(config.scene).read(), checkpoint)
-        of = (checkpoint.config, checkpoint.choices, settings.device, settings.precision, checkpoint.step)
-        origin = measured_of(model, *of)
+        origin = measured_of(
+            model, checkpoint.config, checkpoint.choices, settings.device, settings.precision, checkpoint.step
+        )
         scoring = build(config.evaluation)
         with torch.no_grad():
             metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)

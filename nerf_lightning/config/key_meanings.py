@@ -186,19 +186,8 @@ THE_REST = {
 }
 
 CHOSEN_GROUPS = (
-    *(
-        "callbacks",
-        "correction",
-        "data",
-        "debug",
-        "encoder",
-        "evaluation",
-        "experiment",
-        "field",
-        "logger",
-        "loss",
-        "model",
-    ),
+    *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment"),
+    *("field", "logger", "loss", "model"),
     *("optimizer", "path", "refinement", "sampler", "scene", "scheduler", "trainer"),
 )
 """Groups of conf/ of which a file may choose an option by its name."""

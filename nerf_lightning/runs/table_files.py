@@ -16,18 +16,8 @@ from nerf_lightning.files.atomic import whole_file
 Row = dict[str, Any]
 
 DECIMALS = {
-    **{
-        "PSNR": 2,
-        "PSNR std": 2,
-        "cc PSNR": 2,
-        "cc PSNR std": 2,
-        "SSIM": 4,
-        "SSIM std": 4,
-        "LPIPS": 4,
-        "LPIPS std": 4,
-        "seconds": 1,
-        "minutes": 1,
-    },
+    **{"PSNR": 2, "PSNR std": 2, "cc PSNR": 2, "cc PSNR std": 2, "seconds": 1, "minutes": 1},
+    **{"SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4},
     **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
 }
 COUNTS = ("steps", "parameters", "runs")
@@ -38,10 +28,10 @@ SPARKLINE = 12
 """Signs in which a curve is drawn."""
 
 
-def write_rows(rows: list[Row], folder: Path, name: str, notes: tuple[str, ...] = ()) -> None:
-    """Write `NAME.csv` with all digits, and `NAME.md` with the notes below."""
+def write_rows(rows: list[Row], folder: Path, name: str) -> None:
+    """Write `NAME.csv` with all digits, and `NAME.md`."""
     write_csv(rows, folder / f"{name}.csv")
-    write_markdown(rows, folder / f"{name}.md", notes)
+    write_markdown(rows, folder / f"{name}.md")
 
 
 def write_csv(rows: list[Row], path: Path) -> None:

@@ -102,7 +102,7 @@ def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = N
     scene: Scene = build(config.scene).read()
     config, choices = settled(config, choices, overrides, scene)
     config, choices = corrected(config, choices, overrides, checks=None)
-    run = _run(config, choices, settings, scene, {"model": model, "loss": loss})
+    run = _run(config, choices, settings, scene, model, loss)
     settings.prepare(run.system.model)
     run.system.record["precision"] = settings.precision
     return run
@@ -163,7 +163,8 @@ def _run(
     choices: Mapping[str, Any],
     settings: TrainerSettings,
     scene: Scene,
-    own: Mapping[str, Any] | None = None,
+    model: Model | None = None,
+    loss: Loss | None = None,
 ) -> Run:
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
@@ -171,7 +172,7 @@ def _run(
     start = None
     if config.init_from is not None:
         start = read_checkpoint(required_path("init_from", config.init_from))
-    step = build_step(config, settings, scene, progress, start, own)
+    step = build_step(config, settings, scene, progress, start, model, loss)
     if start is not None:
         log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
@@ -193,7 +194,8 @@ def build_step(
     scene: Scene,
     progress: Progress,
     start: Checkpoint | None = None,
-    own: Mapping[str, Any] | None = None,
+    model: Model | None = None,
+    loss: Loss | None = None,
 ) -> TrainStep:
     """Build model, cameras, loss, correction, optimizer and schedule into the step of training.
 
@@ -203,7 +205,8 @@ def build_step(
         scene: what is learnt.
         progress: the run's place.
         start: the checkpoint whose weights it begins with.
-        own: `model` and `loss` in the place of the config's, where they are not None.
+        model: one in the place of the config's.
+        loss: the same.
 
     Raises:
         InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
@@ -211,8 +214,7 @@ def build_step(
     """
     if not isinstance(config.seed, int):
         raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
-    parts = {name: part for name, part in (own or {}).items() if part is not None}
-    model: Model = parts["model"] if "model" in parts else build(config.model)
+    model = build(config.model) if model is None else model
     refinement: Refinement = build(config.refinement)
     refinement.fit_to(scene)
     scene = replace(scene, refined=refinement.moves())
@@ -229,7 +231,7 @@ def build_step(
     return TrainStep(
         model=model,
         rays=RayGenerator(scene.cameras, scene.near, scene.far, refinement),
-        loss=parts["loss"] if "loss" in parts else build(config.loss),
+        loss=build(config.loss) if loss is None else loss,
         correction=correction,
         optimizer=optimizer,
         schedule=build(config.scheduler),

@@ -111,8 +111,8 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
 def _origin(trainer: Trainer, model: Model, settings: TrainerSettings) -> dict[str, Any]:
     system: Any = trainer.lightning_module
     record = system.record
-    of = (record["config"], record["choices"], settings.device, settings.precision, trainer.global_step)
-    return measured_of(model, *of)
+    config, choices = record["config"], record["choices"]
+    return measured_of(model, config, choices, settings.device, settings.precision, trainer.global_step)
 
 
 def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:

@@ -71,14 +71,9 @@ class WeightsAndBiases(RunLogger):
             offline=self.offline,
             id=uuid.uuid5(uuid.NAMESPACE_URL, f"{folder.absolute()} {started}").hex[:16],
         )
-        try:
+        cure = "Log in with wandb login, keep everything here with logger.wandb.offline=true"
+        with _refused(Error, "Weights & Biases", cure):
             _ = logger.experiment
-        except Error as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"Weights & Biases cannot be used: {reason}. Log in with wandb login, keep everything here with "
-                "logger.wandb.offline=true, or leave it out with logger=tensorboard."
-            ) from error
         return logger
 
 
@@ -105,15 +100,9 @@ class MLflow(RunLogger):
         given = self.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI")
         pictures = None if given else (folder / "mlflow").absolute().as_uri()
         uri = given or f"sqlite:///{(folder / 'mlflow.db').absolute()}"
-        try:
+        with _refused(MlflowException, f"MLflow at {uri}", "Give another logger.mlflow.tracking_uri"):
             logger = MLFlowLogger(self.experiment, run_name=folder.name, tracking_uri=uri, artifact_location=pictures)
             _ = logger.experiment
-        except MlflowException as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"MLflow cannot be used at {uri}: {reason}. Give another logger.mlflow.tracking_uri, or leave it out "
-                "with logger=tensorboard."
-            ) from error
         return logger
 
 
@@ -156,6 +145,17 @@ def show_picture(loggers: list[Logger], tag: str, picture: UInt8[Tensor, "height
             logger.log_image(tag, [picture.numpy()], step)
         elif isinstance(logger, MLFlowLogger):
             logger.experiment.log_image(logger.run_id, picture.numpy(), f"{tag}/step_{step:07d}.png")
+
+
+@contextmanager
+def _refused(error: type[Exception], what: str, cure: str) -> Iterator[None]:
+    try:
+        yield
+    except error as refusal:
+        reason = " ".join(str(refusal).split())
+        raise InputError(
+            f"{what} cannot be used: {reason}. {cure}, or leave it out with logger=tensorboard."
+        ) from refusal
 
 
 def _require(package: str, setting: str, extra: str) -> None:

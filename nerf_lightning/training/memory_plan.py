@@ -100,7 +100,7 @@ def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule)
         # What lies in memory already is not asked for again.
         there = f"mapped file {pixels.path}" if isinstance(pixels, MappedPixelStore) else "memory, there already"
         row = Row("pixels", num_bytes(pixels), there, counts=False)
-    weights = sum(tensor.nbytes for tensor in [*step.model.parameters(), *step.model.buffers()])
+    weights = _weights(step)
     steps = [_step(trial, tile, where), _picture(trial, data, where)]
     heaps = 0 if device.type == "cuda" else min(MOST_HEAPS, threads_on(device))
     gaps = int(heaps * GAPS * max(row.num_bytes for row in steps))
@@ -123,6 +123,10 @@ def _compiles_products(settings: TrainerSettings) -> bool:
     return settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
 
 
+def _weights(step: TrainStep) -> int:
+    return sum(tensor.nbytes for tensor in [*step.model.parameters(), *step.model.buffers()])
+
+
 def _compiled(step: TrainStep) -> int:
     return COMPILED_PER_MATRIX * len(matrices_of(step.model))
 
@@ -133,9 +137,8 @@ def at_most(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> 
     whole = batch * model.points_per_ray(training=True)
     points = whole if settings.tile_points is None else threads_on(settings.device) * settings.tile_points
     features = 4 * sum(sum(matrix.shape) for matrix in matrices_of(model))
-    weights = sum(tensor.nbytes for tensor in [*model.parameters(), *model.buffers()])
     picture = int((pixels.width * pixels.height).max()) * PIXEL_BYTES
-    held = num_bytes(pixels) + 4 * weights + _compiled(step) + batch * RAY_BYTES + picture
+    held = num_bytes(pixels) + 4 * _weights(step) + _compiled(step) + batch * RAY_BYTES + picture
     return int(held + KEPT * points * (features + POINT_BYTES))
 
 

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
-from rich.progress import Progress
 from torch import Tensor
 
 from nerf_lightning import ranks
-from nerf_lightning.console import ProgressLines, stderr_console
+from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
@@ -23,6 +22,9 @@ from nerf_lightning.video.panels import FILMS, film_pictures, panel
 from nerf_lightning.video.paths.base import CameraPath
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
+
+FilmSteps = Generator[tuple[int, int], None, list[Path]]
+"""A film in the making: how many frames of how many are there, again and again, and at the end the films."""
 
 
 def film(
@@ -44,18 +46,24 @@ def film(
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
     steps = film_steps(subjects, path, tile_points, folder, FilmSettings() if settings is None else settings)
-    with Progress(transient=True, console=stderr_console()) as bar:
-        task, lines = bar.add_task("filming", total=None), ProgressLines()
-        for done, total in steps:
-            bar.update(task, completed=done, total=total)
-            lines("filming", done / max(total, 1))
-            if done == total:
-                break
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return list(end.value)
+    _, total = next(steps)
+    for _ in tracked(range(total), "filming"):
+        next(steps)
+    return films_of(steps)
+
+
+def films_of(steps: FilmSteps) -> list[Path]:
+    """Make the films whose frames are all there, and return them, or their folders of frames.
+
+    Raises:
+        InputError: as `film`.
+    """
+    try:
+        next(steps)
+    except StopIteration as end:
+        films: list[Path] = end.value
+        return films
+    raise AssertionError("there are frames left")
 
 
 def film_steps(
@@ -65,10 +73,10 @@ def film_steps(
     folder: Path,
     settings: FilmSettings,
     shows_encoding: bool = True,
-) -> Generator[tuple[int, int], None, list[Path]]:
+) -> FilmSteps:
     """Film a frame at a time, for who has something else to do between two; what is not said here is as in `film`.
 
-    Yields how many frames of how many are there: at first, and after each. After the last one, the films are made.
+    Yields how many frames of how many are there: at first, and after each. Then `films_of` makes the films.
 
     Args:
         subjects: models of one capture.

@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.video.film import film_steps
+from nerf_lightning.video.film import film_steps, films_of
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject
@@ -61,9 +61,7 @@ class FilmJob:
         film = KeyframePath(str(folder / "camera_path.yaml"), width=width, fps=rate)
         subject = Subject(renderer.model, renderer.scene, renderer.background)
         shown = replace(settings, outputs=("rgb",))
-        self._steps: Generator[tuple[int, int], None, list[Path]] = film_steps(
-            [subject], film, renderer.tile_points, folder, shown, shows_encoding=False
-        )
+        self._steps = film_steps([subject], film, renderer.tile_points, folder, shown, shows_encoding=False)
         self._encodes = False
         self._stops = False
 
@@ -110,12 +108,11 @@ class FilmJob:
     def _encode(self) -> None:
         """Make one file of the frames, beside the thread that renders."""
         try:
-            next(self._steps)
-        except StopIteration as end:
-            self.result = end.value[0]
-            self.on_change(self)
+            self.result = films_of(self._steps)[0]
         except (InputError, OSError) as error:
             self._fail(str(error))
+        else:
+            self.on_change(self)
 
     def _fail(self, why: str) -> None:
         self.failure = why

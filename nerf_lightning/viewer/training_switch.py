@@ -25,17 +25,17 @@ class TrainingSwitch:
     def pause(self) -> None:
         """Let the training wait after the step that is being taken."""
         self.wants_pause = self.can_pause
-        self._tell()
+        self.show()
 
     def go_on(self) -> None:
         """Let it go on."""
         self.wants_pause = False
-        self._tell()
+        self.show()
 
     def stop(self) -> None:
         """End it after the step that is being taken, as if that had been its last: saved, and evaluated."""
         self.wants_stop, self.wants_pause = True, False
-        self._tell()
+        self.show()
 
     def pause_while(
         self, work: Callable[[], None], is_anybody_here: Callable[[], bool], ends: Callable[[], bool]
@@ -63,8 +63,5 @@ class TrainingSwitch:
 
     def show(self) -> None:
         """Let every page show how it stands."""
-        self._tell()
-
-    def _tell(self) -> None:
         for show in list(self.on_change.values()):
             show()

@@ -20,7 +20,7 @@ LEAST_SINE = 1e-6
 
 
 class KeyframeCurve:
-    """Pass through keyframes (`geometry.paths.spline`).
+    """Pass through keyframes (`video.paths.spline`).
 
     Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
     stays in the middle.
