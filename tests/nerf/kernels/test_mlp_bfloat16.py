@@ -1,0 +1,124 @@
+"""The perceptron by the CPU's own bfloat16 instructions: the same roundings in plain torch are its reference."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
+from nerf_lightning.nerf.products import TILE_ROWS, cpu_multiplies_bfloat16
+
+pytestmark = pytest.mark.skipif(
+    not cpu_multiplies_bfloat16(), reason="this CPU, as far as torch may use it, does not multiply bfloat16 itself"
+)
+SIZES = [(32, 64, 16), (32, 64, 64, 3), (16, 16, 5), (48, 80, 128, 7), (16, 1)]
+ROWS = [0, 1, 2, 127, 128, 129, TILE_ROWS + 17]
+
+
+@pytest.fixture
+def kernels():
+    return backends.twin("mlp.bfloat16")
+
+
+def rounded(x):
+    return x.bfloat16().double()
+
+
+def given(sizes, rows):
+    return torch.randn(rows, sizes[0]), [torch.randn(b, a) / a**0.5 for a, b in pairwise(sizes)]
+
+
+def reference(points, weights, grad):
+    """Outputs and gradients in float64, of numbers rounded where the kernels round them."""
+    inputs, weights = [rounded(points)], [rounded(weight) for weight in weights]
+    for weight in weights[:-1]:
+        inputs.append(rounded((inputs[-1] @ weight.t()).clamp(min=0.0)))
+    out, flowing, grads = inputs[-1] @ weights[-1].t(), rounded(grad), []
+    for number in reversed(range(len(weights))):
+        grads.insert(0, flowing.t() @ inputs[number])
+        flowing = flowing @ weights[number]
+        if number:
+            flowing = rounded(flowing * (inputs[number] > 0))
+    return [out, flowing, *grads]
+
+
+def far_apart(found, expected):
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize("rows", ROWS)
+@pytest.mark.parametrize("sizes", SIZES)
+def test_it_is_what_the_same_roundings_give(kernels, sizes, rows):
+    points, weights = given(sizes, rows)
+    grad = torch.randn(rows, sizes[-1])
+    out, kept = kernels.forward(points, weights, keep=True)
+    of_points, of_weights = kernels.backward(grad, weights, kept, wants_points=True)
+    assert of_points.shape == points.shape
+    for found, expected in zip([out, of_points, *of_weights], reference(points, weights, grad), strict=True):
+        # A sum in float32 may round to the other neighbour than the exact one does: a unit here and there.
+        assert far_apart(found, expected) < 2e-3
+
+
+@pytest.mark.parametrize("sizes", SIZES)
+def test_a_row_does_not_depend_on_its_neighbours_nor_on_what_is_kept(kernels, sizes):
+    points, weights = given(sizes, 300)
+    out, _ = kernels.forward(points, weights, keep=False)
+    assert torch.equal(kernels.forward(points, weights, keep=True)[0], out)
+    for part in (slice(7, 8), slice(100, 229)):
+        assert torch.equal(kernels.forward(points[part], weights, keep=False)[0], out[part])
+
+
+def test_gradients_of_weights_do_not_see_what_memory_held_before(kernels):
+    points, weights = given((32, 64, 3), 130)
+    grad, results = torch.randn(130, 3), []
+    for dirt in (0.0, torch.nan, 3.0):
+        _ = [torch.full((256, size), dirt) for size in (48, 64, 32, 3)]  # what the next ones are likely to be given
+        _, kept = kernels.forward(points, weights, keep=True)
+        results.append(torch.cat([each.flatten() for each in kernels.backward(grad, weights, kept, False)[1]]))
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])
+
+
+def test_the_result_does_not_depend_on_the_threads():
+    points, weights = given((32, 64, 3), 3 * TILE_ROWS)
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            leaves = [weight.clone().requires_grad_() for weight in weights]
+            mlp(points, leaves, "bfloat16").square().sum().backward()
+            results.append(torch.cat([leaf.grad.flatten() for leaf in leaves]))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_no_number_stays_that(kernels, value):
+    points, weights = given((16, 32, 2), 10)
+    points[3, 5] = value
+    out, _ = kernels.forward(points, weights, keep=False)
+    assert not out[3].isfinite().all()
+    assert out[torch.arange(10) != 3].isfinite().all()
+
+
+def test_gradients_of_the_points_are_left_out_where_nobody_asks(kernels):
+    points, weights = given((32, 64, 3), 200)
+    out, kept = kernels.forward(points, weights, keep=True)
+    assert kernels.backward(out, weights, kept, wants_points=False)[0] is None
+
+
+@pytest.mark.parametrize("switched_off", [False, True])
+def test_other_widths_and_a_kernel_that_is_switched_off_take_the_other_way(monkeypatch, kernels, switched_off):
+    points, weights = given((32, 64, 3) if switched_off else (27, 64, 3), 500)
+    monkeypatch.setattr(kernels, "_forward", lambda *arguments: pytest.fail("not this way"))
+    with backends.without(*["mlp.bfloat16"] if switched_off else []):
+        assert far_apart(mlp(points, weights, "bfloat16"), mlp_torch(points, weights).double()) < 2e-2
+
+
+def test_a_compiler_that_does_not_know_the_instructions_is_not_asked(monkeypatch, kernels):
+    """LLVM would end the program."""
+    monkeypatch.setattr(kernels.llvm, "get_host_cpu_features", lambda: {"avx512f": True})
+    with pytest.raises(RuntimeError, match="numba does not know that this CPU multiplies bfloat16"):
+        kernels.trial()
