@@ -28,6 +28,8 @@ from nerf_lightning.nerf.kernels.mlp.vectors import (
 from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.products import tiles_of_rows
 
+VECTORS = 1
+"""Raised with each change of `vectors`, so that numba compiles anew."""
 ROWS = 128
 """So many go through all layers together."""
 
