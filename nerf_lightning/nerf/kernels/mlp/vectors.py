@@ -2,8 +2,9 @@
 
 LLVM is handed the instructions of AVX512-BF16 as they are, so no compiler is needed; a CPU without them must not come
 here. numba keeps what it compiled for as long as the kernels' own file stays the same, and does not look into this one:
-whoever changes it raises `bfloat16.VECTORS`. Addresses are whole numbers of bytes; a word is an int32 that holds two bfloat16 numbers, the first in its lower
-half.
+whoever changes it raises `bfloat16.VECTORS`.
+
+Addresses are whole numbers of bytes; a word is an int32 that holds two bfloat16 numbers, the first in its lower half.
 """
 
 from typing import Any
