@@ -1,6 +1,5 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
-import gc
 import logging
 import os
 import sys
@@ -25,21 +24,33 @@ quick_composition.install()
 
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
+ENDING = pytest.StashKey()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config):
+    """Leave out, at the end, what takes a process of tests as long as one of `nerf`."""
+    # Not before jaxtyping's hook is there for all of our modules.
+    from nerf_lightning.cli.process import QuickEnd
+
+    config.stash[ENDING] = QuickEnd()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_sessionfinish(session):
+    """Tell with which code."""
+    result = yield
+    session.config.stash[ENDING].code = int(session.exitstatus)
+    return result
+
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Let the collector of cycles rest while tests are imported, and later pass over the million objects that stay."""
-    gc.disable()
-    try:
+    """Import the tests, and all that they import, as quickly as the commands import what they need."""
+    from nerf_lightning.cli.loading import quick_imports
+
+    with quick_imports():
         return (yield)
-    finally:
-        gc.freeze()
-        gc.enable()
-
-
-def pytest_unconfigure():
-    """Give it back: libraries in C++ complain of what is left at the end."""
-    gc.unfreeze()
 
 
 @pytest.hookimpl(tryfirst=True)
