@@ -1,5 +1,6 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
+import atexit
 import logging
 import os
 import sys
@@ -24,24 +25,28 @@ quick_composition.install()
 
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
-ENDING = pytest.StashKey()
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_configure(config):
-    """Leave out, at the end, what takes a process of tests as long as one of `nerf`."""
-    # Not before jaxtyping's hook is there for all of our modules.
-    from nerf_lightning.cli.process import QuickEnd
-
-    config.stash[ENDING] = QuickEnd()
-
 
 @pytest.hookimpl(wrapper=True)
 def pytest_sessionfinish(session):
-    """Tell with which code."""
+    """Note with which code to end."""
     result = yield
-    session.config.stash[ENDING].code = int(session.exitstatus)
+    _exit_code.append(int(session.exitstatus))
     return result
+
+
+_exit_code = []
+
+
+def _leave():
+    """Leave out what takes a process of tests seconds, too: to take apart all that was loaded."""
+    if _exit_code:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_exit_code[-1])
+
+
+# Here, so that what is registered later, such as removing old folders of tests, is done before.
+atexit.register(_leave)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,9 +1,9 @@
 """`nerf` as a process of its own, which ends without taking apart what it has loaded: that takes over a second."""
 
 import atexit
-import logging
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,45 +20,35 @@ def main() -> None:
 
 @contextmanager
 def quick_end() -> Iterator[None]:
-    """Let this process end soon after the block: nothing that Python has loaded is taken apart.
+    """End this process after the block: nothing that Python has loaded is taken apart.
 
     Threads are waited for, and what is registered for the end is done, as ever. An error that nobody has caught, or a
     stream that cannot be flushed, is Python's to tell: then it ends as it would without this.
     """
-    ending = QuickEnd()
     try:
         yield
-        ending.code = 0
     except SystemExit as stop:
-        ending.code = _exit_code(stop)
+        _end(_exit_code(stop))
         raise
-
-
-class QuickEnd:
-    """What ends this process once all else is done that is registered for its end, if the exit code is known.
-
-    It is to be made before most others are imported: what is registered first is called last.
-    """
-
-    code: int | None = None
-
-    def __init__(self) -> None:
-        atexit.register(self._leave)
-
-    def _leave(self) -> None:
-        if self.code is None:
-            return
-        logging.shutdown()  # registered before, where logging was loaded before
-        try:
-            for stream in (sys.stdout, sys.stderr):
-                if stream is not None:
-                    stream.flush()
-        except (OSError, ValueError):  # a full disk; a stream that is closed
-            return
-        os._exit(self.code)
+    _end(0)
 
 
 def _exit_code(stop: SystemExit) -> int:
-    if stop.code is None:
-        return 0
-    return stop.code & 0xFF if isinstance(stop.code, int) else FAILED
+    if stop.code is None or isinstance(stop.code, int):
+        return (stop.code or 0) & 0xFF
+    print(stop.code, file=sys.stderr)
+    stop.code = FAILED
+    return FAILED
+
+
+def _end(code: int) -> None:
+    # What multiprocessing does at the end of its processes.
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+    except (OSError, ValueError):  # a full disk; a stream that is closed
+        return
+    os._exit(code)
