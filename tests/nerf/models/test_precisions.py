@@ -15,7 +15,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
-STEPS, SIDE, TILE_POINTS = 30, 16, 8192
+STEPS, SIDE, TILE_POINTS = 20, 12, 8192
 RAYS = {"nerf": 10, "nerf_occupancy": 16}
 MOST_RAYS = 64
 # Two of four: from both sides.
@@ -42,7 +42,7 @@ def trained(name, scene):
     return model.eval()
 
 
-@pytest.mark.parametrize("name", options("model"))
+@pytest.mark.parametrize("name", [each for each in options("model") if each != "auto"])  # it is one of the others
 def test_weights_see_the_same_in_both_precisions(name):
     scene = ball_scene(num_views=4, size=SIDE)
     model, found = trained(name, scene), {}
