@@ -15,15 +15,20 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 sys.path.insert(0, str(Path(__file__).parent))
 
 import pytest
-import torch
 from _pytest import runner
-from support import fork_server, quick_composition, type_checks
+from support import fork_server
 from support.large_frame import in_large_frame
 
-type_checks.install()
-quick_composition.install()
-
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
+
+
+def pytest_configure(config):
+    """Prepare what the tests import, but for a process that only hands them to workers."""
+    if hasattr(config, "workerinput") or config.getoption("dist", "no") == "no":
+        from support import quick_composition, type_checks
+
+        type_checks.install()
+        quick_composition.install()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -67,6 +72,8 @@ def pytest_runtest_protocol(item, nextitem):
 @pytest.fixture(autouse=True)
 def _quiet_threads():
     """Two threads at most: more would only wait for each other on a small machine."""
+    import torch
+
     torch.set_num_threads(min(MOST_THREADS, torch.get_num_threads()))
 
 
@@ -87,9 +94,13 @@ def _no_server_is_left():
 
 @pytest.fixture(autouse=True)
 def _the_same_numbers_whatever_ran_before():
+    import torch
+
     torch.manual_seed(0)
 
 
 @pytest.fixture
 def generator():
+    import torch
+
     return torch.Generator().manual_seed(20260101)
