@@ -1,5 +1,5 @@
 """`python -m nerf_lightning` is `nerf`."""
 
-from nerf_lightning.cli.main import main
+from nerf_lightning.cli.process import main
 
 main()

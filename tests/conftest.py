@@ -1,6 +1,6 @@
 """Shared by all tests: a tiny scene, a tiny model, rays to look along, and float64 on demand."""
 
-import gc
+import atexit
 import logging
 import os
 import sys
@@ -15,31 +15,52 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 sys.path.insert(0, str(Path(__file__).parent))
 
 import pytest
-import torch
 from _pytest import runner
-from support import fork_server, quick_composition, type_checks
+from support import fork_server
 from support.large_frame import in_large_frame
-
-type_checks.install()
-quick_composition.install()
 
 MOST_THREADS = 1 if "PYTEST_XDIST_WORKER" in os.environ else 2
 
 
+def pytest_configure(config):
+    """Prepare what the tests import, but for a process that only hands them to workers."""
+    if hasattr(config, "workerinput") or config.getoption("dist", "no") == "no":
+        from support import quick_composition, type_checks
+
+        type_checks.install()
+        quick_composition.install()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_sessionfinish(session):
+    """Note with which code to end."""
+    result = yield
+    _exit_code.append(int(session.exitstatus))
+    return result
+
+
+_exit_code = []
+
+
+def _leave():
+    """Leave out what takes a process of tests seconds, too: to take apart all that was loaded."""
+    if _exit_code:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_exit_code[-1])
+
+
+# Here, so that what is registered later, such as removing old folders of tests, is done before.
+atexit.register(_leave)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Let the collector of cycles rest while tests are imported, and later pass over the million objects that stay."""
-    gc.disable()
-    try:
+    """Import the tests, and all that they import, as quickly as the commands import what they need."""
+    from nerf_lightning.cli.loading import quick_imports
+
+    with quick_imports():
         return (yield)
-    finally:
-        gc.freeze()
-        gc.enable()
-
-
-def pytest_unconfigure():
-    """Give it back: libraries in C++ complain of what is left at the end."""
-    gc.unfreeze()
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -51,6 +72,8 @@ def pytest_runtest_protocol(item, nextitem):
 @pytest.fixture(autouse=True)
 def _quiet_threads():
     """Two threads at most: more would only wait for each other on a small machine."""
+    import torch
+
     torch.set_num_threads(min(MOST_THREADS, torch.get_num_threads()))
 
 
@@ -71,9 +94,13 @@ def _no_server_is_left():
 
 @pytest.fixture(autouse=True)
 def _the_same_numbers_whatever_ran_before():
+    import torch
+
     torch.manual_seed(0)
 
 
 @pytest.fixture
 def generator():
+    import torch
+
     return torch.Generator().manual_seed(20260101)

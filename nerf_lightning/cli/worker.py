@@ -10,12 +10,13 @@ from pathlib import Path
 
 from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.cli.main import explained
+from nerf_lightning.cli.process import quick_end
 
 
 def main() -> None:
     """Join the other workers and run the command."""
     command, folder = sys.argv[1], Path(sys.argv[2])
-    with explained(command):
+    with quick_end(), explained(command):
         _run(command, folder)
 
 

@@ -10,6 +10,7 @@ from support.running import FAST, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 STEPS = 110
+FEWER_STEPS = 70  # where it is stopped once
 
 
 def arguments(capture, folder, steps=STEPS, threads=1):
@@ -39,9 +40,9 @@ def steps_saved(folder):
     return torch.load(last, weights_only=True)["global_step"] if last.exists() else 0
 
 
-def never_stopped_on(threads, capture, tmp_path_factory):
+def never_stopped_on(threads, capture, tmp_path_factory, steps=STEPS):
     folder = tmp_path_factory.mktemp("never_stopped") / "run"
-    process = start(*arguments(capture, folder, threads=threads))
+    process = start(*arguments(capture, folder, steps, threads))
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     return state(folder)
@@ -53,14 +54,19 @@ def never_stopped(capture, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def never_stopped_soon_over(capture, tmp_path_factory):
+    return never_stopped_on(1, capture, tmp_path_factory, FEWER_STEPS)
+
+
+@pytest.fixture(scope="module")
 def never_stopped_on_two_threads(capture, tmp_path_factory):
     return never_stopped_on(2, capture, tmp_path_factory)
 
 
-def run_and_stop(capture, folder, how, after_step, threads=1):
+def run_and_stop(capture, folder, how, after_step, threads=1, steps=STEPS):
     """Start or resume; stop as soon as `after_step` is saved; return what was said and the exit code."""
     after_step = max(after_step, steps_saved(folder) + 7)
-    process = start(*arguments(capture, folder, threads=threads))
+    process = start(*arguments(capture, folder, steps, threads))
     while process.poll() is None and steps_saved(folder) < after_step:
         time.sleep(0.02)
     if process.poll() is None:
@@ -110,24 +116,24 @@ def test_a_run_on_two_threads_ends_the_same(capture, tmp_path, never_stopped_on_
 
 
 @pytest.mark.slow
-def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped):
+def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped_soon_over):
     """The command that a stopped run prints: no override needs to be repeated."""
     folder = tmp_path / "run"
-    code, output = run_and_stop(capture, folder, signal.SIGTERM, 50)
+    code, output = run_and_stop(capture, folder, signal.SIGTERM, 14, steps=FEWER_STEPS)
     assert code == 143, output
     assert f"go on with: nerf train resume={folder}" in output
     process = start("train", f"resume={folder}")
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
-    assert_same_to_the_bit(state(folder), never_stopped)
+    assert_same_to_the_bit(state(folder), never_stopped_soon_over)
 
 
 @pytest.mark.slow
-def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped):
+def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped_soon_over):
     folder = tmp_path / "run"
-    for steps in (40, STEPS):
-        extra = (f"scheduler.decay_steps={STEPS}",)  # null stretches the schedule over the new length
+    for steps in (30, FEWER_STEPS):
+        extra = (f"scheduler.decay_steps={FEWER_STEPS}",)  # null stretches the schedule over the new length
         process = start(*arguments(capture, folder, steps), *extra)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 0, output
-    assert_same_to_the_bit(state(folder), never_stopped)
+    assert_same_to_the_bit(state(folder), never_stopped_soon_over)

@@ -5,14 +5,22 @@ import json
 import os
 import signal
 import time
+from subprocess import STDOUT
 
 import pytest
 import torch
 from omegaconf import OmegaConf
-from support.running import FAST, start
+from support.running import FAST, start, start_code
 
 from nerf_lightning.runs import sweep
 
+ALL_CORES = """
+import os, sys
+os.environ.pop("OMP_NUM_THREADS", None)
+sys.argv = argv
+from nerf_lightning.cli.process import main
+main()
+"""
 QUICK = (*FAST, "logger=none", "final.video=false", "callbacks.checkpoints.every_steps=5")
 
 
@@ -52,10 +60,10 @@ def wait_for_step(folder, step, process):
         pytest.param("slurm_here", marks=pytest.mark.exhaustive),
     ],
 )
-def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, monkeypatch, launcher):
-    if launcher == "parallel":  # whose jobs share the cores, however many the tests leave to each other
-        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    code, output = run(*arguments(capture, tmp_path, f"hydra/launcher={launcher}", "seed=0,1"))
+def test_every_launcher_runs_the_jobs_and_makes_a_table_the_best_first(capture, tmp_path, launcher):
+    sweep = arguments(capture, tmp_path, f"hydra/launcher={launcher}", "seed=0,1")
+    # Jobs that share the cores share all of them, however many the tests leave to each other.
+    code, output = finish(start_code(f"argv = {['nerf', *sweep]}\n{ALL_CORES}", stderr=STDOUT))
     assert code == 0, output
     assert "Warning" not in output
     rows = table(tmp_path)

@@ -28,11 +28,22 @@ BUILT = {
 }
 
 
+# What a run has whatever its model is made of: an option of each is composed at a time.
+BESIDE_THE_MODEL = [group for group in BUILT if group not in ("encoder", "field", "model")]
+
+
+def picks(group, option):
+    """Return overrides that pick an option of a group, and what may be picked with it."""
+    if group in BESIDE_THE_MODEL:
+        number = options(group).index(option)
+        return [f"{each}={(offered := options(each))[number % len(offered)]}" for each in BESIDE_THE_MODEL]
+    # An MLP needs the encoder of its model.
+    return [*(["model=nerf"] if option.startswith("nerf_mlp") else []), f"{group}={option}"]
+
+
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g in BUILT for o in options(g)])
 def test_every_component_builds(group, option, tmp_path):
-    # An MLP needs the encoder of its model.
-    model = ["model=nerf"] if option.startswith("nerf_mlp") else []
-    config = composed("train", *model, f"{group}={option}")[BUILT[group]]
+    config = composed("train", *picks(group, option))[BUILT[group]]
     if OmegaConf.is_missing(config, "file"):
         write_keyframes(tmp_path / "keys.yaml", [Keyframe((x, 0.0, 0.0), look_at=(0.0, 1.0, 0.0)) for x in (0.0, 1.0)])
         config.file = str(tmp_path / "keys.yaml")

@@ -14,6 +14,7 @@ OURS = {
     "training/callbacks/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["load", "read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
+    "cli/process.py": ["print"],
     "cli/completion.py": ["read_text"],
     "manual/sources.py": ["read_text"],
     "manual/commented_yaml.py": ["read_text"],

@@ -79,7 +79,7 @@ def test_a_folder_or_a_video_is_needed_and_not_both(given):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("smaller", "points"), [(3, 250), pytest.param(1, 500, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(("smaller", "points"), [(4, 250), pytest.param(1, 500, marks=pytest.mark.exhaustive)])
 def test_real_photographs_become_a_scene(tmp_path, smaller, points):
     pytest.importorskip("pycolmap")
     (tmp_path / "images").mkdir()

@@ -1,5 +1,7 @@
 """Photographs of a corner of a room whose three walls are covered with noise, with cameras that are known."""
 
+from functools import cache
+
 import numpy as np
 import torch
 from PIL import Image
@@ -19,6 +21,7 @@ def corner_poses(count):
     return look_at(eyes, target, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).numpy()
 
 
+@cache
 def noise(side, seed):
     """Return a grey picture (side, side) with blobs of several sizes."""
     rng = np.random.default_rng(seed)

@@ -223,15 +223,15 @@ def stop() -> None:
 
 def import_everything() -> None:
     """Import what any command may need."""
-    for name in LAZY:
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
     import nerf_lightning
+    from nerf_lightning.cli.loading import quick_imports
 
-    for module in pkgutil.walk_packages(nerf_lightning.__path__, "nerf_lightning."):
-        if not module.name.endswith(NOT_IMPORTED):
-            with contextlib.suppress(ImportError):
-                importlib.import_module(module.name)
+    ours = (module.name for module in pkgutil.walk_packages(nerf_lightning.__path__, "nerf_lightning."))
+    with quick_imports():
+        for name in (*LAZY, *ours):
+            if not name.endswith(NOT_IMPORTED):
+                with contextlib.suppress(ImportError):
+                    importlib.import_module(name)
 
 
 def compose_quickly() -> None:

@@ -7,18 +7,19 @@ overrides of single settings are applied by Hydra each time. Processes that star
 import pickle
 from pathlib import Path
 
-from hydra._internal import config_loader_impl
+from hydra._internal import config_loader_impl, defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
-from hydra.core.default_element import ResultDefault
+from hydra.core.default_element import InputDefault, ResultDefault
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig
 
 CONF = f"file://{Path(__file__).parents[2] / 'conf'}"
 
 merged = ConfigLoaderImpl._compose_config_from_defaults_list
-loaded = FileConfigSource.load_config
+loaded = ConfigRepository.load_config
+choices_map = defaults_list._create_interpolation_map
 
 _files: dict[str, bytes] = {}
 _lists: dict[str, DefaultsList] = {}
@@ -35,7 +36,9 @@ def install() -> None:
     """Let Hydra compose so in this process."""
     config_loader_impl.create_defaults_list = files_to_merge
     ConfigLoaderImpl._compose_config_from_defaults_list = merged_once
-    FileConfigSource.load_config = loaded_once
+    # Not of a source of files: Hydra loads their classes anew when it looks for plugins.
+    ConfigRepository.load_config = loaded_once
+    defaults_list._create_interpolation_map = map_if_needed
 
 
 def kept() -> bytes:
@@ -75,13 +78,21 @@ def merged_once(loader: ConfigLoaderImpl, defaults: list[ResultDefault], repo) -
     return pickle.loads(_configs[defaults.key])
 
 
-def loaded_once(source: FileConfigSource, config_path: str) -> ConfigResult:
+def loaded_once(repo: ConfigRepository, config_path: str) -> ConfigResult | None:
     """Return what a file holds, a copy each time."""
-    if not _stays(source):
-        return loaded(source, config_path)
-    if config_path not in _files:
-        _files[config_path] = pickle.dumps(loaded(source, config_path))
-    return pickle.loads(_files[config_path])
+    if not all(map(_stays, repo.get_sources())):
+        return loaded(repo, config_path)
+    key = repr((config_path, [source.path for source in repo.get_sources()]))
+    if key not in _files:
+        _files[key] = pickle.dumps(loaded(repo, config_path))
+    return pickle.loads(_files[key])
+
+
+def map_if_needed(overrides: Overrides, defaults: list[InputDefault], self_added: bool) -> DictConfig:
+    """Return what has been chosen, as Hydra does for each file, where a choice of this file looks at it."""
+    if any(each.is_interpolation() for each in defaults):
+        return choices_map(overrides, defaults, self_added)
+    return DictConfig({})
 
 
 def _stays(source: ConfigSource) -> bool:

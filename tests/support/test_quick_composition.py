@@ -6,11 +6,13 @@ import sys
 import pytest
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
+from support import quick_composition
 from support.running import REPOSITORY
 
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.errors import InputError
 
+LOADED = quick_composition.loaded
 PICKED = ("model=fast_small", "scene=npz", "encoder.num_levels=3", "+callbacks.more.a=[1, 2]", "~callbacks.monitor")
 ALONE = """
 import sys
@@ -27,6 +29,16 @@ def test_a_config_is_what_hydra_composes_alone():
         config, choices = compose_config("train", PICKED)
         assert f"{OmegaConf.to_yaml(config)}{choices}\n" == alone.stdout, alone.stderr
         config.encoder.num_levels = 7  # of one's own
+
+
+def test_a_file_is_read_once(monkeypatch):
+    read = []
+    monkeypatch.setattr(quick_composition, "loaded", lambda repo, path: read.append(path) or LOADED(repo, path))
+    for name in ("_files", "_lists", "_configs"):
+        monkeypatch.setattr(quick_composition, name, {})
+    for steps in ("constant", "exponential", "constant"):
+        compose_config("train", ["model=nerf_tiny", f"scheduler={steps}", "loss=mse"])
+    assert len(read) == len(set(read)) > 20
 
 
 def test_other_values_and_mistakes_are_seen_each_time():

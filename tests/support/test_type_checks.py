@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import pytest
 import torch
@@ -111,3 +112,30 @@ def test_plain_types_and_those_of_methods_and_properties_are_checked():
     for call in (lambda: Box().doubled("2"), lambda: Box().doubled(name=3), lambda: Box().wrong):
         with pytest.raises(TypeCheckError):
             call()
+
+
+def test_what_passed_once_passes_again_and_nothing_else_does():
+    calls = []
+
+    @decorated
+    def parts(values: Float[Tensor, " n"], kind: str, more: Float[Tensor, " n"]) -> tuple[Float[Tensor, " n"], str]:
+        calls.append(kind)
+        return (values, kind) if kind == "right" else (more[1:], kind)
+
+    for _ in range(2):
+        assert len(parts(torch.ones(3), "right", torch.ones(3))) == 2
+        with pytest.raises(TypeCheckError, match="return"):
+            parts(torch.ones(3), "wrong", torch.ones(3))
+        with pytest.raises(TypeCheckError, match="more"):
+            parts(torch.ones(3), "right", torch.ones(2))
+    assert calls == 2 * ["right", "wrong"]
+
+
+def test_values_that_decide_are_looked_at_each_time():
+    @decorated
+    def named(values: Float[Tensor, " n"], way: Literal["up", "down"]) -> list[Float[Tensor, " n"]]:
+        return [values]
+
+    named(torch.ones(3), "up")
+    with pytest.raises(TypeCheckError, match="way"):
+        named(torch.ones(3), "left")

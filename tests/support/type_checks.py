@@ -8,6 +8,7 @@ and its result are checked once by beartype, and axes have their sizes within on
 import dataclasses
 import functools
 import inspect
+import threading
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -92,15 +93,66 @@ def _prepared(function: types.FunctionType, typechecker: Any) -> Callable:
     )
     twin.__kwdefaults__, twin.__module__ = function.__kwdefaults__, function.__module__
     twin.__qualname__, twin.__annotations__ = function.__qualname__, hints
-    quick = beartype(twin, conf=CONF)
     if not arrays:
-        return quick
+        return beartype(twin, conf=CONF)
+    if all(map(_follows_from_shapes, hints.values())):
+        return _once_for_shapes(twin)
+    quick = beartype(twin, conf=CONF)
 
     def within(*arguments: Any, **named: Any) -> Any:
         with slowly_checked("context"):
             return quick(*arguments, **named)
 
     return within
+
+
+def _once_for_shapes(function: types.FunctionType) -> Callable:
+    """Return it with its arguments and its result checked, unless others of these types and shapes have passed."""
+    passed: set[tuple] = set()
+    computed = threading.local()
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        # A result that is there already is only to be checked.
+        result = vars(computed).pop("result", computed)
+        return function(*arguments, **named) if result is computed else result
+
+    quick = beartype(call, conf=CONF)
+
+    def within(*arguments: Any, **named: Any) -> Any:
+        given = (*map(_shapes, arguments), *[(name, _shapes(value)) for name, value in named.items()])
+        known = given in passed
+        if known:
+            computed.result = result = function(*arguments, **named)
+            if (given, _shapes(result)) in passed:
+                del computed.result
+                return result
+        with slowly_checked("context"):
+            result = quick(*arguments, **named)
+        passed.update((given, (given, _shapes(result))))
+        return result
+
+    return within
+
+
+def _shapes(value: Any) -> Any:
+    """Return all that decides whether a value passes, where `_follows_from_shapes` of what is asked of it."""
+    kind = type(value)
+    if kind is tuple:
+        return (kind, *map(_shapes, value))
+    shape = getattr(value, "shape", None)
+    return kind if shape is None else (kind, value.dtype, shape)
+
+
+def _follows_from_shapes(hint: Any) -> bool:
+    """Whether it asks for nothing but classes, shapes and types of elements, of a value and of a few parts."""
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType, tuple):
+        # Of as many parts as there are, beartype looks at another one each time: `...` is no class.
+        return all(map(_follows_from_shapes, typing.get_args(hint)))
+    if hint is Any or hint is None or _is_array(hint):
+        return True
+    return isinstance(hint, type) and origin is None and not getattr(hint, "_is_protocol", False)
 
 
 def _hint(hint: Any, function: types.FunctionType) -> Any:

@@ -1,0 +1,56 @@
+"""A process of `nerf` ends as any does, but for the time that Python takes to tear down what it has loaded."""
+
+import subprocess
+import sys
+
+import pytest
+from support.running import REPOSITORY
+
+BEGIN = """
+import atexit, sys, threading, time
+from nerf_lightning.cli.process import quick_end
+
+class Loaded:
+    def __del__(self):
+        print("taken apart")
+
+loaded = Loaded()
+with quick_end():
+    """
+
+
+def ended(block: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", BEGIN + block], cwd=REPOSITORY, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("block", "code"), [("print('done')", 0), ("sys.exit()", 0), ("sys.exit(3)", 3), ("sys.exit(-2)", 254)]
+)
+def test_it_ends_with_its_code_and_takes_nothing_apart(block, code):
+    done = ended(block)
+    assert (done.returncode, done.stderr) == (code, "")
+    assert "taken apart" not in done.stdout
+
+
+def test_threads_and_what_is_registered_for_the_end_come_first():
+    done = ended(
+        "atexit.register(print, 'registered')\n"
+        "    threading.Thread(target=lambda: time.sleep(0.1) or print('thread')).start()\n"
+        "    print('block')"
+    )
+    assert done.stdout.split() == ["block", "thread", "registered"]
+
+
+def test_a_word_that_is_an_exit_code_is_printed():
+    done = ended("sys.exit('no')")
+    assert (done.returncode, done.stderr) == (1, "no\n")
+
+
+@pytest.mark.parametrize("block", ["1 / 0", "atexit.register(sys.stdout.close)"])
+def test_what_went_wrong_is_told_by_python(block):
+    done = ended(block)
+    plain = subprocess.run(
+        [sys.executable, "-c", BEGIN.replace("quick_end()", "__import__('contextlib').nullcontext()") + block],
+        cwd=REPOSITORY, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (plain.returncode, plain.stdout)
