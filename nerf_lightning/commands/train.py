@@ -1,6 +1,7 @@
 """Learn a radiance field from photographs with known cameras."""
 
 import logging
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -10,9 +11,10 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
+from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.tree import print_tree
 from nerf_lightning.console import StdoutConsole, say, spoken
@@ -180,6 +182,12 @@ def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
         parts.settings.describe(),
         "whole batches" if tile is None else f"tiles of {tile} points",
     )
+    own = modules_to_trust(OmegaConf.to_container(parts.config.model, resolve=True))
+    if own:
+        log.info(
+            "the model has parts of your own: a command that opens its checkpoints builds them only with trust=%s",
+            own[0] if len(own) == 1 else f"[{','.join(own)}]",
+        )
 
 
 @contextmanager
@@ -194,5 +202,7 @@ def _loggers(parts: Parts, folder: Path, former: ResumePoint | None) -> Iterator
 
 
 def _resume_command(folder: Path) -> str:
-    again = to_give_again(HydraConfig.get().overrides.task)
-    return " ".join(["nerf train", to_type("resume", str(folder)), *again])
+    overrides = HydraConfig.get().overrides
+    again = to_give_again(overrides.task)
+    searched = [shlex.quote(each) for each in overrides.hydra if each.startswith("hydra.searchpath=")]
+    return " ".join(["nerf train", to_type("resume", str(folder)), *searched, *again])

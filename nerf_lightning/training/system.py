@@ -1,6 +1,6 @@
 """The one LightningModule: it hands a trainer's batches to the step, and the run's state to checkpoints."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -50,14 +50,21 @@ class RadianceFieldSystem(LightningModule):
         self.val_errors = RayErrors()
 
     @classmethod
-    def load_from_checkpoint(cls, checkpoint_path: Any, map_location: Any = None) -> Any:  # type: ignore[override]
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: Any, map_location: Any = None, trust: Sequence[str] = ()
+    ) -> Any:
         """Return a system that renders and validates, of a file that may come from anybody; to train it has nothing.
+
+        Args:
+            checkpoint_path: the file.
+            map_location: the device.
+            trust: modules of your own, such as ["my_parts"], whose model parts may be built.
 
         Raises:
             InputError: it cannot be read, or asks for what is no part of a model of ours.
         """
         checkpoint = read_checkpoint(checkpoint_path)
-        return cls(rendering_step(checkpoint), checkpoint.record).to(map_location or "cpu").eval()
+        return cls(rendering_step(checkpoint, trust), checkpoint.record).to(map_location or "cpu").eval()
 
     def configure_optimizers(self) -> Optimizer:
         """Return the step's optimizer.
