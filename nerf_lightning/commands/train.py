@@ -2,7 +2,6 @@
 
 import logging
 import shlex
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -81,13 +80,14 @@ def train(config: DictConfig) -> Trained:
         ):
             trainer = _fit(parts, path, former, loggers)
             for folder in held:
-                folder.trained()
+                folder.trained(parts.clock.seconds)
             psnr, last_step = _finish(parts, path, trainer), trainer.global_step
         for folder in held:
             folder.finish(last_step, psnr)
         return Trained(path, psnr)
     except SystemExit as stop:
         for folder in held:
+            folder.trained(parts.clock.seconds)
             folder.stop(restarted=wants_restart(stop.code))
         raise
     except (InputError, OSError):
@@ -133,11 +133,10 @@ def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[L
     if former is None:
         describe_run(trainer.loggers, parts.config)
     checkpoint = None if former is None else former.checkpoint
-    began = time.monotonic()
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
-        log.info("%d steps in %s", steps, spoken(time.monotonic() - began))
+        log.info("%d steps in %s", steps, spoken(parts.clock.seconds))
     _show_profile(trainer, folder)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))

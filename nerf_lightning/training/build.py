@@ -31,6 +31,7 @@ from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.callbacks.training_time import TrainingTime
 from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -74,6 +75,8 @@ class Parts(Run):
     """What the doctor says of the scene, where it was asked."""
     num_steps: int
     signals: StopSignals
+    clock: TrainingTime
+    """One of the callbacks."""
     callbacks: list[Callback]
     loggers: dict[str, Any]
     """What opens them in the run's folder."""
@@ -138,8 +141,8 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     run = _run(config, choices, settings, scene)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
-    signals = StopSignals()
-    callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
+    signals, clock = StopSignals(), TrainingTime()
+    callbacks: list[Callback] = [signals, clock, FolderGuard(), *_chosen_callbacks(config)]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
@@ -152,6 +155,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
         checks=checks,
         num_steps=num_steps,
         signals=signals,
+        clock=clock,
         callbacks=callbacks,
         loggers=loggers,
         finish=finish,

@@ -91,7 +91,7 @@ class RadianceFieldSystem(LightningModule):
         seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen["losses"].sum()
         if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
-            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["losses"][-1])}, prog_bar=True)
+            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["color_errors"][-1])}, prog_bar=True)
         return seen | {"loss": loss}
 
     def monitors(self) -> list[Monitor]:
