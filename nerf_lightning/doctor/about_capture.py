@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from nerf_lightning.nerf.types.scene import Scene
 
+
 def about_capture(scene: Scene, place: str | None, form: str) -> str:
     """Return the line.
 
