@@ -16,8 +16,9 @@ from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
 from nerf_lightning.errors import InputError
-from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, psnr
+from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch

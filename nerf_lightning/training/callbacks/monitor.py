@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nerf_lightning.evaluation.metrics import psnr
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.callbacks.watcher import Watcher
 
 GIGABYTE = 1e9

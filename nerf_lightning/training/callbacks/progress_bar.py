@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nerf_lightning.console import DAY, spoken
-from nerf_lightning.evaluation.metrics import psnr
+from nerf_lightning.nerf.psnr import psnr
 
 log = logging.getLogger(__name__)
 
