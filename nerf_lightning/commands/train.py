@@ -20,7 +20,7 @@ from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.errors import InputError
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
-from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.runs.folder import ResumePoint, RunFolder, former_config, job_folder, open_run, write_config
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.runs.saved_overrides import to_give_again
@@ -66,7 +66,8 @@ def train(config: DictConfig) -> Trained:
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
     hydra = HydraConfig.get()
-    parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
+    known = ranks.from_first(lambda: former_config(config, job_folder()))
+    parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task, known)
     asked, config = config, parts.config
     if config.print_config and ranks.is_first():
         print_tree(config, StdoutConsole())

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -151,6 +152,23 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked:
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
+
+
+def former_config(config: DictConfig, job_folder: Path | None) -> Mapping[str, Any] | None:
+    """Return what a folder keeps of its run's config, where it is known before the run is; None where there is none.
+
+    Nothing in it is built: the folder may come from anybody.
+    """
+    named = required_path("resume", config.resume) if config.resume not in (None, "auto") else None
+    path = named or job_folder or config.paths.output_dir
+    if path is None:
+        return None
+    folder = Path(path).parent.parent if Path(path).suffix == ".ckpt" else Path(path)
+    try:
+        content = read_plain_yaml(folder / ".hydra" / "config.yaml")
+    except InputError:
+        return None  # whoever goes on with it is told
+    return content if isinstance(content, dict) else None
 
 
 def job_folder() -> Path | None:

@@ -119,13 +119,19 @@ def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
                 raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")
 
 
-def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str]) -> Parts:
+def build_parts(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    former: Mapping[str, Any] | None = None,
+) -> Parts:
     """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
 
     Args:
         config: of the run.
         choices: the names picked from each group, which its checkpoints keep.
         overrides: what the config was composed with.
+        former: the config of the run that is gone on with, as its folder keeps it; None: it is a new one.
 
     Raises:
         InputError: anything in the config or in the capture that makes no run.
@@ -137,7 +143,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
-    config, choices = corrected(config, choices, overrides, checks)
+    config, choices = corrected(config, choices, overrides, checks, former)
     run = _run(config, choices, settings, scene)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
