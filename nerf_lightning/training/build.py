@@ -35,6 +35,7 @@ from nerf_lightning.training.callbacks.training_time import TrainingTime
 from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.loggers import WeightsAndBiases
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
@@ -139,6 +140,9 @@ def build_parts(
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     finish, loggers = Finish.from_config(config), build(config.logger)
+    for each in loggers.values() if ranks.is_first() else ():
+        if isinstance(each, WeightsAndBiases):
+            each.require_access()
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
