@@ -5,10 +5,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from nerf_lightning.config.key_meanings import meaning_of
+from nerf_lightning.config.overrides import leaves
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.published import published_for
 from nerf_lightning.runs.results import FoundResults, RunResult
 from nerf_lightning.runs.summary import differing_keys
@@ -43,6 +45,9 @@ NOTED = ("version", "commit", "device", "precision")
 
 MOST_SETTINGS = 32
 """Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
+
+MOST_LETTERS = 80
+"""Of a value that no command line gave."""
 
 MOST_CURVES = 40
 """Rows whose curves are read: of more, the table would take long to come."""
@@ -232,7 +237,8 @@ def without_empty(rows: list[Row]) -> list[Row]:
 def _row(group: Group, shown: list[str], curve: Curve) -> Row:
     first = group[0]
     row: Row = {"scene": first.scene, "model": first.model}
-    row |= {key: first.settings.get(key, "") for key in shown}
+    unsaid = _values_of(first.folder, [key for key in shown if key not in first.settings])
+    row |= {key: first.settings.get(key, unsaid.get(key, "")) for key in shown}
     seeds = sorted(result.seed for result in group if result.seed is not None)
     row |= {"resolution": _resolution(first), "seeds": " ".join(map(str, seeds))}
     for metric, column in SPREAD.items():
@@ -243,6 +249,19 @@ def _row(group: Group, shown: list[str], curve: Curve) -> Row:
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
     row["steps"] = None if row["steps"] is None else round(row["steps"])
     return row | {"time": None, "source": None}
+
+
+def _values_of(folder: Path, keys: Sequence[str]) -> dict[str, str]:
+    """Return what a run had for settings that nobody gave: the number or word, or the option of a group."""
+    if not keys:
+        return {}
+    try:
+        config = leaves(read_plain_yaml(folder / ".hydra" / "config.yaml"))
+        choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
+        known = {key: config.get(key, choices.get(key)) for key in keys}
+    except (InputError, LookupError, TypeError, AttributeError):
+        return {}
+    return {key: str(value)[:MOST_LETTERS] for key, value in known.items() if value is not None}
 
 
 def _resolution(result: RunResult) -> str:

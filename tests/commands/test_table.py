@@ -39,6 +39,15 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
     assert "paths.output_dir" not in rows[0]
 
 
+def test_what_a_run_did_not_say_is_told_from_its_config(table, tmp_path):
+    for number, overrides in enumerate(((), ("optimizer.lr=1e-3", "refinement=se3"))):
+        run = leave_measured_run(tmp_path / "runs" / str(number), 20.0 + number, overrides=overrides)
+        (run / ".hydra" / "config.yaml").write_text("optimizer: {lr: 0.03}\nrefinement: {_target_: x}\n")
+        (run / ".hydra" / "hydra.yaml").write_text("runtime: {choices: {refinement: none, model: fast, scene: a}}\n")
+    _, rows = table("published=false")
+    assert [(row["optimizer.lr"], row["refinement"]) for row in rows] == [("1e-3", "se3"), ("0.03", "none")]
+
+
 def test_settings_without_a_column_are_counted_below(table, tmp_path):
     for number in range(2):
         overrides = tuple(f"optimizer.a{key:02d}={number}" for key in range(34))
