@@ -67,7 +67,8 @@ def train(config: DictConfig) -> Trained:
     # Whatever is wrong with the input shows here, before a folder is taken.
     hydra = HydraConfig.get()
     known = ranks.from_first(lambda: former_config(config, job_folder()))
-    parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task, known)
+    # What is left open is composed again, and may lie where the command line has said.
+    parts = build_parts(config, hydra.runtime.choices, [*_searched(), *hydra.overrides.task], known)
     asked, config = config, parts.config
     if config.print_config and ranks.is_first():
         print_tree(config, StdoutConsole())
@@ -202,7 +203,10 @@ def _loggers(parts: Parts, folder: Path, former: ResumePoint | None) -> Iterator
 
 
 def _resume_command(folder: Path) -> str:
-    overrides = HydraConfig.get().overrides
-    again = to_give_again(overrides.task)
-    searched = [shlex.quote(each) for each in overrides.hydra if each.startswith("hydra.searchpath=")]
-    return " ".join(["nerf train", to_type("resume", str(folder)), *searched, *again])
+    again = to_give_again(HydraConfig.get().overrides.task)
+    return " ".join(["nerf train", to_type("resume", str(folder)), *map(shlex.quote, _searched()), *again])
+
+
+def _searched() -> list[str]:
+    """Return the override that names folders with yamls of a person's own, if there is one."""
+    return [each for each in HydraConfig.get().overrides.hydra if each.startswith("hydra.searchpath=")]

@@ -15,9 +15,11 @@ from nerf_lightning.console import spoken
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.model_choice import model_for
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
 
 AUTO = "auto"
+EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
 
@@ -76,18 +78,17 @@ def corrected(
     picked = chosen(choices)
     if picked.get("correction") != AUTO:
         return config, picked
-    exposure = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     if former is None:
         found = [check.message for check in checks or () if check.name == "exposure" and check.verdict == "look"]
     else:
         section = former.get("correction")
-        kept = isinstance(section, dict) and section.get("_target_") == exposure["_target_"]
+        kept = isinstance(section, dict) and section.get("_target_") == EXPOSURE
         found = ["the run began with it"] if kept else []
     picked["correction"] = "exposure" if found else "none"
     if found:
         log.info("correction: exposure, since %s (correction=none takes the colours as they are)", found[0])
         config = copy.deepcopy(config)
-        config.correction = exposure
+        config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked
 
 
