@@ -112,8 +112,9 @@ class EscapingFormatter(logging.Formatter):
     """Format log records so that whatever their messages name stays text; only tracebacks take several lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
-        record.message = for_terminal(record.message)
+        """Return the line of a record; Hydra indents its own with a tab."""
+        text = record.message.lstrip("\t")
+        record.message = "  " * (len(record.message) - len(text)) + for_terminal(text)
         return super().formatMessage(record)
 
     def formatException(self, ei: Any) -> str:

@@ -117,7 +117,9 @@ def commands():
         lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
         for words in (*lines, *re.findall(r"`([^`\n]+)`", text)):
             match = re.match(r"(?:srun |\.venv-xla/bin/)?nerf ([a-z]+.*)", words)
-            if match and not any(word in match[1] for word in ("...", "--help", "NAME", "encoder=scaled")):
+            if match and not any(
+                word in match[1] for word in ("...", "--help", "NAME", "encoder=scaled", "model=voxels", "scene=table")
+            ):
                 found.add(match[1].split("  #")[0].split(" # ")[0].strip())
     return sorted(found)
 

@@ -135,6 +135,8 @@ def test_names_of_all_languages_are_taken(name):
 def test_log_messages_stay_in_their_line():
     record = logging.LogRecord("a", logging.INFO, "f", 1, "read %s", ("\x1b[2Jx\nERROR y",), None)
     formatter = EscapingFormatter("%(levelname)s %(message)s")
+    indented = logging.LogRecord("a", logging.INFO, "f", 1, "\t#0 : a\tb", (), None)
+    assert formatter.format(indented) == "INFO   #0 : a\\tb"
     assert formatter.format(record) == r"INFO read \x1b[2Jx\nERROR y"
     try:
         raise ValueError("\x1b[2J")

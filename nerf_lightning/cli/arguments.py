@@ -6,6 +6,9 @@ from typing import NoReturn
 from hydra._internal.utils import get_args_parser
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.manual.suggestions import did_you_mean
+
+COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve", "--config-dir", "--hydra-help")
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:
@@ -32,4 +35,6 @@ def _as_word(name: str, value: str | bool) -> str:
 
 
 def _refuse(message: str) -> NoReturn:
-    raise InputError(f"{message}. nerf COMMAND --hydra-help lists the options; settings are given as key=value.")
+    option = next((word for word in message.split() if word.startswith("--")), "")
+    hint = did_you_mean(option, COMMON)
+    raise InputError(f"{message}.{hint} nerf COMMAND --hydra-help lists the options; settings are given as key=value.")

@@ -1,7 +1,7 @@
 """Learn a radiance field from photographs with known cameras."""
 
 import logging
-import time
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -10,16 +10,17 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
+from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.tree import print_tree
 from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.errors import InputError
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
-from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.runs.folder import ResumePoint, RunFolder, former_config, job_folder, open_run, write_config
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.runs.saved_overrides import to_give_again
@@ -65,7 +66,9 @@ def train(config: DictConfig) -> Trained:
     """
     # Whatever is wrong with the input shows here, before a folder is taken.
     hydra = HydraConfig.get()
-    parts = build_parts(config, hydra.runtime.choices, hydra.overrides.task)
+    known = ranks.from_first(lambda: former_config(config, job_folder()))
+    # What is left open is composed again, and may lie where the command line has said.
+    parts = build_parts(config, hydra.runtime.choices, [*_searched(), *hydra.overrides.task], known)
     asked, config = config, parts.config
     if config.print_config and ranks.is_first():
         print_tree(config, StdoutConsole())
@@ -79,13 +82,14 @@ def train(config: DictConfig) -> Trained:
         ):
             trainer = _fit(parts, path, former, loggers)
             for folder in held:
-                folder.trained()
+                folder.trained(parts.clock.seconds)
             psnr, last_step = _finish(parts, path, trainer), trainer.global_step
         for folder in held:
             folder.finish(last_step, psnr)
         return Trained(path, psnr)
     except SystemExit as stop:
         for folder in held:
+            folder.trained(parts.clock.seconds)
             folder.stop(restarted=wants_restart(stop.code))
         raise
     except (InputError, OSError):
@@ -131,11 +135,10 @@ def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[L
     if former is None:
         describe_run(trainer.loggers, parts.config)
     checkpoint = None if former is None else former.checkpoint
-    began = time.monotonic()
     trainer.fit(parts.system, parts.data, ckpt_path=checkpoint, weights_only=True)
     if ranks.is_first():
         steps = trainer.global_step - (0 if former is None else former.step)
-        log.info("%d steps in %s", steps, spoken(time.monotonic() - began))
+        log.info("%d steps in %s", steps, spoken(parts.clock.seconds))
     _show_profile(trainer, folder)
     if parts.signals.received is not None:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, _resume_command(folder))
@@ -180,6 +183,12 @@ def _announce(parts: Parts, folder: Path, former: ResumePoint | None) -> None:
         parts.settings.describe(),
         "whole batches" if tile is None else f"tiles of {tile} points",
     )
+    own = modules_to_trust(OmegaConf.to_container(parts.config.model, resolve=True))
+    if own:
+        log.info(
+            "the model has parts of your own: a command that opens its checkpoints builds them only with trust=%s",
+            own[0] if len(own) == 1 else f"[{','.join(own)}]",
+        )
 
 
 @contextmanager
@@ -195,4 +204,9 @@ def _loggers(parts: Parts, folder: Path, former: ResumePoint | None) -> Iterator
 
 def _resume_command(folder: Path) -> str:
     again = to_give_again(HydraConfig.get().overrides.task)
-    return " ".join(["nerf train", to_type("resume", str(folder)), *again])
+    return " ".join(["nerf train", to_type("resume", str(folder)), *map(shlex.quote, _searched()), *again])
+
+
+def _searched() -> list[str]:
+    """Return the override that names folders with yamls of a person's own, if there is one."""
+    return [each for each in HydraConfig.get().overrides.hydra if each.startswith("hydra.searchpath=")]

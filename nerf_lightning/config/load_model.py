@@ -1,6 +1,7 @@
 """Configs to objects: the user's own freely, a checkpoint's only from our rooms."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,11 +22,15 @@ SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
 
 
-def load_model(checkpoint: Checkpoint) -> Model:
+def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     """Build the model that a checkpoint describes, with its weights, in evaluation mode.
 
     The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
-    defined in our own rooms and follow one of our contracts are built.
+    defined in our own rooms, or in modules that a person trusts, and follow one of our contracts are built.
+
+    Args:
+        checkpoint: as read.
+        trusted: modules of the person's own, with all below them.
 
     Raises:
         InputError: the config names anything else, or the weights do not fit.
@@ -34,7 +39,7 @@ def load_model(checkpoint: Checkpoint) -> Model:
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise InputError(f"{checkpoint.path} is damaged: its config has no readable model part. Use another one.")
     config = config["model"]
-    require_trusted(config, str(checkpoint.path))
+    require_trusted(config, str(checkpoint.path), trusted)
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
         shapes = _built(config, checkpoint)

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 
 FEWEST = 8
@@ -42,6 +43,7 @@ def exposure_fitted(
     truth: Float[Tensor, "height width 3"],
     opacity: Float[Tensor, "height width"],
     fitted: Bool[Tensor, "height width"],
+    background: Float[Tensor, "1 3"] | None,
 ) -> Float[Tensor, "height width 3"]:
     """Return a render under the exposure and white balance that bring some of its pixels closest to its photograph.
 
@@ -53,23 +55,26 @@ def exposure_fitted(
         truth: the photograph.
         opacity: of each pixel of the render.
         fitted: pixels that are compared; where there is none the render stays as it is.
+        background: the colour behind the render; None: there is none.
     """
     if not bool(fitted.any()):
         return render
 
-    def shown(stops: Tensor, ours: Tensor, opaque: Tensor) -> Tensor:
-        return ours + opaque[:, None] * (scale_light(ours, torch.exp2(stops)) - ours)
+    foreground = render if background is None else render - (1.0 - opacity[..., None]) * background
+
+    def shown(stops: Tensor, *parts: Tensor) -> Tensor:
+        return in_other_light(lambda straight: scale_light(straight, torch.exp2(stops)), *parts)
 
     stops = torch.zeros(3, device=render.device, requires_grad=True)
-    ours, true, opaque = render[fitted], truth[fitted], opacity[fitted]
+    ours, true = (render[fitted], foreground[fitted], opacity[fitted]), truth[fitted]
     optimizer = torch.optim.LBFGS([stops], max_iter=50, tolerance_grad=1e-9, line_search_fn="strong_wolfe")
 
     def error() -> float:
         optimizer.zero_grad()
-        squared = (shown(stops, ours, opaque) - true).square().mean()
+        squared = (shown(stops, *ours) - true).square().mean()
         squared.backward()
         return float(squared.detach())
 
     with torch.enable_grad():
         optimizer.step(error)
-    return shown(stops.detach(), render.reshape(-1, 3), opacity.reshape(-1)).view_as(render)
+    return shown(stops.detach(), render, foreground, opacity)

@@ -26,7 +26,7 @@ from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_de
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
 
 
@@ -130,7 +130,7 @@ class Scoring:
         scored = slice(None)
         if self.colors == "half_fit":
             scored = slice(truth.shape[1] // 2, None)
-            picture = replace(picture, rgb=_fitted_on_the_left(picture, truth, kept, scored.start))
+            picture = replace(picture, rgb=_fitted_on_the_left(picture, truth, kept, scored.start, background))
         if self.quantize:
             picture = replace(picture, rgb=(picture.rgb.clamp(0, 1) * 255).round() / 255)
         render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
@@ -140,10 +140,13 @@ class Scoring:
         return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
 
 
-def _fitted_on_the_left(picture: Picture, truth: Tensor, kept: Tensor | None, middle: int) -> Tensor:
+def _fitted_on_the_left(
+    picture: Picture, truth: Tensor, kept: Tensor | None, middle: int, background: Background
+) -> Tensor:
     fitted = torch.ones(truth.shape[:2], dtype=torch.bool) if kept is None else kept.clone()
     fitted[:, middle:] = False
-    return exposure_fitted(picture.rgb, truth, picture.opacity, fitted)
+    behind = background_colors(background, 1, torch.device("cpu"), random=None)
+    return exposure_fitted(picture.rgb, truth, picture.opacity, fitted, behind)
 
 
 def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, float | None]:

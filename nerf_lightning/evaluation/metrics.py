@@ -15,24 +15,12 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from nerf_lightning import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected
 from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (standard deviation 1.5) of torchmetrics' SSIM."""
-LEAST_MSE = 1e-10
-"""Errors below count as this one, a PSNR of 100 dB."""
 HIGHER_IS_BETTER = ("psnr", "cc_psnr", "ssim")
 """Of the others, which are errors, the lower is better."""
-
-
-def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
-    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; at most 100.
-
-    Equal pictures (a view of background alone) would have an infinite one, and no mean or file could hold it.
-
-    >>> round(float(psnr(torch.tensor(0.01))), 3)
-    20.0
-    """
-    return -10.0 * torch.log10(mse.clamp(min=LEAST_MSE))
 
 
 def masked_out(
@@ -72,15 +60,10 @@ def image_metrics(
         assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
         ssim = float(similarity)
     return {
-        "psnr": _psnr_of(render, truth, kept),
-        "cc_psnr": _psnr_of(color_corrected(render, truth, kept).clamp(0, 1), truth, kept),
+        "psnr": picture_psnr(render, truth, kept),
+        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp(0, 1), truth, kept),
         "ssim": ssim,
     }
-
-
-def _psnr_of(render: Tensor, truth: Tensor, kept: Tensor | None) -> float:
-    error = (render - truth).square()
-    return float(psnr((error if kept is None else error[kept]).mean()))
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -71,13 +72,17 @@ class RunFolder:
             path = path.replace(folder / LAST)
         return ResumePoint(path, found.step, found.precision, found.tile_points)
 
-    def trained(self) -> None:
-        """Note that training is over, and how long it took.
+    def trained(self, seconds: float) -> None:
+        """Note how long this start has trained, from its first step to its last, and how long all else took before now.
+
+        A run that is gone on with counts on.
 
         Raises:
             InputError: the folder is gone.
         """
-        self._note(training_seconds=self._note())
+        note, here = read_note(self.path), time.monotonic() - self.began
+        spent = {"training_seconds": seconds, "setup_seconds": here - seconds}
+        self._note(**{key: round((number(note.get(key)) or 0.0) + value, 1) for key, value in spent.items()})
 
     def finish(self, step: int, psnr: float | None = None) -> None:
         """Note that the run is complete.
@@ -95,14 +100,13 @@ class RunFolder:
         """Let others have the folder."""
         self.lock.release()
 
-    def _note(self, **values: Any) -> float:
+    def _note(self, **values: Any) -> None:
         require_run(self.path)
         note = read_note(self.path)
         now = time.monotonic()
         seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)
         self.began = now
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
-        return seconds
 
 
 def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked: DictConfig | None = None) -> RunFolder:
@@ -136,7 +140,7 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked:
         ) from error
     note = read_note(folder)
     kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
-        key: note[key] for key in ("started", "seconds") if key in note
+        key: note[key] for key in ("started", "seconds", "training_seconds", "setup_seconds") if key in note
     }
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
     write_json(
@@ -148,6 +152,23 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked:
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
+
+
+def former_config(config: DictConfig, job_folder: Path | None) -> Mapping[str, Any] | None:
+    """Return what a folder keeps of its run's config, where it is known before the run is; None where there is none.
+
+    Nothing in it is built: the folder may come from anybody.
+    """
+    named = required_path("resume", config.resume) if config.resume not in (None, "auto") else None
+    path = named or job_folder or config.paths.output_dir
+    if path is None:
+        return None
+    folder = Path(path).parent.parent if Path(path).suffix == ".ckpt" else Path(path)
+    try:
+        content = read_plain_yaml(folder / ".hydra" / "config.yaml")
+    except InputError:
+        return None  # whoever goes on with it is told
+    return content if isinstance(content, dict) else None
 
 
 def job_folder() -> Path | None:

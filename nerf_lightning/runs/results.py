@@ -15,7 +15,7 @@ from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
-from nerf_lightning.runs.summary import RunSummary, read_note, read_run
+from nerf_lightning.runs.summary import RunSummary, read_note, read_run, told_settings
 
 Measured = Literal["run", "eval"]
 FILES: dict[Measured, str] = {"run": "metrics.json", "eval": "evaluation/metrics.json"}
@@ -138,7 +138,7 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
         model=str(origin.get("model") or run.overrides.get("model", "")) or "not said",
         seed=int(seed) if SEED.fullmatch(seed) else None,
         values=values,
-        settings={key: value for key, value in run.overrides.items() if _is_shown(key.lstrip("+~"))},
+        settings=told_settings({key: value for key, value in run.overrides.items() if _is_shown(key.lstrip("+~"))}),
         protocol=protocol,
         origin=origin,
     )

@@ -10,6 +10,8 @@ from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
 
+CLASS = "._target_"
+
 
 @dataclass(frozen=True)
 class RunSummary:
@@ -60,6 +62,16 @@ def by_key(overrides: list[str]) -> dict[str, str]:
     {'model': 'nerf_tiny', 'seed': '1'}
     """
     return {key: value for key, _, value in (override.partition("=") for override in overrides)}
+
+
+def told_settings(overrides: dict[str, str]) -> dict[str, str]:
+    """Return overrides by the names that columns have: a class stands for its group, and that it was added is not said.
+
+    >>> told_settings({"loss._target_": "my_losses.L1", "+loss.part": "0.5"})
+    {'loss.part': '0.5', 'loss': 'my_losses.L1'}
+    """
+    given = sorted(overrides.items(), key=lambda pair: pair[0].endswith(CLASS))  # a class has the last word
+    return {key.lstrip("+").removesuffix(CLASS): value for key, value in given}
 
 
 def differing_keys(settings: Sequence[dict[str, str]]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerf_lightning.runs.summary import RunSummary, by_key, differing_keys, read_run
+from nerf_lightning.runs.summary import RunSummary, by_key, differing_keys, read_run, told_settings
 from nerf_lightning.runs.sweep_job import JobRecord
 from nerf_lightning.runs.table_files import Row
 
@@ -10,7 +10,7 @@ from nerf_lightning.runs.table_files import Row
 def job_rows(records: list[JobRecord], sweep_folder: Path) -> list[Row]:
     """Return a row per job, sorted by PSNR; what no job has, or all have the same of, is left out of the settings."""
     runs = {record.number: read_run(Path(record.folder)) for record in records}
-    settings = {record.number: by_key(record.overrides) for record in records}
+    settings = {record.number: told_settings(by_key(record.overrides)) for record in records}
     swept = differing_keys(list(settings.values()))
     rows = []
     for record in sorted(records, key=lambda record: _rank(runs[record.number], record)):

@@ -1,13 +1,16 @@
 """Measured runs as one table: a row per scene, model and setting, mean and standard deviation over seeds."""
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
+from nerf_lightning.config.key_meanings import meaning_of
+from nerf_lightning.config.overrides import leaves
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.evaluation.metrics import HIGHER_IS_BETTER
 from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.published import published_for
 from nerf_lightning.runs.results import FoundResults, RunResult
 from nerf_lightning.runs.summary import differing_keys
@@ -34,11 +37,17 @@ PLAIN = {
     "megabytes": "MB",
 }
 HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
+FINGERPRINT = "split_hash"
+CHOOSE_PICTURES = ("split", "resolution", "masks", "downscale", "filter", "hold_every", "frames")
+"""Where these differ, so do the pictures, and that need not be said again."""
 # What tells whose numbers they are, and may move them a little: named below a table where it differs.
 NOTED = ("version", "commit", "device", "precision")
 
 MOST_SETTINGS = 32
 """Columns of settings by which runs differ: more are not read, and a stranger's run may have thousands."""
+
+MOST_LETTERS = 80
+"""Of a value that no command line gave."""
 
 MOST_CURVES = 40
 """Rows whose curves are read: of more, the table would take long to come."""
@@ -100,7 +109,7 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
     for result in results:
         first = first_of.setdefault(result.scene, result)
         for other, same_scene in ((first, True), (results[0], False)):
-            apart = differences(other.protocol, result.protocol, same_scene)
+            apart = _apart(other, result, same_scene)
             if apart and not force:
                 raise InputError(
                     f"{other.folder} and {result.folder} were not measured alike ({'; '.join(apart)}), so their "
@@ -110,6 +119,34 @@ def one_protocol(results: Sequence[RunResult], force: bool) -> list[str]:
             for difference in apart:
                 pairs.setdefault(difference, f"{other.folder} and {result.folder}")
     return [f"Not all of these were measured alike: {pair}: {difference}." for difference, pair in pairs.items()]
+
+
+def _apart(one: RunResult, other: RunResult, same_scene: bool) -> list[str]:
+    """Return what keeps two results from being compared, in words and in settings that people know."""
+    found = dict(each.split(": ", 1) for each in differences(one.protocol, other.protocol, same_scene))
+    told = [f"{key}: {values}" for key, values in found.items() if key != FINGERPRINT]
+    if FINGERPRINT in found and not found.keys() & {*CHOOSE_PICTURES}:
+        told.append(_other_pictures(one.summary.overrides, other.summary.overrides))
+    return told
+
+
+def _other_pictures(one: dict[str, str], other: dict[str, str]) -> str:
+    chosen = ({key: value for key, value in given.items() if _chooses_pictures(key)} for given in (one, other))
+    differing = differing_keys(list(chosen))
+    if not differing:
+        return "other pictures, by the same settings: the capture was changed in between"
+    return f"other pictures, of {listed(_as_given(one, other, differing), cap=3)}"
+
+
+def _as_given(one: dict[str, str], other: dict[str, str], keys: Iterable[str]) -> Iterator[str]:
+    for key in keys:
+        told = [f"{key}={given[key]}" for given in (one, other) if key in given]
+        yield " and ".join(told if len(told) == 2 else [*told, "its default"])
+
+
+def _chooses_pictures(key: str) -> bool:
+    is_of_scene = key == "scene" or key.startswith("scene.")
+    return (is_of_scene and meaning_of(key).identity) or key in ("evaluation.split", "evaluation.max_views")
 
 
 def noted_origins(results: Sequence[RunResult]) -> list[str]:
@@ -200,7 +237,8 @@ def without_empty(rows: list[Row]) -> list[Row]:
 def _row(group: Group, shown: list[str], curve: Curve) -> Row:
     first = group[0]
     row: Row = {"scene": first.scene, "model": first.model}
-    row |= {key: first.settings.get(key, "") for key in shown}
+    unsaid = _values_of(first.folder, [key for key in shown if key not in first.settings])
+    row |= {key: first.settings.get(key, unsaid.get(key, "")) for key in shown}
     seeds = sorted(result.seed for result in group if result.seed is not None)
     row |= {"resolution": _resolution(first), "seeds": " ".join(map(str, seeds))}
     for metric, column in SPREAD.items():
@@ -211,6 +249,19 @@ def _row(group: Group, shown: list[str], curve: Curve) -> Row:
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
     row["steps"] = None if row["steps"] is None else round(row["steps"])
     return row | {"time": None, "source": None}
+
+
+def _values_of(folder: Path, keys: Sequence[str]) -> dict[str, str]:
+    """Return what a run had for settings that nobody gave: the number or word, or the option of a group."""
+    if not keys:
+        return {}
+    try:
+        config = leaves(read_plain_yaml(folder / ".hydra" / "config.yaml"))
+        choices = read_plain_yaml(folder / ".hydra" / "hydra.yaml")["runtime"]["choices"]
+        known = {key: config.get(key, choices.get(key)) for key in keys}
+    except (InputError, LookupError, TypeError, AttributeError):
+        return {}
+    return {key: str(value)[:MOST_LETTERS] for key, value in known.items() if value is not None}
 
 
 def _resolution(result: RunResult) -> str:

@@ -15,9 +15,11 @@ from nerf_lightning.console import spoken
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.model_choice import model_for
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
 
 AUTO = "auto"
+EXPOSURE = f"{Exposure.__module__}.{Exposure.__name__}"
 PHOTOS_SECONDS = 300
 """Of training on photographs alone: with their cameras, evaluation and film about ten minutes on two cores."""
 
@@ -56,23 +58,35 @@ def settled(
 
 
 def corrected(
-    config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], checks: Sequence[Check] | None
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    checks: Sequence[Check] | None,
+    former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config and the names picked from each group, with the correction that the photographs want.
+
+    A run that is gone on with keeps the one that was chosen for it.
 
     Args:
         config: with its model chosen.
         choices: the names picked from each group.
         overrides: what it was composed with.
         checks: what the doctor says of the scene; None where it was not asked.
+        former: the config of the run that is gone on with; None: it is a new one.
     """
     picked = chosen(choices)
     if picked.get("correction") != AUTO:
         return config, picked
-    found = [check for check in checks or () if check.name == "exposure" and check.verdict == "look"]
+    if former is None:
+        found = [check.message for check in checks or () if check.name == "exposure" and check.verdict == "look"]
+    else:
+        section = former.get("correction")
+        kept = isinstance(section, dict) and section.get("_target_") == EXPOSURE
+        found = ["the run began with it"] if kept else []
     picked["correction"] = "exposure" if found else "none"
     if found:
-        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", found[0].message)
+        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", found[0])
         config = copy.deepcopy(config)
         config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked

@@ -31,9 +31,11 @@ from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.callbacks.training_time import TrainingTime
 from nerf_lightning.training.evaluate_and_film import Finish
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.loggers import WeightsAndBiases
 from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
@@ -74,6 +76,8 @@ class Parts(Run):
     """What the doctor says of the scene, where it was asked."""
     num_steps: int
     signals: StopSignals
+    clock: TrainingTime
+    """One of the callbacks."""
     callbacks: list[Callback]
     loggers: dict[str, Any]
     """What opens them in the run's folder."""
@@ -116,13 +120,19 @@ def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
                 raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")
 
 
-def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str]) -> Parts:
+def build_parts(
+    config: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    former: Mapping[str, Any] | None = None,
+) -> Parts:
     """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
 
     Args:
         config: of the run.
         choices: the names picked from each group, which its checkpoints keep.
         overrides: what the config was composed with.
+        former: the config of the run that is gone on with, as its folder keeps it; None: it is a new one.
 
     Raises:
         InputError: anything in the config or in the capture that makes no run.
@@ -130,16 +140,19 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     finish, loggers = Finish.from_config(config), build(config.logger)
+    for each in loggers.values() if ranks.is_first() else ():
+        if isinstance(each, WeightsAndBiases):
+            each.require_access()
     scene: Scene = build(config.scene).read()
     finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
-    config, choices = corrected(config, choices, overrides, checks)
+    config, choices = corrected(config, choices, overrides, checks, former)
     run = _run(config, choices, settings, scene)
     num_rays, data = run.data.batches.whole.num_rays, config.data
     num_steps = settings.num_steps(num_rays, data.batch_rays, data.crop_steps)
-    signals = StopSignals()
-    callbacks: list[Callback] = [signals, FolderGuard(), *_chosen_callbacks(config)]
+    signals, clock = StopSignals(), TrainingTime()
+    callbacks: list[Callback] = [signals, clock, FolderGuard(), *_chosen_callbacks(config)]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
@@ -152,6 +165,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
         checks=checks,
         num_steps=num_steps,
         signals=signals,
+        clock=clock,
         callbacks=callbacks,
         loggers=loggers,
         finish=finish,

@@ -16,6 +16,8 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.tensorboard import shown_name
 
+LOG_IN = "Log in with wandb login, keep everything here with logger.wandb.offline=true"
+
 
 class RunLogger(ABC):
     """Settings of a logger, which is opened once the run has its folder."""
@@ -59,6 +61,20 @@ class WeightsAndBiases(RunLogger):
         _require("wandb", "logger=wandb", "wandb")
         self.project, self.entity, self.offline = project, entity, offline
 
+    def require_access(self) -> None:
+        """Look for a key before the run has a folder; in a terminal, W&B asks for one.
+
+        Raises:
+            InputError: nobody is logged in.
+        """
+        if self.offline or os.environ.get("WANDB_MODE") in ("offline", "dryrun", "disabled"):
+            return
+        import wandb
+        from wandb.errors import Error
+
+        with _refused(Error, "Weights & Biases", LOG_IN):
+            wandb.login(verify=False)
+
     def open(self, folder: Path, started: str) -> WandbLogger:
         """See `RunLogger`."""
         from wandb.errors import Error
@@ -71,8 +87,7 @@ class WeightsAndBiases(RunLogger):
             offline=self.offline,
             id=uuid.uuid5(uuid.NAMESPACE_URL, f"{folder.absolute()} {started}").hex[:16],
         )
-        cure = "Log in with wandb login, keep everything here with logger.wandb.offline=true"
-        with _refused(Error, "Weights & Biases", cure):
+        with _refused(Error, "Weights & Biases", LOG_IN):
             _ = logger.experiment
         return logger
 
@@ -152,7 +167,7 @@ def _refused(error: type[Exception], what: str, cure: str) -> Iterator[None]:
     try:
         yield
     except error as refusal:
-        reason = " ".join(str(refusal).split())
+        reason = " ".join(str(refusal).split()).rstrip(".")
         raise InputError(
             f"{what} cannot be used: {reason}. {cure}, or leave it out with logger=tensorboard."
         ) from refusal

@@ -42,7 +42,7 @@ def open_checkpoint(config: DictConfig, float32: bool = False) -> Opened:
     """Open `ckpt` as the config's trainer says.
 
     Args:
-        config: of a command, with `ckpt` and `trainer`.
+        config: of a command, with `ckpt`, `trainer` and `trust`.
         float32: multiply so, whatever the run was trained in.
 
     Raises:
@@ -55,13 +55,22 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     """Open several; the tiles are those of the first."""
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
+    trusted = _modules(config.trust)
     checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in paths]
     settings.keep_tile(checkpoints[0].tile_points)
-    return [Opened(settings, each, _model(settings, each, float32)) for each in checkpoints]
+    return [Opened(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
 
 
-def _model(settings: TrainerSettings, checkpoint: Checkpoint, float32: bool) -> Model:
-    model = load_model(checkpoint)
+def _modules(trust: Any) -> list[str]:
+    named = [] if trust is None else [trust] if isinstance(trust, str) else list(trust)
+    for name in named:
+        if not isinstance(name, str) or not all(word.isidentifier() for word in name.split(".")):
+            raise InputError(f"trust={name}: give the name of a Python module of yours, as it is imported: my_parts.")
+    return named
+
+
+def _model(settings: TrainerSettings, checkpoint: Checkpoint, trusted: Sequence[str], float32: bool) -> Model:
+    model = load_model(checkpoint, trusted)
     return model.to(settings.device) if float32 else settings.prepare(model)
 
 
@@ -79,7 +88,7 @@ def read_photographs(config: DictConfig, checkpoint: Checkpoint) -> Scene | None
     return None
 
 
-def rendering_step(checkpoint: Checkpoint) -> TrainStep:
+def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> TrainStep:
     """Return a step that renders and validates, and takes no step.
 
     The loss, the optimizer and the schedule of a run come from its person's own config alone, never from a file.
@@ -92,7 +101,7 @@ def rendering_step(checkpoint: Checkpoint) -> TrainStep:
             f"run, then trainer.fit(run.system, run.data, ckpt_path='{checkpoint.path}')."
         )
 
-    scene, model, settings = checkpoint.scene, load_model(checkpoint), TrainerSettings(accelerator="cpu")
+    scene, model, settings = checkpoint.scene, load_model(checkpoint, trusted), TrainerSettings(accelerator="cpu")
     settings.keep_tile(checkpoint.tile_points)
     return TrainStep(
         model=model,

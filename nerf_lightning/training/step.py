@@ -23,6 +23,7 @@ from nerf_lightning.nerf.encoders.base import follow_run, tables_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
@@ -199,8 +200,8 @@ class TrainStep:
             measure_gradients: whether to measure the gradients' norms, before they are clipped.
 
         Returns:
-            What `gradients` returns, with the losses of all processes; the `pixels` of the batch; and `gradient_norms`
-            by level, where they were measured and the step was taken.
+            What `gradients` returns, with the losses and errors of all processes; the `pixels` of the batch; and
+            `gradient_norms` by level, where they were measured and the step was taken.
         """
         progress = self.progress
         optimizer.zero_grad()
@@ -212,7 +213,7 @@ class TrainStep:
         first = ranks.share(num_rays // self.rays_together).start * self.rays_together
         share = Share(first, num_rays, ranks.total(batch.weight.sum()))
         seen = self.gradients(batch, backward, share)
-        ranks.add_up([seen["losses"]])
+        ranks.add_up([seen["losses"], seen["color_errors"]])
         ranks.add_up_gradients(self._parameters())
         norms: dict[str, Tensor] = {}
         if self.guard.allows(seen["losses"], self._named_parameters()):
@@ -239,7 +240,8 @@ class TrainStep:
             share: what part of the step's batch this is; None: all of it.
 
         Returns:
-            `losses` per level, detached, which add up over all shares to the batch's; and of each ray its `foreground`
+            `losses` and `color_errors` (mean squared) per level, detached, which add up over all shares to the batch's;
+            and of each ray its `foreground`
             light, its last level's `rgb`, its `target` colour and its `weight`.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
@@ -314,8 +316,10 @@ class TrainStep:
             renderings = self.model(rays, None if behind is None else behind[tile], numbers)
             shown = [self.correction.photographed(each, pixels) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile])))
-            levels = levels * ((tile.stop - tile.start) / share.num_rays)
-            return TileLoss(levels, renderings[-1].foreground, shown[-1].rgb)
+            part = (tile.stop - tile.start) / share.num_rays
+            with torch.no_grad():
+                errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
+            return TileLoss(levels * part, errors * part, renderings[-1].foreground, shown[-1].rgb)
 
         tile_rays, together = self._tile_rays(num_rays, training=True), self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
@@ -326,7 +330,9 @@ class TrainStep:
             lost = in_turn(lose, list(tiles(num_rays, tile_rays, together)), backward)
         seen = {name: torch.cat([getattr(each, name) for each in lost]) for name in ("foreground", "rgb")}
         seen |= {"target": target.rgb, "weight": batch.weight}
-        return {"losses": torch.stack([each.levels for each in lost]).sum(0)} | seen
+        for name, of in (("losses", "levels"), ("color_errors", "errors")):
+            seen[name] = torch.stack([getattr(each, of) for each in lost]).sum(0)
+        return seen
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:

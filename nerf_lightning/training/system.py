@@ -1,6 +1,6 @@
 """The one LightningModule: it hands a trainer's batches to the step, and the run's state to checkpoints."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,9 @@ from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
 from nerf_lightning.errors import InputError
-from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, psnr
+from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
@@ -50,14 +51,21 @@ class RadianceFieldSystem(LightningModule):
         self.val_errors = RayErrors()
 
     @classmethod
-    def load_from_checkpoint(cls, checkpoint_path: Any, map_location: Any = None) -> Any:  # type: ignore[override]
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: Any, map_location: Any = None, trust: Sequence[str] = ()
+    ) -> Any:
         """Return a system that renders and validates, of a file that may come from anybody; to train it has nothing.
+
+        Args:
+            checkpoint_path: the file.
+            map_location: the device.
+            trust: modules of your own, such as ["my_parts"], whose model parts may be built.
 
         Raises:
             InputError: it cannot be read, or asks for what is no part of a model of ours.
         """
         checkpoint = read_checkpoint(checkpoint_path)
-        return cls(rendering_step(checkpoint), checkpoint.record).to(map_location or "cpu").eval()
+        return cls(rendering_step(checkpoint, trust), checkpoint.record).to(map_location or "cpu").eval()
 
     def configure_optimizers(self) -> Optimizer:
         """Return the step's optimizer.
@@ -84,7 +92,7 @@ class RadianceFieldSystem(LightningModule):
         seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
         loss = seen["losses"].sum()
         if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
-            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["losses"][-1])}, prog_bar=True)
+            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["color_errors"][-1])}, prog_bar=True)
         return seen | {"loss": loss}
 
     def monitors(self) -> list[Monitor]:

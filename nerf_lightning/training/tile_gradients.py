@@ -24,6 +24,9 @@ class TileLoss:
     """What a tile of rays has lost."""
 
     levels: Float[Tensor, "levels"]
+    """Each level's loss."""
+    errors: Float[Tensor, "levels"]
+    """Each level's mean squared error of colour, whatever its loss is; of one that shows none it means nothing."""
     foreground: Float[Tensor, "rays 3"]
     """The light of its rays without the background's."""
     rgb: Float[Tensor, "rays 3"]
@@ -31,7 +34,7 @@ class TileLoss:
 
     def detached(self) -> "TileLoss":
         """Return the same without what the backward pass needs."""
-        return TileLoss(self.levels.detach(), self.foreground.detach(), self.rgb.detach())
+        return TileLoss(self.levels.detach(), self.errors.detach(), self.foreground.detach(), self.rgb.detach())
 
 
 def in_turn(lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward) -> list[TileLoss]:

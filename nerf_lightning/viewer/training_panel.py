@@ -9,7 +9,7 @@ PAUSE, GO_ON = "Pause", "Go on"
 STOP, SURE = "Stop training", "Really stop: press again"
 # How long the second press is waited for.
 SURE_SECONDS = 8.0
-WHAT_STOP_IS = "The step ends, then the checkpoint is written and the run evaluated."
+WHAT_STOP_IS = "The checkpoint is written, and the run evaluated."
 
 
 class TrainingPanel:
@@ -25,7 +25,7 @@ class TrainingPanel:
         self._asked = 0.0
         gui, harmless = session.client.gui, session.queue.complaints.harmless
         with gui.add_folder("Training"):
-            self.said = gui.add_markdown("The training runs.")
+            self.said = gui.add_markdown("")
             self.hold = gui.add_button(PAUSE, visible=switch.can_pause, hint="No step is taken until somebody lets it")
             self.end = gui.add_button(STOP, color="gray", hint=WHAT_STOP_IS)
         self.hold.on_click(harmless(lambda _: switch.go_on() if switch.wants_pause else switch.pause()))
@@ -55,6 +55,6 @@ class TrainingPanel:
 
     def _state(self) -> str:
         switch = self.switch
-        how = "It stops" if switch.wants_stop else "It pauses" if switch.wants_pause else "It runs"
-        far = f", step {switch.step:,} of {switch.num_steps:,}" if switch.num_steps else ""
-        return f"{how}{far}. {WHAT_STOP_IS if switch.wants_stop else ''}".strip()
+        how = "Stopping at" if switch.wants_stop else "Paused at" if switch.wants_pause else "Running:"
+        far = f"step {switch.step:,} of {switch.num_steps:,}" if switch.num_steps else "the first step"
+        return f"{how} {far}. {WHAT_STOP_IS if switch.wants_stop else ''}".strip()

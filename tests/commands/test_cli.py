@@ -83,6 +83,12 @@ def test_a_mode_in_a_file_of_the_users_counts(tmp_path, nerf):
     assert "Launching 2 jobs" in nerf("train", f"--config-dir={tmp_path}", "experiment=many", *many).err
 
 
+def test_a_mistyped_option_has_a_near_match(nerf):
+    result = nerf("train", "--hlep")
+    assert result.code == 2
+    assert "Did you mean --help?" in result.err
+
+
 def test_an_unknown_command_has_a_near_match(nerf):
     result = nerf("trian")
     assert result.code == 2

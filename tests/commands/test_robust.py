@@ -45,7 +45,6 @@ def test_it_weighs_the_loss_of_each_model(model, of):
     loss = build(composed("train", f"model={model}", "loss=robust").loss)
     assert isinstance(loss, RobustLoss)
     assert type(loss.of) is of
-    assert loss.every_level_is_a_picture is of.every_level_is_a_picture
 
 
 def test_a_run_that_was_killed_and_goes_on_ends_with_the_same_bits(capture, run, tmp_path):

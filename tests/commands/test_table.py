@@ -39,6 +39,15 @@ def test_settings_that_differ_make_rows_of_their_own(table, tmp_path):
     assert "paths.output_dir" not in rows[0]
 
 
+def test_what_a_run_did_not_say_is_told_from_its_config(table, tmp_path):
+    for number, overrides in enumerate(((), ("optimizer.lr=1e-3", "refinement=se3"))):
+        run = leave_measured_run(tmp_path / "runs" / str(number), 20.0 + number, overrides=overrides)
+        (run / ".hydra" / "config.yaml").write_text("optimizer: {lr: 0.03}\nrefinement: {_target_: x}\n")
+        (run / ".hydra" / "hydra.yaml").write_text("runtime: {choices: {refinement: none, model: fast, scene: a}}\n")
+    _, rows = table("published=false")
+    assert [(row["optimizer.lr"], row["refinement"]) for row in rows] == [("1e-3", "se3"), ("0.03", "none")]
+
+
 def test_settings_without_a_column_are_counted_below(table, tmp_path):
     for number in range(2):
         overrides = tuple(f"optimizer.a{key:02d}={number}" for key in range(34))
@@ -122,6 +131,44 @@ def test_another_protocol_is_refused_and_the_difference_named(table, tmp_path):
     assert len(ours(rows)) == 2
     assert "Not all of these were measured alike" in result.out
     assert "pixels: float and 8-bit" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_other_pictures_are_told_by_the_settings_that_chose_them(table, tmp_path):
+    asked = {"a": ("scene.num_test=8", "scene.cache_dir=x"), "b": ("scene.num_test=16", "optimizer.lr=1e-2"), "c": ()}
+    for name, overrides in asked.items():
+        leave_measured_run(
+            tmp_path / "runs" / name, overrides=overrides, protocol={"split_hash": name * 16}, origin={"config": name}
+        )
+    result, _ = table("models=fast")
+    said(result, "runs/a", "runs/b", "(other pictures, of scene.num_test=8 and scene.num_test=16)")
+    assert "split_hash" not in result.err
+    text = table("force=true")[0].out
+    assert "other pictures, of scene.num_test=8 and its default" in text
+    assert "split_hash" not in text
+
+
+def test_what_makes_the_pictures_differ_is_told_alone(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    other = {"split_hash": "f" * 16, "resolution": [[400, 400]]}
+    leave_measured_run(tmp_path / "runs" / "b", protocol=other, origin={"config": "b"})
+    result, _ = table()
+    said(result, "(resolution: [[800, 800]] and [[400, 400]])")
+
+
+def test_pictures_that_no_setting_tells_apart_are_said_to_be_other_files(table, tmp_path):
+    leave_measured_run(tmp_path / "runs" / "a")
+    leave_measured_run(tmp_path / "runs" / "b", protocol={"split_hash": "f" * 16}, origin={"config": "b"})
+    said(table()[0], "(other pictures, by the same settings: the capture was changed in between)")
+
+
+def test_a_class_of_ones_own_has_the_column_of_its_group(table, tmp_path):
+    losses = {"a": ("loss._target_=my_losses.L1", "+loss.part=0.5"), "b": ("loss=robust",), "c": ()}
+    for name, overrides in losses.items():
+        leave_measured_run(tmp_path / "runs" / name, overrides=overrides, origin={"config": name})
+    _, rows = table("published=false")
+    assert sorted(row["loss"] for row in rows) == ["", "my_losses.L1", "robust"]
+    assert {row["loss.part"] for row in rows} == {"", "0.5"}
+    assert not [column for column in rows[0] if "_target_" in column or "+" in column]
 
 
 def test_force_names_every_difference_once(table, tmp_path):

@@ -126,7 +126,7 @@ def test_every_part_of_every_model_builds_or_is_refused_in_words(model):
         for option in choices(group):
             builds_or_is_refused_in_words(f"model={model}", f"{group}={option}")
     for level in SAMPLED.get(model.partition("_")[0] if model not in SAMPLED else model, ("fine",)):
-        if level in composed("train", f"model={model}").model.levels:
+        if level in composed("train", f"model={model}").model.get("levels", {}):
             for option in options("sampler"):
                 builds_or_is_refused_in_words(f"model={model}", f"sampler@model.levels.{level}.sampler={option}")
 

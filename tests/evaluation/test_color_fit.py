@@ -60,8 +60,23 @@ def test_exposure_is_fitted_to_some_of_the_pixels_and_the_background_keeps_its_c
     opacity[:3], left[:, :10] = 0.0, True
     render = scale_light(truth, 1.0 / GAINS)
     render[:3] = truth[:3]
-    torch.testing.assert_close(exposure_fitted(render, truth, opacity, left), truth, atol=1e-4, rtol=0)
-    assert torch.equal(exposure_fitted(render, truth, opacity, torch.zeros_like(left)), render)
+    for behind in (None, torch.ones(1, 3)):
+        torch.testing.assert_close(exposure_fitted(render, truth, opacity, left, behind), truth, atol=1e-4, rtol=0)
+        assert torch.equal(exposure_fitted(render, truth, opacity, torch.zeros_like(left), behind), render)
+
+
+def test_the_light_of_half_covered_pixels_is_fitted_and_the_background_in_them_stays():
+    """As a correction that trains does it: the gain is on the scene's own light, before the background comes."""
+    light, opacity = picture(), torch.rand(16, 20, generator=torch.Generator().manual_seed(1)) * 0.8 + 0.2
+    left = torch.zeros(16, 20, dtype=torch.bool)
+    left[:, :10] = True
+
+    def over_white(straight):
+        return opacity[..., None] * straight + (1.0 - opacity[..., None])
+
+    render, truth = over_white(scale_light(light, 1.0 / GAINS)), over_white(light)
+    found = exposure_fitted(render, truth, opacity, left, torch.ones(1, 3))
+    torch.testing.assert_close(found, truth, atol=1e-4, rtol=0)
 
 
 @pytest.fixture

@@ -157,7 +157,7 @@ def go_on(config):
     run = open_run(config, 100, None)
     try:
         run.resume_point()
-        run.trained()
+        run.trained(1.0)
         run.finish(100, 30.0)
     finally:
         run.release()

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from support import extensions
+from support.captures import picture
 from support.configs import composed
+from support.running import refused
 from support.scenes import ball_scene
 from support.steps import rays_of
 
@@ -29,6 +32,7 @@ ADDED = {
         "encoder=frequency_small",
     ],
     "a code for each photograph": ["model=nerf_tiny", "field=nerf_mlp_with_codes"],
+    "a model of its own kind": ["model=voxels", "model.resolution=12", "sampler@model.sampler=stratified_32"],
 }  # fmt: skip
 
 
@@ -80,3 +84,22 @@ def test_codes_learn_from_their_own_photographs_and_pictures_know_none():
     before = render_picture(step.model.eval(), step.rays, 0, "white", 4096).rgb
     torch.nn.init.normal_(codes)
     assert torch.equal(render_picture(step.model, step.rays, 0, "white", 4096).rgb, before)
+
+
+def test_a_table_of_cameras_is_a_capture(tmp_path):
+    cameras = ball_scene(num_views=8, size=16).cameras
+    rows = []
+    for view, c2w in enumerate(cameras.c2w.double()):
+        Image.fromarray(picture(view, 16, 16)).save(tmp_path / f"{view}.png")
+        rows.append([f"{view}.png", 25.0, *c2w[:, 3].tolist(), *(c2w[:, 3] - 2.0 * c2w[:, 2]).tolist()])
+    (tmp_path / "cameras.csv").write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    given = [f"scene.root={tmp_path}", f"scene.cache_dir={tmp_path}/cache"]
+    scene = build(composed("train", SEARCHED, "scene=table", "scene.background=white", *given).scene).read()
+    assert (scene.name, scene.background, scene.view_names[1]) == ("table", "white", "1.png")
+    assert torch.equal(scene.pixels.view(1), torch.from_numpy(picture(1, 16, 16)))
+    torch.testing.assert_close(scene.cameras.focal, torch.full((8, 2), 25.0))
+    centers = scene.cameras.c2w[..., 3] @ scene.to_user[:3, :3].T + scene.to_user[:3, 3]
+    torch.testing.assert_close(centers, cameras.c2w[..., 3], atol=1e-4, rtol=0)
+    for written in ("0.png,25,1,2\n", "0.png,wide,0,0,1,0,0,0\n"):
+        (tmp_path / "cameras.csv").write_text(written)
+        refused(build(composed("train", SEARCHED, "scene=table", *given).scene).read, parts=("file,focal,x,y,z",))

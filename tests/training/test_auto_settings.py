@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from omegaconf import OmegaConf
 from support.configs import composed
 from support.running import FAST
 from support.scenes import ball_scene
@@ -10,6 +11,7 @@ from support.scenes import ball_scene
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.errors import InputError
+from nerf_lightning.runs.folder import former_config
 from nerf_lightning.training.auto_settings import corrected, settled
 from nerf_lightning.training.build import build_parts
 
@@ -97,6 +99,24 @@ def test_a_correction_that_is_named_stays():
             config, choices = corrected_for(verdict, f"correction={named}")
             assert choices["correction"] == named
             assert config.correction == composed("train", f"correction={named}").correction
+
+
+@pytest.mark.parametrize("goes_on", ["resume={}", "resume={}/checkpoints/last.ckpt", "paths.output_dir={} resume=auto"])
+def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(tmp_path, goes_on):
+    (tmp_path / ".hydra").mkdir()
+    for named, verdict in (("exposure", None), ("none", "look")):
+        chosen = OmegaConf.create({"correction": composed("train", f"correction={named}").correction})
+        OmegaConf.save(chosen, tmp_path / ".hydra" / "config.yaml")
+        config, choices = compose_config("train", goes_on.format(tmp_path, tmp_path).split())
+        checks = [Check("exposure", verdict, "one differs")] if verdict else None
+        config, choices = corrected(config, choices, [], checks, former_config(config, job_folder=None))
+        assert choices["correction"] == named
+        assert config.correction == chosen.correction
+
+
+def test_a_new_run_knows_of_no_former_one(tmp_path):
+    for overrides in ([], [f"paths.output_dir={tmp_path}/new"], ["resume=auto"]):
+        assert former_config(compose_config("train", overrides)[0], job_folder=None) is None
 
 
 def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from support.running import FAST, refused
 
 import nerf_lightning as nl
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.training import loggers
 from nerf_lightning.training.loggers import MLflow, WeightsAndBiases, opened_loggers, show_picture
 
 PICTURE = torch.zeros(4, 5, 3, dtype=torch.uint8)
@@ -68,6 +70,24 @@ def test_a_missing_package_is_named_before_a_folder_is_taken(trained, tmp_path, 
     assert not (tmp_path / "run").exists()
 
 
+def test_who_is_not_logged_in_is_told_before_a_folder_is_taken(trained, tmp_path, monkeypatch):
+    class Refusal(Exception):
+        pass
+
+    def login(verify):
+        raise Refusal("No API key configured. Use `wandb login` to log in.")
+
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(login=login))
+    monkeypatch.setitem(sys.modules, "wandb.errors", SimpleNamespace(Error=Refusal))
+    monkeypatch.setattr(loggers, "_require", lambda *_: None)
+    refused(trained, "logger=wandb", parts=("No API key configured", "logger.wandb.offline=true", "logger=tensorboard"))
+    assert not (tmp_path / "run").exists()
+    WeightsAndBiases(offline=True).require_access()
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    WeightsAndBiases().require_access()
+
+
 class Takes(WandbLogger):
     """Stands for W&B's logger: it keeps what it is given, and needs no package."""
 
@@ -106,7 +126,7 @@ def test_weights_and_biases_keeps_a_run_offline(trained, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     run = trained("logger=wandb", "callbacks.validation_pictures.every_steps=2")
     (kept,) = (run.folder / "wandb").glob("offline-run-*")
-    assert len(list((kept / "files" / "media" / "images").rglob("*.png"))) == 3  # the cameras, and steps 2 and 4
+    assert len(list((kept / "files" / "media" / "images").rglob("*.png"))) == 2  # of steps 2 and 4
     first, second = (WeightsAndBiases(offline=True).open(run.folder, started) for started in ("then", "now"))
     assert first._id != second._id
     first.experiment.finish()
@@ -121,5 +141,5 @@ def test_mlflow_keeps_curves_settings_and_pictures(trained):
     assert found.data.metrics["test/psnr"] == pytest.approx(run.psnr)
     assert found.data.params["choice.model"] == "nerf_tiny"
     assert found.info.status == "FINISHED"
-    assert len(list((run.folder / "mlflow").rglob("step_*.png"))) == 3
+    assert len(list((run.folder / "mlflow").rglob("step_*.png"))) == 2
     refused(MLflow(tracking_uri="nowhere://x").open, run.folder, "now", parts=("nowhere://x", "logger.mlflow.tracking"))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.export.baking.marcher import MarchedRays, Marcher
@@ -12,11 +12,9 @@ from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture, view_rays
+from nerf_lightning.nerf.psnr import picture_psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
-
-# Of equal pictures: 120 dB.
-LEAST_ERROR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -66,15 +64,15 @@ def measured_cost(
     errors: list[tuple[float, ...]] = []
     samples: list[tuple[float, float]] = []
     for number, view in enumerate(views):
-        own = render_picture(model, rays_of, view, scene.background, tile_points).rgb
+        own = render_picture(model, rays_of, view, scene.background, tile_points).rgb.clamp(0, 1)
         marched = marcher.render(view_rays(rays_of, view)[0])
         samples.append((marched.num_densities, marched.num_colors))
-        page = over(marched, scene.background)
+        page = over(marched, scene.background).clamp(0, 1)
         pairs: list[tuple[Tensor, Tensor, Tensor | None]] = [(page, own, None)]
         if photographs is not None:
             truth, kept = photograph(photographs, view, scene.background), photographs.pixels.kept(view)
             pairs += [(page, truth, kept), (own, truth, kept)]
-        errors.append(tuple(_psnr(*pair) for pair in pairs))
+        errors.append(tuple(picture_psnr(*pair) for pair in pairs))
         report("measured", (number + 1) / len(views))
     means = [float(column) for column in torch.tensor(errors, dtype=torch.float64).mean(dim=0)]
     densities, colors = torch.tensor(samples).mean(dim=0).tolist()
@@ -86,9 +84,3 @@ def over(marched: MarchedRays, background: Background) -> Float[Tensor, "*rays 3
     """Return the colours over a background; where a scene has none, over black."""
     behind = background_colors(background, 1, torch.device("cpu"), random=None)
     return marched.rgb if behind is None else marched.rgb + (1.0 - marched.opacity)[..., None] * behind
-
-
-def _psnr(picture: Tensor, truth: Tensor, kept: Bool[Tensor, "height width"] | None) -> float:
-    error = (picture.clamp(0, 1) - truth.clamp(0, 1)).square().mean(dim=-1)
-    mean = (error if kept is None else error[kept]).mean().clamp(min=LEAST_ERROR)
-    return float(-10.0 * mean.log10())

@@ -8,12 +8,10 @@ from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.learnt_part import LearntPart
+from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Scene
-
-LEAST_OPACITY = 1e-2
-"""Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less."""
 
 
 class Correction(LearntPart, ABC):
@@ -45,9 +43,8 @@ class Correction(LearntPart, ABC):
             rendering: of one ray for each pixel.
             pixels: where in which photograph each ray stands.
         """
-        opacity = rendering.opacity[:, None]
-        straight = rendering.foreground / opacity.clamp(min=LEAST_OPACITY)
-        return replace(rendering, rgb=rendering.rgb + opacity * (self(straight, pixels) - straight))
+        light = rendering.rgb, rendering.foreground, rendering.opacity
+        return replace(rendering, rgb=in_other_light(lambda straight: self(straight, pixels), *light))
 
     @abstractmethod
     def forward(self, rgb: Float[Tensor, "*rays 3"], pixels: PixelIndex) -> Float[Tensor, "*rays 3"]:

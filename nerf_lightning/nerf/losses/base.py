@@ -16,9 +16,6 @@ class Loss(nn.Module, ABC):
     Dividing by the sum of a tile's own weights would let tiles with few unmasked rays count too much.
     """
 
-    every_level_is_a_picture: bool = True
-    """Whether each level's number is a squared error of colour; else only the last one's is."""
-
     patch: int = 1
     """Side in pixels of the squares that it wants to see whole: batches hold one after the other, row by row."""
 

@@ -13,4 +13,9 @@ class MeanSquaredError(Loss):
 
     def forward(self, renderings: list[Rendering], target: Target) -> list[Float[Tensor, ""]]:
         """Return the weighted mean over rays and channels, per level."""
-        return [((rendering.rgb - target.rgb).square() * target.weight[..., None]).mean() for rendering in renderings]
+        return [squared_error(rendering.rgb, target) for rendering in renderings]
+
+
+def squared_error(rgb: Float[Tensor, "rays 3"], target: Target) -> Float[Tensor, ""]:
+    """Return the mean squared error of colours, weighted over rays, over rays and channels."""
+    return ((rgb - target.rgb).square() * target.weight[..., None]).mean()

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.types.rays import Target
 from nerf_lightning.nerf.types.renderings import DenseRendering
 
@@ -25,8 +26,6 @@ class ProposalLoss(Loss):
         distortion: factor on the distortion loss; larger values remove fog and floaters, too large ones detail.
     """
 
-    every_level_is_a_picture = False
-
     def __init__(self, interlevel: float = 1.0, distortion: float = 1e-3):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion
@@ -35,7 +34,7 @@ class ProposalLoss(Loss):
         """Return the weighted mean over the rays for each level: interlevel losses, then colour with distortion."""
         last, weight = renderings[-1], target.weight
         losses = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
-        color = ((last.rgb - target.rgb).square() * weight[..., None]).mean()
+        color = squared_error(last.rgb, target)
         if not self.distortion:
             return [*losses, color]
         return [*losses, color + self.distortion * (distortion_loss(last) * weight).mean()]

@@ -50,7 +50,6 @@ class RobustLoss(Loss):
         super().__init__()
         require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
         self.of, self.share, self.times, self.patch = of, share, times, patch
-        self.every_level_is_a_picture = of.every_level_is_a_picture
         self.register_buffer("threshold", torch.tensor(FIRST_THRESHOLD))
 
     threshold: Tensor

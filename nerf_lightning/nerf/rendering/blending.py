@@ -1,11 +1,16 @@
 """The background, decided in one place: what lies behind a ray, and what a photograph shows in front of it."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.scene import Background, Scene
+
+LEAST_OPACITY = 1e-2
+"""Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less."""
 
 
 def background_colors(
@@ -35,6 +40,25 @@ def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] 
         return rgba[..., :3]
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + background * (1.0 - alpha)
+
+
+def in_other_light(
+    change: Callable[[Tensor], Tensor],
+    rgb: Float[Tensor, "*rays 3"],
+    foreground: Float[Tensor, "*rays 3"],
+    opacity: Float[Tensor, "*rays"],
+) -> Float[Tensor, "*rays 3"]:
+    """Return rendered colours after a change of the scene's own light; the background behind it keeps its colour.
+
+    Args:
+        change: takes straight colours, as of opaque pixels, to changed ones.
+        rgb: over the background.
+        foreground: the scene's own light in them, sum of weights times colour.
+        opacity: sum of weights.
+    """
+    opacity = opacity[..., None]
+    straight = foreground / opacity.clamp(min=LEAST_OPACITY)
+    return rgb + opacity * (change(straight) - straight)
 
 
 def photograph(scene: Scene, view: int, background: Background) -> Float[Tensor, "height width 3"]:

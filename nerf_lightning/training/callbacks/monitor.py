@@ -8,6 +8,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
+from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.callbacks.watcher import Watcher
 
 GIGABYTE = 1e9
@@ -50,8 +51,10 @@ class Monitor(Watcher):
         rays, seconds = progress.rays_seen - self.rays_seen, now - self.since
         self.since, self.rays_seen = now, progress.rays_seen
         names = system.model.level_names
-        pictures = names if system.step.loss.every_level_is_a_picture else names[-1:]
-        values = level_scalars(names, outputs["losses"], pictures) | system.model.statistics()
+        first = system.model.first_picture
+        pictures = names[-1:] if first is None else names[first:]
+        values = level_scalars(names, outputs["losses"], outputs["color_errors"], pictures)
+        values |= system.model.statistics()
         values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
@@ -65,13 +68,22 @@ class Monitor(Watcher):
             logger.log_metrics(values, step)
 
 
-def level_scalars(names: tuple[str, ...], losses: Tensor, pictures: tuple[str, ...]) -> dict[str, float]:
-    """Return the loss of each of several levels, the PSNR where it is of a picture, and the sum that is minimised."""
-    losses = losses.cpu()  # the device is read once
+def level_scalars(
+    names: tuple[str, ...], losses: Tensor, errors: Tensor, pictures: tuple[str, ...]
+) -> dict[str, float]:
+    """Return what is logged of the levels of a step.
+
+    Args:
+        names: of the levels.
+        losses: of each, of whatever kind.
+        errors: the mean squared error of the colours that each shows.
+        pictures: the names of the levels that show some, whose PSNR is logged.
+    """
+    losses, shown = torch.stack([losses, psnr(errors)]).cpu()  # the device is read once
     values = {"train/loss": float(losses.sum())}
-    for name, loss in zip(names, losses, strict=True):
+    for name, loss, quality in zip(names, losses, shown, strict=True):
         if len(names) > 1:  # else it is the sum
             values[f"train/loss_{name}"] = float(loss)
         if name in pictures:
-            values[f"train/psnr_{name}"] = float(-10.0 * torch.log10(loss))
+            values[f"train/psnr_{name}"] = float(quality)
     return values

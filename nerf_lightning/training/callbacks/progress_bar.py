@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from nerf_lightning.console import DAY, spoken
+from nerf_lightning.nerf.psnr import psnr
 
 log = logging.getLogger(__name__)
 
@@ -66,11 +67,8 @@ class TrainingProgress(ProgressBar):
         rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
         self._warn_of_days((pl_module.step.num_steps - step) / per_second)
-        loss = outputs["losses"].cpu()
-        text = (
-            f"loss {float(loss.sum()):.4f}  PSNR {float(-10 * torch.log10(loss[-1])):.1f} dB  "
-            f"{rays_per_second:,.0f} rays/s"
-        )
+        loss, quality = torch.stack([outputs["losses"].sum(), psnr(outputs["color_errors"][-1])]).tolist()
+        text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
         if self.bar is not None:
             self.bar.update(self.task, completed=step, total=pl_module.step.num_steps, description=text)
         else:

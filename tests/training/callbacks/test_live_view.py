@@ -298,7 +298,7 @@ def test_a_training_stopped_in_the_page_is_saved_and_evaluated(capture, tmp_path
     client = ViserClient(address_in(watched), 32, 24)
     client.look_from(0)
     client.set("Pause", True)
-    client.wait_until(lambda: any("It pauses" in str(each) for each in client.said))
+    client.wait_until(lambda: any("Paused at" in str(each) for each in client.said))
     client.set("Stop training", True)
     client.set("Stop training", True)
     output, _ = watched.communicate(timeout=120)

@@ -1,0 +1,29 @@
+"""The peak signal-to-noise ratio, by which renders are judged; the same wherever one is told."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+LEAST_MSE = 1e-10
+"""Errors below count as this one, a PSNR of 100 dB."""
+
+
+def psnr(mse: Float[Tensor, "*images"]) -> Float[Tensor, "*images"]:
+    """Return the peak signal-to-noise ratio in dB, -10 log10(mse), for colours in [0, 1]; at most 100.
+
+    Equal pictures (a view of background alone) would have an infinite one, and no mean or file could hold it.
+
+    >>> round(float(psnr(torch.tensor(0.01))), 3)
+    20.0
+    """
+    return -10.0 * torch.log10(mse.clamp(min=LEAST_MSE))
+
+
+def picture_psnr(
+    render: Float[Tensor, "height width 3"],
+    truth: Float[Tensor, "height width 3"],
+    kept: Bool[Tensor, "height width"] | None = None,
+) -> float:
+    """Return the PSNR (dB) of a picture, of the pixels that are kept (at least one; None: all)."""
+    error = (render - truth).square()
+    return float(psnr((error if kept is None else error[kept]).mean()))

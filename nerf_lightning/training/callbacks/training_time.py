@@ -1,0 +1,27 @@
+"""How long a training takes by itself: without what comes before its first step, and after its last."""
+
+import time
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import Callback
+
+
+class TrainingTime(Callback):
+    """Measure the time from the first step of this start to the end of the last one, validation in between included."""
+
+    def __init__(self) -> None:
+        self.seconds, self.since = 0.0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        """Start the clock."""
+        self.since = time.monotonic()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Count the step."""
+        now = time.monotonic()
+        self.seconds, self.since = self.seconds + now - self.since, now
+
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last so many seconds: the training paused."""
+        self.since += seconds

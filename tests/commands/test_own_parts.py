@@ -1,0 +1,69 @@
+"""Parts of one's own, in files outside of the package: trained with, and opened again by whoever trusts them."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from support import extensions
+from support.planted import in_config, write_checkpoint
+from support.running import FAST, refused, said
+
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.commands.train import _resume_command
+from nerf_lightning.config.compose import composed_job
+from nerf_lightning.config.load_model import load_model
+
+MODULE = "support.extensions.voxel_model"
+SEARCHED = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
+VOXELS = ("model=voxels", "model.resolution=8", "sampler@model.sampler=stratified_16")
+
+
+def test_yamls_of_ones_own_are_found_where_the_model_is_left_open(nerf, capture, tmp_path):
+    """The fault: the config was composed again without them, once the model was chosen."""
+    scene = ("scene=npz", f"scene.path={capture}", f"paths.output_dir={tmp_path}/run")
+    small = ("encoder.first.log2_table_size=8", "data.batch_rays=64", "trainer.max_steps=2", "trainer.tile_points=8192")
+    done = nerf("train", SEARCHED, *scene, *small, "encoder=joined", "final.video=false", "final.evaluate=false")
+    assert done.code == 0, done.err
+
+
+@pytest.fixture
+def own_run(nerf, capture, tmp_path):
+    run = tmp_path / "run"
+    fast = [each for each in FAST if not each.startswith("model=")]
+    scene = ("scene=npz", f"scene.path={capture}")
+    done = nerf("train", SEARCHED, *scene, *fast, *VOXELS, "final.video=false", f"paths.output_dir={run}")
+    assert done.code == 0, done.err
+    return run, done.out + done.err
+
+
+def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(nerf, own_run, tmp_path):
+    run, output = own_run
+    assert f"builds them only with trust={MODULE}" in " ".join(output.split())
+    said(nerf("eval", f"ckpt={run}"), "VoxelModel", f"If it is your own, add trust={MODULE};")
+    measured = nerf(
+        "eval", f"ckpt={run}", f"trust={MODULE}", "evaluation.max_views=1", f"paths.output_dir={tmp_path}/m"
+    )
+    assert measured.code == 0, measured.err
+    assert "dB" in measured.out
+    points = nerf(
+        "export",
+        f"ckpt={run}",
+        "what=points",
+        "what.num_points=50",
+        "what.max_views=1",
+        "trust=[support]",
+        f"paths.output_dir={tmp_path}/p",
+    )
+    assert points.code == 0, points.err
+    said(nerf("render", f"ckpt={run}", "trust=no such module"), "trust=no such module", "a Python module")
+
+
+def test_the_command_that_goes_on_names_where_ones_own_yamls_lie():
+    with composed_job("train", [SEARCHED, "model=voxels"]):
+        assert _resume_command(Path("run")) == f"nerf train resume=run {shlex.quote(SEARCHED)}"
+
+
+def test_a_module_that_python_does_not_find_is_told(tmp_path):
+    elsewhere = {"_target_": "gone.VoxelModel"}
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda config: config.update(model=elsewhere)))
+    refused(load_model, read_checkpoint(file), ["gone"], parts=("gone.VoxelModel", "PYTHONPATH=FOLDER"))
