@@ -5,7 +5,16 @@ As a program: `python -m nerf_lightning.nerf.kernels.compile`.
 
 from nerf_lightning.nerf.kernels.backends import twin
 
-CPU_TWINS = ("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "fusion.cpu")
+CPU_TWINS = (
+    "hash_grid.cpu",
+    "march.cpu",
+    "packed.cpu",
+    "adam.cpu",
+    "carving.cpu",
+    "bricks.cpu",
+    "fusion.cpu",
+    "texels.cpu",
+)
 
 
 def compile_kernels() -> None:
