@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
@@ -15,7 +16,6 @@ from nerf_lightning.export.density_grid import Lattice, Report
 from nerf_lightning.export.marching_cubes import marching_cubes
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.kernels.backends import twin, why_not
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -123,7 +123,9 @@ def depth_view(
         opacities.append(levels[-1].opacity.cpu())
     depth = torch.cat(depths).view(rays.near.shape).float()
     meets = torch.cat(opacities).view(rays.near.shape) > OPAQUE
-    normals = normals_from_depth(rays.origins + depth[..., None] * rays.directions)
+    # Differences, which are steep beside an edge: of pixels there it is not known which surface they see.
+    down, along = torch.gradient(rays.origins + depth[..., None] * rays.directions, dim=(0, 1))
+    normals = normalize(torch.linalg.cross(down, along), dim=-1)
     cosine = (normals * rays.directions).sum(dim=-1).abs().clamp(min=LEAST_COSINE)
     share = (spacing * rays_of.cameras.focal[view].min() / depth).clamp(LEAST_SHARE, 1.0)
     trust = torch.where(meets, cosine * share, NOTHING)

@@ -10,7 +10,6 @@ from nerf_lightning.export.density_grid import Lattice
 from nerf_lightning.export.marching_cubes import marching_cubes
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.kernels.fusion.cpu import add_view
 
 
@@ -106,7 +105,8 @@ def test_exact_depth_comes_back_to_a_fraction_of_a_cell(shape, typical, farthest
     for view in range(24):
         rays = rays_through_pixels(cameras, all_pixels(cameras, view), torch.zeros(24), torch.full((24,), 8.0))
         depth, distance = shape(rays)
-        normals = normals_from_depth(rays.origins + depth[..., None] * rays.directions)
+        down, along = torch.gradient(rays.origins + depth[..., None] * rays.directions, dim=(0, 1))
+        normals = torch.nn.functional.normalize(torch.linalg.cross(down, along), dim=-1)
         cosine = (normals * rays.directions).sum(dim=-1).abs().nan_to_num(0.3).float().numpy()
         depth = torch.where(depth.isnan(), torch.inf, depth).float().numpy()
         views.append((numbers_of(cameras, view), depth, cosine))
