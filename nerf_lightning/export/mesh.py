@@ -14,7 +14,7 @@ from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export import density_mesh, fused_mesh
 from nerf_lightning.export.atlas import find_texels, make_atlas
-from nerf_lightning.export.base import Export, refuse_ndc
+from nerf_lightning.export.base import Export, refuse_ndc, require_no_folders
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
 from nerf_lightning.export.density_mesh import mesh_of_density
 from nerf_lightning.export.fused_mesh import mesh_of_depth
@@ -116,6 +116,8 @@ class MeshExport(Export):
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
+        beside = ("mtl", "png") if self.texture and self.format == "obj" else ()
+        require_no_folders(folder / f"mesh.{ending}" for ending in (self.format, *beside))
         require_library("trimesh")  # before the work, not after it
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT[self.surface])
         if self.texture:

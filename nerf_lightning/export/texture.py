@@ -30,8 +30,8 @@ LEAST_COSINE = 0.1
 # A texel of which less is seen has no colour of its own: that of the nearest one that has.
 LEAST_SEEN = 1e-3
 LEAST_SIZE, LARGEST_SIZE = 16, 16_384
-# Which face and where on it, where it lies, its colour: measured at 2048 x 2048.
-BYTES_PER_TEXEL = 150
+# Which face and where on it, its colour, and the nearest that has one: measured, where charts fill the picture.
+BYTES_PER_TEXEL = 100
 # Texels that are looked at together; a report follows each lot.
 TOGETHER = 1 << 16
 

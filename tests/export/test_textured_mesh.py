@@ -169,10 +169,34 @@ def test_without_xatlas_its_extra_is_named_before_any_work(tmp_path, monkeypatch
 
 def test_a_picture_beyond_memory_is_refused_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1_000_000_000}))
-    with pytest.raises(
-        InputError, match=r"8192 x 8192 texels, which takes 10\.\d GB.*what\.texture_size=\d+ would fit"
-    ):
+    with pytest.raises(InputError, match=r"8192 x 8192 texels, which takes 6\.\d GB.*what\.texture_size=\d+ would fit"):
         exported(tmp_path, solid(ball()), record(), texture_size=8192)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("mesh.glb", {}),
+        ("mesh.png", {"format": "obj"}),
+        ("mesh.ply", {"texture": False}),
+    ],
+)
+def test_a_folder_where_the_file_shall_be_is_refused_before_any_work(tmp_path, name, settings):
+    (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=rf"{name} is a folder.*paths\.output_dir=DIR"):
+        exported(tmp_path, solid(ball()), record(), **settings)
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    def full(self, content):
+        self.open("wb").close()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        exported(tmp_path, solid(ball()), record())
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_mesh_that_no_view_sees_gets_no_texture(tmp_path):
