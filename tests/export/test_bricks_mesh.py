@@ -37,7 +37,7 @@ def test_the_mesh_of_a_short_run_is_close_to_the_exact_surface(tmp_path):
     assert to_mesh < 0.03
     fused_to_truth, fused_to_mesh = errors(tmp_path / "fused" / "mesh.ply")
     assert fused_to_truth < 0.8 * to_truth
-    assert fused_to_mesh < 1.2 * to_mesh
+    assert fused_to_mesh < 1.35 * to_mesh
 
 
 def errors(path):
