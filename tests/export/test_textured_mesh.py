@@ -40,7 +40,7 @@ def checker(points):
 
 
 def exported(folder, model, scene, **settings):
-    given = {"resolution": 20, "texture": True, "texture_size": 192} | settings
+    given = {"resolution": 10, "texture": True, "texture_size": 64} | settings
     return MeshExport(**given).export(model, scene, folder, TILE)
 
 
@@ -57,7 +57,8 @@ def only_mesh(path):
 
 @pytest.mark.parametrize(("format", "surface"), [("glb", "density"), ("obj", "tsdf")])
 def test_a_checker_comes_back_in_place(tmp_path, format, surface):
-    path = exported(tmp_path, solid(ball(), color=checker), record(), format=format, surface=surface)[-1]
+    fine = {"resolution": 20, "texture_size": 192, "format": format, "surface": surface}
+    path = exported(tmp_path, solid(ball(), color=checker), record(), **fine)[-1]
     mesh = only_mesh(path)
     inside = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(mesh.faces))
     points = (inside[..., None] * mesh.vertices[mesh.faces]).sum(axis=1)
@@ -123,7 +124,7 @@ def test_obj_has_its_material_and_its_picture_beside_it(tmp_path):
     assert "mtllib mesh.mtl" in (tmp_path / "mesh.obj").read_text()
     assert "map_Kd mesh.png" in (tmp_path / "mesh.mtl").read_text()
     with Image.open(tmp_path / "mesh.png") as picture:
-        assert picture.size == (192, 192)
+        assert picture.size == (64, 64)
 
 
 def test_texels_are_those_whose_centres_lie_in_a_triangle():
