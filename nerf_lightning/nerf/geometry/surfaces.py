@@ -34,7 +34,7 @@ def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor,
     Each pixel has those of a plane through the 5 x 5 pixels around it, by weighted least squares; zero where they lie
     on a line. Differences of neighbours alone show the depth's waves, whose length is a cell of the field's, and go
     wrong wherever a neighbour sees another surface. So near pixels count more (a Gaussian), and those whose points are
-    as far apart as a surface's are: s pixels away, s times as far as the nearest of the four neighbours,
+    as far apart as a surface's are: s pixels away, s times as far as the second nearest of the four neighbours,
 
         w = exp(-s^2 / (2 sigma^2)) exp(-((|p_k - p| - s gap) / gap)^2).
 
@@ -50,7 +50,7 @@ def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor,
         return way, way.norm(dim=-1)
 
     gaps = (away(*step)[1].nan_to_num(nan=torch.inf) for step in ((-1, 0), (1, 0), (0, -1), (0, 1)))
-    gap = torch.stack(list(gaps)).amin(dim=0).clamp(min=torch.finfo(points.dtype).tiny)
+    gap = torch.stack(list(gaps)).kthvalue(2, dim=0).values.clamp(min=torch.finfo(points.dtype).tiny)
     total, total_down, total_along = (torch.zeros_like(gap) for _ in range(3))
     mean, down_slope, along_slope = (torch.zeros_like(points) for _ in range(3))
     for down, along in product(range(-REACH, REACH + 1), repeat=2):
