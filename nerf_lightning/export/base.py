@@ -1,6 +1,7 @@
 """The contract of an export: a model in, files out, in the user's own frame."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,3 +55,17 @@ def refuse_ndc(record: SceneRecord, what: str) -> None:
             "density of a place depends on how far away it is, and far things have no box. Use what=points or "
             "what=images, which take the depth back to the world, or train again with scene.space=contracted."
         )
+
+
+def require_no_folders(paths: Iterable[Path]) -> None:
+    """Refuse places for files at which folders lie, before the work and not after it.
+
+    Raises:
+        InputError: one does.
+    """
+    for path in paths:
+        if path.is_dir():
+            raise InputError(
+                f"{path} is a folder, and a file of that name is to be written. Remove it, or give another place with "
+                "paths.output_dir=DIR."
+            )

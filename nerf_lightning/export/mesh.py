@@ -1,112 +1,181 @@
-"""A mesh of the surface: marching cubes on the density, cleaned, coloured, in the user's frame."""
+"""A mesh of the surface: of the density or of what the views see, cleaned, coloured, in the user's frame."""
 
 import logging
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
+from torch import Tensor
 
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.base import Export, refuse_ndc
-from nerf_lightning.export.density_grid import require_resolution, sample_density
-from nerf_lightning.export.marching_cubes import marching_cubes, without_floaters
-from nerf_lightning.export.mesh_files import MeshFormat, require_library, save_mesh
-from nerf_lightning.export.surface import SeenFrom, surface_colors, surface_level
+from nerf_lightning.export import density_mesh, fused_mesh
+from nerf_lightning.export.atlas import find_texels, make_atlas
+from nerf_lightning.export.base import Export, refuse_ndc, require_no_folders
+from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
+from nerf_lightning.export.density_mesh import mesh_of_density
+from nerf_lightning.export.fused_mesh import mesh_of_depth
+from nerf_lightning.export.marching_cubes import without_floaters
+from nerf_lightning.export.mesh_files import MeshFormat, require_library, save_mesh, save_textured_mesh
+from nerf_lightning.export.surface import SeenFrom, surface_colors
+from nerf_lightning.export.texture import LARGEST_SIZE, LEAST_SIZE, TextureMaker, require_texture_room
 from nerf_lightning.export.visibility import seen_faces
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# The density's grid, and as much again for the mesh.
-BYTES_PER_POINT = 8
-# So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
-RATIO = 10.0
+Surface = Literal["density", "tsdf"]
+BYTES_PER_POINT = {"density": density_mesh.BYTES_PER_POINT, "tsdf": fused_mesh.BYTES_PER_POINT}
 # A guess at how the time is shared; the bar corrects itself.
-COSTS = {"density": 6.0, "surface": 2.0, "views": 6.0, "colours": 4.0}
+COSTS = {
+    "density": {"density": 6.0, "surface": 2.0, "views": 6.0},
+    "tsdf": {"depth": 12.0, "surface": 2.0},
+}
+COLORING = {False: {"colours": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
+# In cells: so far the surface may be off to each side.
+REACH = 2.0
+# Most faces of a mesh with a texture, where nobody says how many: the charts of more take minutes.
+TEXTURED_FACES = 60_000
 
 log = logging.getLogger(__name__)
 
 
 class MeshExport(Export):
-    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box.
+    """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a colour per vertex or a texture.
 
     Args:
         resolution: cells along the longest side of the box.
-        threshold: density per scene unit at the surface; None: where rendering sees it (`surface_level`).
+        surface: `density` is where the density crosses the threshold, also where nobody looks; `tsdf` fuses the
+            rendered depth of the training views, which is nearer to what they see, and open where none looks.
+        threshold: with `density`: per scene unit, at the surface; None: where rendering sees it (`surface_level`).
+        truncation: with `tsdf`: how far before and behind a surface views are asked for their distance, in cells. More
+            is smoother, less keeps thin things.
         colors: colour of a vertex, as seen from the nearest cameras, or along the surface's normal.
         min_share: connected parts with fewer faces than this share of the largest one's are floaters, and removed.
         seen_only: remove what no training view sees, the insides of things above all; else the mesh is closed.
-        faces: most faces, reached by decimation; None keeps all.
+        faces: most faces, reached by decimation; None keeps all, or 60,000 where there is a texture.
+        texture: colours are a picture, each texel as the views see it that look at it best; then `colors` says nothing.
+            Needs `pip install 'nerf-lightning[texture]'`.
+        texture_size: texels along each side of the picture.
         format: of the file; PLY and OBJ open everywhere, in the capture's frame; GLB is one file for browsers, and its
-            root node turns it so that y is up, as glTF has it.
+            root node turns it so that y is up, as glTF has it. None: PLY, or GLB where there is a texture, which PLY
+            does not know; OBJ then has an MTL and a PNG beside it.
     """
 
     def __init__(
         self,
         resolution: int = 256,
+        surface: Surface = "density",
         threshold: float | None = None,
+        truncation: float = 4.0,
         colors: SeenFrom = "cameras",
         min_share: float = 0.01,
         seen_only: bool = True,
         faces: int | None = None,
-        format: MeshFormat = "ply",
+        texture: bool = False,
+        texture_size: int = 2048,
+        format: MeshFormat | None = None,
     ):
         if threshold is not None and not threshold > 0:
             raise InputError(f"what.threshold={threshold}: give a density above 0, or null to take it from the data.")
+        if not 1 <= truncation <= 64:
+            raise InputError(f"what.truncation={truncation}: give a number of cells from 1 to 64.")
+        if surface == "tsdf" and threshold is not None:
+            raise InputError(
+                f"what.threshold={threshold} belongs to what.surface=density: with what.surface=tsdf the surface is "
+                "where the views' light is stopped. Leave one of the two out."
+            )
+        if surface == "tsdf" and not seen_only:
+            raise InputError(
+                "what.seen_only=false asks for a closed mesh, and what.surface=tsdf knows only what the views see. "
+                "Take what.surface=density for it."
+            )
         if not 0 <= min_share <= 1:
             raise InputError(f"what.min_share={min_share}: give a share from 0 (all is kept) to 1 (the largest part).")
         if faces is not None and faces < 4:
             raise InputError(f"what.faces={faces}: a closed mesh has 4 or more; null keeps all.")
-        self.resolution, self.threshold, self.colors = resolution, threshold, colors
-        self.min_share, self.seen_only, self.faces, self.format = min_share, seen_only, faces, format
+        if not LEAST_SIZE <= texture_size <= LARGEST_SIZE:
+            raise InputError(
+                f"what.texture_size={texture_size}: give a number of texels from {LEAST_SIZE} to {LARGEST_SIZE}."
+            )
+        if texture and format == "ply":
+            raise InputError(
+                "what.format=ply has no texture, and what.texture=true makes one. Give what.format=glb (one file), or "
+                "obj (with an MTL and a PNG beside it)."
+            )
+        self.texture, self.texture_size = texture, texture_size
+        self.resolution, self.colors = resolution, colors
+        self.surface, self.threshold, self.truncation = surface, threshold, truncation
+        self.min_share, self.seen_only = min_share, seen_only
+        self.faces = TEXTURED_FACES if texture and faces is None else faces
+        self.format = format or ("glb" if texture else "ply")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""
         refuse_ndc(record, "mesh")
+        beside = ("mtl", "png") if self.texture and self.format == "obj" else ()
+        require_no_folders(folder / f"mesh.{ending}" for ending in (self.format, *beside))
         require_library("trimesh")  # before the work, not after it
-        lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
-        with StageProgress(COSTS) as report:
-            density = sample_density(model, lattice, tile_points, report)
-            if record.space == "bounded":
-                _close(density)
-            level = self._level(model, record, density, tile_points)
-            _to_log_ratio(density, level)
-            vertices, faces = marching_cubes(density, 0.0, report)
-            del density
-            vertices = lattice.to_scene(vertices)
-            if self.seen_only:
-                faces = seen_faces(model, record, vertices, faces, tile_points, report)
+        lattice = require_resolution(record, self.resolution, BYTES_PER_POINT[self.surface])
+        if self.texture:
+            require_library("xatlas", "texture")
+            require_texture_room(self.texture_size)
+        with StageProgress(COSTS[self.surface] | COLORING[self.texture]) as report:
+            vertices, faces = self._surface(model, record, lattice, tile_points, report)
             vertices, faces = self._cleaned(vertices, faces)
-            normals = vertex_normals(vertices, faces)
-            points, outward = torch.from_numpy(vertices), torch.from_numpy(normals)
-            # Two cells to each side: so far the surface may be off.
-            reach = 2.0 * lattice.spacing
-            colors = surface_colors(model, record, points, outward, reach, self.colors, tile_points, report)
-        path, to_user = folder / f"mesh.{self.format}", record.to_user.double()
-        placed, turned = points_to_user(points.double(), to_user), directions_to_user(outward.double(), to_user)
-        up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
-        save_mesh(path, placed.numpy(), faces, turned.numpy(), colors.numpy(), up.numpy())
-        log.info("%d vertices, %d faces; the surface is where the density is %.4g", len(vertices), len(faces), level)
+            log.info("%d vertices, %d faces", len(vertices), len(faces))
+            write = self._textured if self.texture else self._colored
+            return write(model, record, folder, vertices, faces, lattice.spacing, tile_points, report)
+
+    def _colored(
+        self,
+        model: Model,
+        record: SceneRecord,
+        folder: Path,
+        vertices: Float[ndarray, "vertices 3"],
+        faces: Int[ndarray, "faces 3"],
+        spacing: float,
+        tile_points: int,
+        report: Report,
+    ) -> list[Path]:
+        points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
+        colors = surface_colors(model, record, points, normals, REACH * spacing, self.colors, tile_points, report)
+        path, (placed, turned, up) = folder / f"mesh.{self.format}", _for_the_user(points, normals, record)
+        save_mesh(path, placed, faces, turned, colors.numpy(), up)
         return [path]
 
-    def _level(self, model: Model, record: SceneRecord, density: Float[ndarray, "x y z"], tile_points: int) -> float:
-        level = self.threshold or surface_level(model, record, tile_points)
-        lowest, highest = float(density.min()), float(density.max())
-        if level is not None and lowest < level < highest:
-            return level
-        found = f"the densities of its box go from {lowest:.3g} to {highest:.3g} per scene unit"
-        if level is None:
-            raise InputError(
-                f"There is no surface to export: {found}, and no training view of {record.name} sees anything opaque "
-                "there. Train longer, or say with what.threshold=DENSITY what counts as the surface."
-            )
-        raise InputError(
-            f"There is no surface in {record.name} where the density is {level:.3g}: {found}. Give what.threshold="
-            "DENSITY between the two, or train longer."
-        )
+    def _textured(
+        self,
+        model: Model,
+        record: SceneRecord,
+        folder: Path,
+        vertices: Float[ndarray, "vertices 3"],
+        faces: Int[ndarray, "faces 3"],
+        spacing: float,
+        tile_points: int,
+        report: Report,
+    ) -> list[Path]:
+        points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
+        atlas = make_atlas(vertices, faces, self.texture_size)
+        report("charts", 1.0)
+        maker = TextureMaker(model, record, points, normals, REACH * spacing, tile_points)
+        picture = maker(find_texels(atlas, self.texture_size), self.texture_size, report)
+        placed, turned, up = _for_the_user(points, normals, record)
+        mesh = (placed[atlas.source], atlas.faces, turned[atlas.source])
+        return save_textured_mesh(folder / f"mesh.{self.format}", *mesh, atlas.uv, picture, up)
+
+    def _surface(
+        self, model: Model, record: SceneRecord, lattice: Lattice, tile_points: int, report: Report
+    ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+        if self.surface == "tsdf":
+            return mesh_of_depth(model, record, lattice, self.truncation, tile_points, report)
+        vertices, faces = mesh_of_density(model, record, lattice, self.threshold, tile_points, report)
+        if self.seen_only:
+            faces = seen_faces(model, record, vertices, faces, tile_points, report)
+        return vertices, faces
 
     def _cleaned(
         self, vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"]
@@ -137,15 +206,11 @@ def vertex_normals(
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
 
-def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
-    """Replace densities by log(density / level), bounded: they grow by factors, and so their logarithm is straight."""
-    density /= level
-    np.clip(density, 1.0 / RATIO, RATIO, out=density)
-    np.log(density, out=density)
-
-
-def _close(density: Float[ndarray, "x y z"]) -> None:
-    """Empty the outermost points: nothing lies outside of a bounded scene's box, and the surface is closed there."""
-    for axis in range(3):
-        faces = np.moveaxis(density, axis, 0)
-        faces[0] = faces[-1] = 0.0
+def _for_the_user(
+    points: Float[Tensor, "vertices 3"], normals: Float[Tensor, "vertices 3"], record: SceneRecord
+) -> tuple[Float[ndarray, "vertices 3"], Float[ndarray, "vertices 3"], Float[ndarray, "3"]]:
+    """Return vertices, normals and the direction up in the user's frame."""
+    to_user = record.to_user.double()
+    up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
+    placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
+    return placed.numpy(), turned.numpy(), up.numpy()

@@ -1,4 +1,4 @@
-"""Mesh files: PLY, OBJ and GLB, with a colour and a normal for each vertex, by libraries that are an extra."""
+"""Mesh files: PLY, OBJ and GLB, with a normal and a colour for each vertex or with a texture, by optional libraries."""
 
 from functools import partial
 from importlib import import_module
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
+from PIL import Image
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
@@ -52,6 +53,53 @@ def save_mesh(
         part.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def save_textured_mesh(
+    path: Path,
+    vertices: Float[ndarray, "vertices 3"],
+    faces: Int[ndarray, "faces 3"],
+    normals: Float[ndarray, "vertices 3"],
+    uv: Float[ndarray, "vertices 2"],
+    picture: UInt8[ndarray, "height width 3"],
+    up: Float[ndarray, "3"],
+) -> list[Path]:
+    """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
+
+    Each is whole or not there; the OBJ, which names the others, comes last.
+
+    Args:
+        path: of the file; its ending says in which format.
+        vertices: where the corners are.
+        faces: three corners each.
+        normals: of the corners.
+        uv: where each corner lies in the picture, from 0 to 1, to the right and up.
+        picture: sRGB.
+        up: the unit vector that points up, in the frame of the vertices.
+    """
+    trimesh = require_library("trimesh")
+    image, visual = Image.fromarray(picture), trimesh.visual
+    form = path.suffix[1:]
+    if form == "glb":
+        material = visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    else:
+        # Full ambient and diffuse light and no highlights: the light is in the colours already.
+        material = visual.material.SimpleMaterial(image, ambient=[1.0] * 3, diffuse=[1.0] * 3, specular=[0.0] * 3)
+        material.name = path.stem
+    textured = visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=textured, process=False)
+    if form == "glb":
+        contents = {path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=partial(_as_gltf, up))}
+    else:
+        exchange = require_library("trimesh.exchange.obj")
+        mtl = path.with_suffix(".mtl")
+        settings = {"include_normals": True, "return_texture": True, "mtl_name": mtl.name, "header": None}
+        text, beside = exchange.export_obj(mesh, **settings)
+        contents = {path.with_name(name): content for name, content in beside.items()} | {path: text.encode()}
+    for each, content in contents.items():
+        with whole_file(each) as part:
+            part.write_bytes(content)
+    return list(contents)
+
+
 def _linear(colors: UInt8[ndarray, "vertices 3"]) -> UInt8[ndarray, "vertices 3"]:
     """Return sRGB codes as bytes of linear light, which glTF takes vertex colours for."""
     share = colors / 255.0
@@ -80,14 +128,14 @@ def _unlit(tree: dict[str, Any]) -> None:
     # The light is in the colours already: no viewer should add its own.
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    tree["materials"] = [{"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}]
+    tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
     for mesh in tree["meshes"]:
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
 
 
-def require_library(name: str) -> Any:
-    """Return a module of the extra `mesh`.
+def require_library(name: str, extra: str = "mesh") -> Any:
+    """Return a module of an extra.
 
     Raises:
         InputError: it is not installed.
@@ -95,7 +143,8 @@ def require_library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
+        what = "a mesh" if extra == "mesh" else "a mesh with a texture"
         raise InputError(
-            f"Exporting a mesh needs {name.partition('.')[0].replace('skimage', 'scikit-image')}, which is not "
-            f"installed or does not load here ({error}). Install it with: pip install 'nerf-lightning[mesh]'"
+            f"Exporting {what} needs {name.partition('.')[0].replace('skimage', 'scikit-image')}, which is not "
+            f"installed or does not load here ({error}). Install it with: pip install 'nerf-lightning[{extra}]'"
         ) from error

@@ -82,6 +82,41 @@ def test_a_spheres_normals_are_near_and_face_the_camera():
     assert normal_error(normals_from_depth(fine_points), fine_truth, fine_hit.double()) < 0.6 * error
 
 
+def test_waves_of_the_depth_are_smoothed():
+    rays, generator = picture_rays(48, focal=200.0), torch.Generator().manual_seed(0)
+    normal = normalize(torch.tensor([0.5, -0.6, 0.2], dtype=torch.float64), dim=0)
+    points = plane(rays, normal)
+    pixel = (points[1:] - points[:-1]).norm(dim=-1).median()
+    noise = 0.15 * pixel * torch.randn(48, 48, 1, generator=generator, dtype=torch.float64)
+    rough = points + noise * rays.directions
+    down, along = torch.gradient(rough, dim=(0, 1))
+    differences = normalize(torch.linalg.cross(down, along), dim=-1)
+    truth, alpha = (-normal).expand_as(points), torch.ones(48, 48, dtype=torch.float64)
+    if float(rays.directions[8, 8] @ normal) < 0:
+        truth = -truth
+    assert normal_error(normals_from_depth(rough), truth, alpha) < 0.5 * normal_error(differences, truth, alpha)
+
+
+def test_beside_an_edge_a_normal_is_that_of_its_own_surface():
+    rays = picture_rays(32, focal=60.0)
+    normal = normalize(torch.tensor([0.5, -0.6, 0.2], dtype=torch.float64), dim=0)
+    points = plane(rays, normal)
+    points[:, 16:] = (points + 2.0 * rays.directions)[:, 16:]
+    facing = normal if float(rays.directions[8, 8] @ normal) < 0 else -normal
+    found = normals_from_depth(points)[:, :16]
+    assert float((found * facing).sum(dim=-1).min()) > math.cos(math.radians(2.0))
+
+
+def test_a_pixel_without_a_point_spoils_no_other():
+    rays = picture_rays(16, focal=200.0)
+    normal = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    points = plane(rays, normal)
+    points[5, 5], points[9, 3] = math.inf, math.nan
+    found = normals_from_depth(points)
+    kept = points.isfinite().all(dim=-1)
+    torch.testing.assert_close(found[kept], normal.expand_as(found[kept]))
+
+
 @pytest.mark.parametrize("degrees", [0.0, 1e-4, 30.0, 90.0, 180.0])
 def test_the_angle_is_in_degrees(degrees):
     truth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 5, 3)

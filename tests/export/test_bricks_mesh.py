@@ -26,14 +26,24 @@ def test_the_mesh_of_a_short_run_is_close_to_the_exact_surface(tmp_path):
     run = ("experiment=quickstart", *scene, f"scene.cache_dir={tmp_path}/cache", "trainer.max_steps=150")
     least = ("final.video=false", "logger=none", "evaluation.max_views=1", "evaluation.num_pictures=0")
     export = (f"ckpt={tmp_path}/run/checkpoints/last.ckpt", "what=mesh", "what.resolution=128")
-    for command in (("train", *run, *least, f"paths.output_dir={tmp_path}/run"), ("export", *export)):
+    fused = (*export, "what.surface=tsdf", f"paths.output_dir={tmp_path}/fused")
+    commands = (("train", *run, *least, f"paths.output_dir={tmp_path}/run"), ("export", *export), ("export", *fused))
+    for command in commands:
         process = start(*command)
         output, _ = process.communicate(timeout=600)
         assert process.returncode == 0, output
-    mesh = trimesh.load(tmp_path / "run" / "export" / "mesh.ply", process=False)
-    ours = on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), POINTS)
-    true = exact_surface(POINTS)
-    to_truth, to_mesh = distances(ours, true).mean(), distances(true, ours).mean()
-    print(f"chamfer {to_truth:.4f} and {to_mesh:.4f}")
+    to_truth, to_mesh = errors(tmp_path / "run" / "export" / "mesh.ply")
     assert to_truth < 0.08
     assert to_mesh < 0.03
+    fused_to_truth, fused_to_mesh = errors(tmp_path / "fused" / "mesh.ply")
+    assert fused_to_truth < 0.8 * to_truth
+    assert fused_to_mesh < 1.35 * to_mesh
+
+
+def errors(path):
+    """How far the mesh's points are from the exact surface on average, and those of the surface from the mesh."""
+    mesh, true = trimesh.load(path, process=False), exact_surface(POINTS)
+    ours = on_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), POINTS)
+    found = distances(ours, true).mean(), distances(true, ours).mean()
+    print(f"{path.parent.name}: chamfer {found[0]:.4f} and {found[1]:.4f}")
+    return found

@@ -57,6 +57,16 @@ def median_distances(rendering: DenseRendering | PackedRendering, rays: RayBundl
     return median
 
 
+def transmittance_at(
+    rendering: DenseRendering | PackedRendering, rays: RayBundle, distance: Float[Tensor, "rays"]
+) -> Float[Tensor, "rays"]:
+    """Return the share of each ray's light that nothing has stopped before a distance."""
+    ray, midpoint, weights = _samples_of(rendering)
+    before = torch.where(midpoint < distance.reshape(-1)[ray], weights, 0.0)
+    stopped = torch.zeros(rays.near.numel(), device=weights.device).index_add_(0, ray, before)
+    return (1.0 - stopped).clamp(min=0.0)
+
+
 def _samples_of(
     rendering: DenseRendering | PackedRendering,
 ) -> tuple[Int[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:

@@ -2,7 +2,12 @@ import pytest
 import torch
 from support.scenes import some_rays
 
-from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, median_distances, weight_along
+from nerf_lightning.nerf.rendering.ray_statistics import (
+    effective_samples,
+    median_distances,
+    transmittance_at,
+    weight_along,
+)
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
 
@@ -64,6 +69,15 @@ def test_the_median_lies_in_what_is_seen_and_not_between(kind):
     weights[1, 1], weights[1, 8] = 0.6, 0.3
     weights[3] = 0.1
     assert median_distances(*kind(weights)).tolist() == pytest.approx([0.85, 0.15, 1.0, 0.45])
+
+
+@pytest.mark.parametrize("kind", [dense, packed])
+def test_the_light_at_a_distance_is_what_nothing_before_it_has_stopped(kind):
+    weights = torch.zeros(3, 4)
+    weights[0, 0], weights[0, 2], weights[1, 3] = 0.25, 0.5, 1.0
+    rendering, rays = kind(weights, near=2.0, far=6.0)
+    assert transmittance_at(rendering, rays, torch.tensor([4.0, 6.0, 6.0])).tolist() == [0.75, 0.0, 1.0]
+    assert transmittance_at(rendering, rays, torch.tensor([2.0, 5.0, 2.0])).tolist() == [1.0, 1.0, 1.0]
 
 
 def test_many_rays_do_not_blur_the_median():

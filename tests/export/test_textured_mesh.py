@@ -1,0 +1,210 @@
+"""what.texture=true: a known pattern comes back in place, files are what readers expect, bad input is refused."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import psutil
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from support.known_fields import ball, solid
+from support.rasterizer import in_texture
+from support.scenes import ball_scene
+
+from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.errors import InputError
+from nerf_lightning.export import mesh_files
+from nerf_lightning.export.mesh import TEXTURED_FACES, MeshExport
+from nerf_lightning.nerf.kernels.texels.cpu import covered_texels
+
+TILE, CELL = 1 << 15, 0.5
+DARK, LIGHT = (0.2, 0.3, 0.7), (0.9, 0.8, 0.3)
+
+
+def record(**changes):
+    return replace(scene_record(ball_scene(num_views=12, size=24)), **changes)
+
+
+def is_light(points):
+    """A checker in space, of cells that are CELL wide."""
+    return torch.floor(points / CELL + 0.5).long().sum(dim=-1) % 2 == 0
+
+
+def checker(points):
+    return torch.where(is_light(points)[..., None], torch.tensor(LIGHT), torch.tensor(DARK))
+
+
+def exported(folder, model, scene, **settings):
+    given = {"resolution": 10, "texture": True, "texture_size": 64} | settings
+    return MeshExport(**given).export(model, scene, folder, TILE)
+
+
+def texture_of(mesh):
+    material = mesh.visual.material
+    picture = material.baseColorTexture if hasattr(material, "baseColorTexture") else material.image
+    return np.asarray(picture.convert("RGB"))
+
+
+def only_mesh(path):
+    loaded = trimesh.load(path, process=False)
+    return next(iter(loaded.geometry.values())) if isinstance(loaded, trimesh.Scene) else loaded
+
+
+@pytest.mark.parametrize(("format", "surface"), [("glb", "density"), ("obj", "tsdf")])
+def test_a_checker_comes_back_in_place(tmp_path, format, surface):
+    fine = {"resolution": 20, "texture_size": 192, "format": format, "surface": surface}
+    path = exported(tmp_path, solid(ball(), color=checker), record(), **fine)[-1]
+    mesh = only_mesh(path)
+    inside = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(mesh.faces))
+    points = (inside[..., None] * mesh.vertices[mesh.faces]).sum(axis=1)
+    uv = (inside[..., None] * mesh.visual.uv[mesh.faces]).sum(axis=1)
+    found = in_texture(texture_of(mesh), uv) / 255.0
+    # A cell of the mesh from the edges of the checker: so far is its surface from that of the rays.
+    clear = (np.abs((points / CELL) % 1 - 0.5) > 0.08 / CELL).all(axis=1)
+    seen = points @ [1.0, 0.0, 0.0] > -0.2 if surface == "density" else clear
+    expected = checker(torch.tensor(points)).numpy()
+    wrong = np.abs(found - expected).max(axis=1) > 0.25
+    print(f"{wrong[clear & seen].mean():.4f} of {(clear & seen).sum()} are of the other colour")
+    assert (clear & seen).sum() > 100
+    assert wrong[clear & seen].mean() < 0.03
+
+
+def test_one_grey_fills_the_whole_picture_and_is_encoded_as_srgb(tmp_path):
+    (path,) = exported(tmp_path, solid(ball(), color=lambda points: torch.full_like(points, 0.4)), record())
+    assert path.name == "mesh.glb"
+    assert np.unique(texture_of(only_mesh(path))).tolist() == [102]
+
+
+def test_glb_holds_its_picture_and_no_viewer_lights_it(tmp_path):
+    (path,) = exported(tmp_path, solid(ball()), record())
+    assert [each.name for each in tmp_path.iterdir()] == ["mesh.glb"]
+    content = path.read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (image,), (texture,), (material,) = tree["images"], tree["textures"], tree["materials"]
+    assert image["mimeType"] == "image/png"
+    assert "uri" not in image
+    assert texture["source"] == 0
+    assert material["pbrMetallicRoughness"]["baseColorTexture"]["index"] == 0
+    assert material["extensions"] == {"KHR_materials_unlit": {}}
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert {"POSITION", "NORMAL", "TEXCOORD_0"} <= set(primitive["attributes"])
+    assert "COLOR_0" not in primitive["attributes"]
+
+
+VALIDATE = """
+const fs = require('fs'), validator = require('gltf-validator');
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])))
+    .then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.parametrize("texture", [True, False])
+def test_the_validator_of_gltf_has_nothing_to_say(tmp_path, texture):
+    node = shutil.which("node")
+    has_it = node and subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode == 0
+    if not has_it:
+        pytest.skip(
+            "needs node and its package gltf-validator (npm install gltf-validator; NODE_PATH=.../node_modules)"
+        )
+    (path,) = exported(tmp_path, solid(ball()), record(), texture=texture, format="glb")
+    issues = json.loads(subprocess.run([node, "-e", VALIDATE, path], capture_output=True, check=True).stdout)
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+def test_obj_has_its_material_and_its_picture_beside_it(tmp_path):
+    written = exported(tmp_path, solid(ball()), record(), format="obj")
+    assert sorted(each.name for each in written) == ["mesh.mtl", "mesh.obj", "mesh.png"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["mesh.mtl", "mesh.obj", "mesh.png"]
+    assert "mtllib mesh.mtl" in (tmp_path / "mesh.obj").read_text()
+    assert "map_Kd mesh.png" in (tmp_path / "mesh.mtl").read_text()
+    with Image.open(tmp_path / "mesh.png") as picture:
+        assert picture.size == (64, 64)
+
+
+def test_texels_are_those_whose_centres_lie_in_a_triangle():
+    corners = np.array([[[1.0, 1.0], [7.2, 1.0], [1.0, 7.2]]])
+    face, shares = covered_texels(corners, 8)
+    row, column = np.indices((8, 8)) + 0.5
+    inside = (row > 1) & (column > 1) & (row + column < 8.2)
+    assert np.array_equal(face == 0, inside)
+    places = (shares[inside][..., None] * corners[0]).sum(axis=1)
+    np.testing.assert_allclose(places, np.stack([column[inside], row[inside]], axis=1), atol=1e-5)
+
+
+def test_a_mesh_with_a_texture_has_few_faces_unless_it_is_told():
+    assert MeshExport(texture=True).faces == TEXTURED_FACES
+    assert MeshExport(texture=True, faces=70_000).faces == 70_000
+    assert MeshExport().faces is None
+    assert (MeshExport().format, MeshExport(texture=True).format) == ("ply", "glb")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"format": "ply"}, r"what\.format=ply has no texture.*what\.format=glb"),
+        ({"texture_size": 4}, r"what\.texture_size=4: give a number of texels from 16 to 16384"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, said):
+    with pytest.raises(InputError, match=said):
+        MeshExport(**{"texture": True} | settings)
+
+
+def test_without_xatlas_its_extra_is_named_before_any_work(tmp_path, monkeypatch):
+    def absent(name):
+        if name == "xatlas":
+            raise ImportError("No module named 'xatlas'")
+        return import_module(name)
+
+    monkeypatch.setattr(mesh_files, "import_module", absent)
+    with pytest.raises(InputError, match=r"texture needs xatlas, .*pip install 'nerf-lightning\[texture\]'"):
+        exported(tmp_path, solid(ball()), record())
+    exported(tmp_path, solid(ball()), record(), texture=False)
+
+
+def test_a_picture_beyond_memory_is_refused_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1_000_000_000}))
+    with pytest.raises(InputError, match=r"8192 x 8192 texels, which takes 6\.\d GB.*what\.texture_size=\d+ would fit"):
+        exported(tmp_path, solid(ball()), record(), texture_size=8192)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("mesh.glb", {}),
+        ("mesh.png", {"format": "obj"}),
+        ("mesh.ply", {"texture": False}),
+    ],
+)
+def test_a_folder_where_the_file_shall_be_is_refused_before_any_work(tmp_path, name, settings):
+    (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=rf"{name} is a folder.*paths\.output_dir=DIR"):
+        exported(tmp_path, solid(ball()), record(), **settings)
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    def full(self, content):
+        self.open("wb").close()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        exported(tmp_path, solid(ball()), record())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_that_no_view_sees_gets_no_texture(tmp_path):
+    scene = record()
+    away = scene.cameras.c2w.clone()
+    away[:, :, [0, 2]] *= -1  # each looks the other way
+    turned = replace(scene, cameras=replace(scene.cameras, c2w=away))
+    with pytest.raises(InputError, match="No training view of ball sees the mesh"):
+        exported(tmp_path, solid(ball()), turned, threshold=100.0, seen_only=False)
+    assert not list(tmp_path.iterdir())
