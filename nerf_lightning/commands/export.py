@@ -5,15 +5,18 @@ from omegaconf import DictConfig
 
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.export.base import Beside, Export
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
+from nerf_lightning.video.paths.base import CameraPath
 
 
 def run(config: DictConfig) -> None:
@@ -26,10 +29,13 @@ def export(config: DictConfig) -> None:
     if not ranks.is_first():
         return
     what: Export = build(config.what)
+    path = build(config.path) if what.shows_photographs else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
-    if what.shows_photographs:
-        what.beside = _beside(config, opened.checkpoint)
+    if path is not None:
+        asked = config.what.photographs or config.what.max_views
+        photographs = read_photographs(config, opened.checkpoint) if asked else None
+        what.beside = beside_page(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
@@ -38,9 +44,12 @@ def export(config: DictConfig) -> None:
     say(*map(str, written))
 
 
-def _beside(config: DictConfig, checkpoint: Checkpoint) -> Beside:
-    """Return the photographs, where they are asked for and can be read, and the numbers of the run."""
-    asked = config.what.photographs or config.what.max_views
+def beside_page(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath) -> Beside:
+    """Return what a page shows besides the scene: photographs, the numbers of the run, and a camera path.
+
+    Raises:
+        InputError: the path cannot be laid around the scene.
+    """
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     model = checkpoint.choices.get("model", "")
     known = [
@@ -48,4 +57,4 @@ def _beside(config: DictConfig, checkpoint: Checkpoint) -> Beside:
         ("step", f"{checkpoint.step:,}"),
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
-    return Beside(read_photographs(config, checkpoint) if asked else None, tuple(known))
+    return Beside(photographs, tuple(known), page_path(path, checkpoint.scene, run))

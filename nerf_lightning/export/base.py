@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
@@ -17,6 +18,8 @@ class Beside:
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
+    keyframes: tuple[dict[str, Any], ...] = ()
+    """A camera path as a keyframe file has it, in the capture's own frame; each with all that a camera needs."""
 
 
 class Export(ABC):

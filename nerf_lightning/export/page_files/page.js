@@ -224,6 +224,7 @@ const plus = (a, b, by = 1) => a.map((x, i) => x + by * b[i]);
 const minus = (a, b) => plus(a, b, -1);
 const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
 const length = (a) => Math.sqrt(dot(a, a));
+const unit = (a) => a.map((x) => x / Math.max(1e-12, length(a)));
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
 function turned(vector, axis, angle) {
@@ -267,6 +268,12 @@ class View {
     this.photograph = null;
   }
 
+  // A camera in the middle of whose picture lies what it looks at.
+  look(eye, target, up, lens) {
+    const back = unit(minus(eye, target)), right = unit(cross(up, back));
+    Object.assign(this, { eye, target, lens, axes: [right, cross(back, right), back], photograph: null });
+  }
+
   pan(right, up) {
     const unit = length(minus(this.eye, this.target));
     this.move(-right * unit, -up * unit, 0);
@@ -286,10 +293,13 @@ const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.15;
 class Frames {
   constructor(picture, view) {
     Object.assign(this, { picture, view, share: 0.6, movedAt: -Infinity, before: 0, waits: false, keys: new Set() });
+    this.player = new Player(this);
     this.step = this.step.bind(this);
   }
 
+  // Whoever takes the camera stops the one that goes along the path.
   moved() {
+    this.player.pause();
     this.movedAt = performance.now();
     this.ask();
   }
@@ -305,8 +315,9 @@ class Frames {
     const elapsed = now - this.before;
     this.before = now;
     if (this.keys.size && elapsed < 500) fly(this, elapsed / 1000);
+    if (this.player.playing) this.player.advance();
     place(this.view);
-    if (this.keys.size || performance.now() - this.movedAt < PAUSE) {
+    if (this.keys.size || this.player.playing || performance.now() - this.movedAt < PAUSE) {
       if (elapsed > SLOW && elapsed < 1000) this.share = Math.max(COARSEST, 0.85 * this.share);
       if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
       this.picture.draw(this.view, this.share);
@@ -388,11 +399,12 @@ function listenToKeys(frames) {
   const once = {
     1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
     b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => jump(frames, frames.view.about.first),
-    i: () => byId("numbers").showModal(), "[": () => next(frames, -1), "]": () => next(frames, 1),
+    i: () => byId("numbers").showModal(), " ": () => frames.player.toggle(), k: () => frames.player.add(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
     const key = event.key.toLowerCase();
     if (event.ctrlKey || event.metaKey || event.altKey || byId("numbers").open || event.target.matches("input, select")) return;
+    if (key === " " && event.target.matches("button")) return;  // it is pressed by that
     if (held(key)) {
       event.preventDefault();
       frames.keys.add(key);
@@ -410,6 +422,7 @@ function show(frames, what) {
 }
 
 function jump(frames, number) {
+  frames.player.pause();
   frames.view.jump(number);
   frames.ask();
 }
@@ -448,6 +461,7 @@ async function start() {
     listenToPointers(picture.canvas, frames);
     listenToKeys(frames);
     listenToControls(frames);
+    frames.player.listen();
     document.body.classList.add("running");
     frames.ask();
   } catch (error) {
