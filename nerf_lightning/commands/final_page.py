@@ -4,7 +4,6 @@ import logging
 from pathlib import Path
 
 import torch
-from omegaconf import OmegaConf
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.recorded_frame import as_trained
@@ -28,8 +27,9 @@ def write_final_page(what: PageExport, parts: Parts, folder: Path) -> None:
         # From the file, as nerf export does: what was trained in bfloat16 is baked in float32.
         checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
         model = load_model(checkpoint).to(parts.settings.device).eval()
-        path = build(OmegaConf.merge(parts.config.path, PATH))
-        what.beside = beside_page(checkpoint, as_trained(parts.scene, checkpoint), path)
+        path = parts.config.path.copy()
+        path.update(PATH)
+        what.beside = beside_page(checkpoint, as_trained(parts.scene, checkpoint), build(path))
         with torch.no_grad():
             written = what.export(model, checkpoint.scene, folder, parts.settings.inference_tile_points)
         say(*(f"page         {file}" for file in written))

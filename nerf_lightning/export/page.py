@@ -10,7 +10,7 @@ from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export
-from nerf_lightning.export.page_file import is_page, page_of, write_page
+from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
@@ -82,13 +82,13 @@ def require_box(record: SceneRecord) -> None:
         )
 
 
-def require_no_other(target: Path) -> None:
+def require_no_other(target: Path, mark: bytes = MARK) -> None:
     """Refuse to write over what is no page of ours.
 
     Raises:
         InputError: there is such a file, or a folder.
     """
-    if target.is_dir() or (target.exists() and not is_page(target)):
+    if target.is_dir() or (target.exists() and not is_page(target, mark)):
         kind = "a folder" if target.is_dir() else "a file that is no page of this program"
         raise InputError(
             f"{target} is {kind}, and would be lost. Move it away, or give another folder with paths.output_dir=DIR."

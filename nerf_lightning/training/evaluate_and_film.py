@@ -13,9 +13,9 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.page import QUALITIES, PageExport, require_box
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.refinements.carry import motions, moved_far
