@@ -79,7 +79,7 @@ class GalleryExport(RunsExport):
                 page, note = self._page(run, page_of)
                 cards.append(_card(run, differing, page, note, target))
                 report("pages", (number + 1) / len(shown))
-        _write(cards, f"{len(shown)} run{'s' if len(shown) > 1 else ''}", file)
+        _write(cards, f"{target.absolute().name}: {len(shown)} run{'s' if len(shown) > 1 else ''}", file)
         say(*(f"no page      {for_terminal(card.name)}: {card.note}" for card in cards if card.note))
         if left_out:
             names = listed((str(run.folder) for run in left_out), cap=5)
@@ -103,9 +103,8 @@ def _rank(run: RunSummary) -> tuple[bool, float, str]:
 
 def _settings(run: RunSummary) -> dict[str, str]:
     """Return what makes it another run than others, of what was given on the command line."""
-    return {
-        key: value for key, value in run.overrides.items() if meaning_of(key.lstrip("+~").partition("@")[0]).identity
-    }
+    meanings = {key: meaning_of(key.lstrip("+~").partition("@")[0]) for key in run.overrides}
+    return {key: run.overrides[key] for key, each in meanings.items() if each.identity or each.shown}
 
 
 def _card(run: RunSummary, differing: list[str], page: Path | None, note: str, target: Path) -> Card:
