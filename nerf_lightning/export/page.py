@@ -5,7 +5,6 @@ from typing import Literal
 
 from nerf_lightning.console import StageProgress, say
 from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.marcher import Marcher
@@ -52,7 +51,6 @@ class PageExport(Export):
         """Write the page, and say what it costs."""
         target = folder / "page.html"
         require_no_other(target)
-        require_box(record)
         with StageProgress(COSTS) as report:
             baked = bake(model, record, self.resolution, self.num_harmonics, tile_points, report)
             marcher = Marcher(baked)
@@ -65,21 +63,6 @@ class PageExport(Export):
     def _said(self, target: Path, cost: Cost) -> list[str]:
         size = f"{target.stat().st_size / 1e6:.1f} MB"
         return [f"size         {size} (what.quality={self.quality})", *(f"{a:<12} {b}" for a, b in cost.facts())]
-
-
-def require_box(record: SceneRecord) -> None:
-    """Refuse a scene without an end.
-
-    Raises:
-        InputError: all space is contracted.
-    """
-    if record.space == "contracted":
-        raise InputError(
-            f"what=page: {for_terminal(record.name)} was trained with all of space contracted around its box "
-            "(scene.space=contracted), and a page holds a box alone: what lies around it would be missing. Use "
-            "nerf view or nerf render, what=points or what=mesh, or train again with scene.space=bounded (or ndc, for "
-            "photographs that all look the same way)."
-        )
 
 
 def require_no_other(target: Path, mark: bytes = MARK) -> None:

@@ -165,6 +165,9 @@ def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]
     """Return what one turns around, and how far things are from it, in the world."""
     if record.space == "ndc":
         return [0.0, 0.0, -2.0], 1.0
+    contraction = baked.contraction
+    if contraction is not None:
+        return list(contraction.center), 3**0.5 * contraction.half
     half = 0.5 * 8 * baked.spacing * np.array(baked.shape)
     return (np.array(baked.lower) + half).tolist(), float(np.linalg.norm(half))
 

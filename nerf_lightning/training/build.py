@@ -131,7 +131,7 @@ def build_parts(config: DictConfig, choices: Mapping[str, Any], overrides: Seque
     settings.prepare_machine()
     finish, loggers = Finish.from_config(config), build(config.logger)
     scene: Scene = build(config.scene).read()
-    finish.require_possible(scene)
+    finish.require_film(scene)
     config, choices = settled(config, choices, overrides, scene)
     checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
     config, choices = corrected(config, choices, overrides, checks)

@@ -16,7 +16,7 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
-from nerf_lightning.export.page import QUALITIES, PageExport, require_box
+from nerf_lightning.export.page import QUALITIES, PageExport
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.refinements.carry import motions, moved_far
 from nerf_lightning.nerf.types.scene import Scene
@@ -54,16 +54,14 @@ class Finish:
         page = _page(config.final.page)
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None, page)
 
-    def require_possible(self, scene: Scene) -> None:
-        """Refuse a path that cannot be laid around the scene, frames for which there is no memory, or a page.
+    def require_film(self, scene: Scene) -> None:
+        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory.
 
         Raises:
             InputError: why not.
         """
-        record = scene_record(scene)
-        if self.page is not None:
-            require_box(record)
         if self.path is not None:
+            record = scene_record(scene)
             require_room(lay_path(self.path, record), FilmSettings(), [record])
 
     def __call__(

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from support.baked_ball import all_around, beside, record_of, shiny_model
 from support.browser import drag, opened
+from support.contracted_hall import hall_model, hall_scene
 
 from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.config.compose import compose_config
@@ -58,18 +59,18 @@ def press(driver, key: str) -> None:
     driver.execute_script(f"document.body.dispatchEvent({event})", key)
 
 
-def marched(page, view: int, width: int, height: int) -> np.ndarray:
+def marched(page, view: int, width: int, height: int, behind="white") -> np.ndarray:
     """What the file shows through a camera in a window, its picture in the middle."""
     lens = read_baked(page)[0]["cameras"][view]
     c2w = torch.tensor([*lens["axes"], lens["eye"]]).T
-    return marched_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height)
+    return marched_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height, behind)
 
 
-def marched_through(page, c2w, focal, size, width, height) -> np.ndarray:
+def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
     scale = min(width / size[0], height / size[1])
     cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
     rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), 0)
-    return over(Marcher(read_baked(page)[1]).render(rays), "white").clamp(0, 1).numpy()
+    return over(Marcher(read_baked(page)[1]).render(rays), behind).clamp(0, 1).numpy()
 
 
 def psnr(one, other) -> float:
@@ -118,6 +119,22 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
             assert np.abs(shot(driver) - colors).mean() > 0.02
         press(driver, "i")
         assert run("return document.getElementById('numbers').open")
+
+
+def test_a_scene_without_bounds_is_shown_as_the_marcher_computes_it(tmp_path):
+    what, scene = PageExport("small", 48, photographs=2, max_views=0), hall_scene()
+    what.beside = beside(scene)
+    with torch.no_grad():
+        page = what.export(hall_model(), record_of(scene), tmp_path, 1 << 14)[0]
+    with opened(page.as_uri(), 256, 360) as driver:
+        wait_for(driver, "still")
+        driver.execute_script("document.body.classList.add('bare')")
+        found = shot(driver)
+        height, width = found.shape[:2]
+        assert psnr(found, marched(page, 0, width, height, "black")) > 38
+        assert found.std() > 0.1
+        assert found.min(axis=2).mean() > 0.05  # the wall is there
+        assert driver.get_log("browser") == []
 
 
 @pytest.fixture(scope="module")

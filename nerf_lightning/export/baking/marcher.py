@@ -44,12 +44,16 @@ class Marcher:
 
     def render(self, rays: RayBundle) -> MarchedRays:
         """Return what rays meet in the box."""
-        shape = rays.near.shape
+        shape, contraction = rays.near.shape, self.baked.contraction
         lower, spacing = torch.tensor(self.baked.lower), self.baked.spacing
-        origins = ((rays.origins - lower) / spacing).float().reshape(-1, 3).contiguous()
+        inside = (rays.origins - lower) / spacing if contraction is None else contraction.unit(rays.origins)
+        origins = inside.float().reshape(-1, 3).contiguous()
         directions, looks = rays.directions.float().reshape(-1, 3), rays.view_directions.float().reshape(-1, 3)
         basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
-        found = kernels().march_tiles(
+        module, begin = "bricks.cpu", ()
+        if contraction is not None:
+            module, begin, spacing = "bricks.contracted", (contraction.near / contraction.half,), contraction.half
+        found = kernels(module).march_tiles(
             origins.numpy(),
             directions.contiguous().numpy(),
             basis.contiguous().numpy(),
@@ -58,6 +62,7 @@ class Marcher:
             self.colors,
             self.baked.scale,
             STEP,
+            *begin,
         )
         columns = torch.from_numpy(found)
         depth = spacing * columns[:, 4] / columns[:, 3].clamp(min=1e-6)

@@ -139,7 +139,7 @@ class Picture {
 
   linked() {
     const gl = this.gl, program = gl.createProgram();
-    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}`;
+    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}${this.about.contraction ? "#define CONTRACTED\n" : ""}`;
     const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
     for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, head + byId("shader").textContent]]) {
       const shader = gl.createShader(kind);
@@ -194,6 +194,11 @@ class Picture {
     gl.uniform2fv(this.at("exponents"), about.exponents);
     gl.uniform2fv(this.at("ranges"), about.ranges);
     if (about.ndc) gl.uniform2fv(this.at("ndc"), about.ndc);
+    if (about.contraction) {
+      gl.uniform3fv(this.at("middle"), about.contraction.center);
+      gl.uniform1f(this.at("half_side"), about.contraction.half);
+      gl.uniform1f(this.at("nearest"), about.contraction.near);
+    }
   }
 
   // The lens fits into the window, its middle in the window's; `share` of the window's pixels along each side.

@@ -5,7 +5,7 @@ As a program: `python -m nerf_lightning.nerf.kernels.compile`.
 
 from nerf_lightning.nerf.kernels.backends import twin
 
-CPU_TWINS = ("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu")
+CPU_TWINS = ("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "bricks.contracted")
 
 
 def compile_kernels() -> None:
