@@ -23,8 +23,9 @@ class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
     Args:
-        quality: about 3, 10 or 30 MB.
-        resolution: voxels along the longest side of what there is; None: as the quality has it.
+        quality: about 3, 10 or 30 MB; of scenes without bounds three times as much.
+        resolution: voxels along the longest side of what there is; in scenes without bounds three quarters of them lie
+            along the side of the box, and as many around it. None: as the quality has it.
         photographs: most photographs that are places to jump to, spread over all; 0: none.
         max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
     """

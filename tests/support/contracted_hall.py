@@ -1,4 +1,4 @@
-"""A ball in a hall that is larger than the scene's box: what a scene without bounds is."""
+"""A ball amid fog that grows dense outside of the scene's box: what a scene without bounds is."""
 
 from dataclasses import replace
 
@@ -6,11 +6,12 @@ import torch
 from support.baked_ball import RADIUS, all_around, record_of, shiny_model
 from support.known_fields import ball
 
-WALL = 3.0
+DENSE = 5.0
+"""So far out the fog has half its density, of 100 inside of the ball; at 3 it stops most of the light."""
 
 
 def hall_scene(size: int = 32):
-    """Cameras between the box, of half a side 1, and the wall, looking at the ball."""
+    """Cameras outside of the box, of half a side 1, and in the fog, looking at the ball."""
     scene = all_around(size)
     c2w = scene.cameras.c2w.clone()
     c2w[:, :, 3] *= 0.5
@@ -21,7 +22,7 @@ def hall_scene(size: int = 32):
 
 def hall_model():
     def soft(positions):
-        return 0.2 * torch.minimum(ball(RADIUS)(positions), WALL - positions.norm(dim=-1))
+        return torch.minimum(0.2 * ball(RADIUS)(positions), 0.02 * (DENSE - positions.norm(dim=-1)))
 
     return shiny_model(soft)
 

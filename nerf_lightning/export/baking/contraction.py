@@ -38,7 +38,7 @@ class Contraction:
         return (world - torch.tensor(self.center)) / self.half
 
     def world(self, places: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """Return where places of the contracted cube, -2 to 2, lie in the scene; the rim, which is at infinity, far away.
+        """Return where places of the contracted cube, -2 to 2, lie in the scene; its rim is at infinity: far away.
 
         >>> Contraction((0.0, 0.0, 0.0), 1.0, 0.1).world(torch.tensor([[0.5, 0.0, 1.0], [-1.75, 0.5, 0.0]])).tolist()
         [[0.5, 0.0, 1.0], [-4.0, 2.0, 0.0]]
