@@ -1,19 +1,27 @@
-"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps or cameras."""
+"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page; or pages of several."""
+
+import os
+from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import Checkpoint
-from nerf_lightning.config.instantiate import build
+from nerf_lightning.commands.gallery_pages import page_maker
+from nerf_lightning.commands.page_path import page_path
+from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.console import say
-from nerf_lightning.export.base import Beside, Export
+from nerf_lightning.export.base import Beside, Export, RunsExport
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
+from nerf_lightning.runs.results import find_runs
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
+from nerf_lightning.video.paths.base import CameraPath
 
 
 def run(config: DictConfig) -> None:
@@ -25,22 +33,47 @@ def export(config: DictConfig) -> None:
     """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
     if not ranks.is_first():
         return
+    several = isinstance(build(config.what), RunsExport)
+    written = export_runs(config) if several else export_one(config)
+    say(*map(str, written))
+
+
+def export_one(config: DictConfig) -> list[Path]:
+    """Export one checkpoint, and return where the files are."""
     what: Export = build(config.what)
+    path = build(config.path) if what.shows_photographs else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
-    if what.shows_photographs:
-        what.beside = _beside(config, opened.checkpoint)
+    if path is not None:
+        asked = config.what.photographs or config.what.max_views
+        photographs = read_photographs(config, opened.checkpoint) if asked else None
+        what.beside = beside_page(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are those that training refined (refinement=...), not those that were read")
-    say(*map(str, written))
+    return written
 
 
-def _beside(config: DictConfig, checkpoint: Checkpoint) -> Beside:
-    """Return the photographs, where they are asked for and can be read, and the numbers of the run."""
-    asked = config.what.photographs or config.what.max_views
+def export_runs(config: DictConfig) -> list[Path]:
+    """Export several runs; by default where all of them lie."""
+    what: RunsExport = build(config.what)
+    given = config.ckpt if isinstance(config.ckpt, ListConfig) else [config.ckpt]
+    folders = [Path(required_path("ckpt", each)) for each in given]
+    runs = find_runs(folders, "ckpt")
+    first = folders[0].absolute()
+    default = first if len(folders) == 1 else Path(os.path.commonpath([each.absolute().parent for each in folders]))
+    with filled_folder(config.paths.output_dir, default) as folder:
+        return what.export(runs, folder, page_maker(export_one))
+
+
+def beside_page(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath) -> Beside:
+    """Return what a page shows besides the scene: photographs, the numbers of the run, and a camera path.
+
+    Raises:
+        InputError: the path cannot be laid around the scene.
+    """
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     model = checkpoint.choices.get("model", "")
     known = [
@@ -48,4 +81,4 @@ def _beside(config: DictConfig, checkpoint: Checkpoint) -> Beside:
         ("step", f"{checkpoint.step:,}"),
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
-    return Beside(read_photographs(config, checkpoint) if asked else None, tuple(known))
+    return Beside(photographs, tuple(known), page_path(path, checkpoint.scene, run))

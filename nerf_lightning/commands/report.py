@@ -31,7 +31,7 @@ def run(config: DictConfig) -> str:
     target = output_folder(config.paths.output_dir, run) / "report.html"
     most_video_bytes = int(config.max_megabytes * 1e6)
     doctor = partial(_examine_capture, config) if config.doctor else None
-    report = read_run(run, run / FILES[config.measured], most_video_bytes, doctor)
+    report = read_run(run, run / FILES[config.measured], most_video_bytes, doctor, target.parent)
     write_page(report, target)
     lines = [f"left out     {line}" for line in report.missing]
     say(*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)")

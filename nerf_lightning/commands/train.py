@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
+from nerf_lightning.commands.final_page import write_final_page
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.tree import print_tree
 from nerf_lightning.console import StdoutConsole, say, spoken
@@ -158,6 +159,8 @@ def _finish(parts: Parts, folder: Path, trainer: Trainer) -> float | None:
     psnr = parts.finish(parts.settings, parts.scene, parts.system.model, trainer, folder)
     for logger in trainer.loggers:
         logger.finalize("success")
+    if parts.finish.page is not None and ranks.is_first():
+        write_final_page(parts.finish.page, parts, folder)
     if parts.config.final.report and ranks.is_first():
         _write_report(parts, folder)
     return psnr

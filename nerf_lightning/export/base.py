@@ -1,9 +1,10 @@
 """The contract of an export: a model in, files out, in the user's own frame."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
@@ -18,6 +19,8 @@ class Beside:
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
+    keyframes: tuple[dict[str, Any], ...] = ()
+    """A camera path as a keyframe file has it, in the capture's own frame; each with all that a camera needs."""
 
 
 class Export(ABC):
@@ -40,6 +43,23 @@ class Export(ABC):
 
         Raises:
             InputError: a setting that makes no sense, or a model in which there is nothing to export.
+        """
+
+
+class RunsExport(ABC):
+    """Write what several runs have learnt as files beside each other."""
+
+    @abstractmethod
+    def export(self, runs: Sequence[Path], target: Path, page_of: Callable[[Path, Any], Path]) -> list[Path]:
+        """Write files into `target` and return where they are.
+
+        Args:
+            runs: their folders.
+            target: is there, and can be written.
+            page_of: makes the page of a run in a quality, and returns where it is, or raises `InputError`.
+
+        Raises:
+            InputError: a setting that makes no sense.
         """
 
 

@@ -5,12 +5,11 @@ from typing import Literal
 
 from nerf_lightning.console import StageProgress, say
 from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export
-from nerf_lightning.export.page_file import is_page, page_of, write_page
+from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
@@ -24,8 +23,9 @@ class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
     Args:
-        quality: about 3, 10 or 30 MB.
-        resolution: voxels along the longest side of what there is; None: as the quality has it.
+        quality: about 3, 10 or 30 MB; of scenes without bounds three times as much.
+        resolution: voxels along the longest side of what there is; in scenes without bounds three quarters of them lie
+            along the side of the box, and as many around it. None: as the quality has it.
         photographs: most photographs that are places to jump to, spread over all; 0: none.
         max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
     """
@@ -52,7 +52,6 @@ class PageExport(Export):
         """Write the page, and say what it costs."""
         target = folder / "page.html"
         require_no_other(target)
-        require_box(record)
         with StageProgress(COSTS) as report:
             baked = bake(model, record, self.resolution, self.num_harmonics, tile_points, report)
             marcher = Marcher(baked)
@@ -67,28 +66,13 @@ class PageExport(Export):
         return [f"size         {size} (what.quality={self.quality})", *(f"{a:<12} {b}" for a, b in cost.facts())]
 
 
-def require_box(record: SceneRecord) -> None:
-    """Refuse a scene without an end.
-
-    Raises:
-        InputError: all space is contracted.
-    """
-    if record.space == "contracted":
-        raise InputError(
-            f"what=page: {for_terminal(record.name)} was trained with all of space contracted around its box "
-            "(scene.space=contracted), and a page holds a box alone: what lies around it would be missing. Use "
-            "nerf view or nerf render, what=points or what=mesh, or train again with scene.space=bounded (or ndc, for "
-            "photographs that all look the same way)."
-        )
-
-
-def require_no_other(target: Path) -> None:
+def require_no_other(target: Path, mark: bytes = MARK) -> None:
     """Refuse to write over what is no page of ours.
 
     Raises:
         InputError: there is such a file, or a folder.
     """
-    if target.is_dir() or (target.exists() and not is_page(target)):
+    if target.is_dir() or (target.exists() and not is_page(target, mark)):
         kind = "a folder" if target.is_dir() else "a file that is no page of this program"
         raise InputError(
             f"{target} is {kind}, and would be lost. Move it away, or give another folder with paths.output_dir=DIR."

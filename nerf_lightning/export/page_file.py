@@ -34,6 +34,7 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
+SCRIPTS = ("page.js", "path.js")
 MARK = b"<!-- nerf_lightning page 1 -->"
 BEHIND: dict[Background, str] = {"white": "#ffffff", "random": "#ffffff", "black": "#000000", "none": "#000000"}
 # Pixels of the longer side: of the still picture, of photographs.
@@ -91,6 +92,10 @@ def page_of(
         "radius": radius,
         "up": (up / up.norm().clamp(min=1e-6)).tolist(),
         "ndc": None if record.cameras.ndc is None else record.cameras.ndc[0].tolist(),
+        "path": list(beside.keyframes),
+        "to_user": record.to_user.tolist(),
+        # A film has the shape of the first photograph.
+        "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
     }
     grid = " x ".join(str(8 * count) for count in marcher.baked.shape)
     known = [
@@ -105,7 +110,8 @@ def page_of(
 
 def write_page(page: Page, target: Path) -> None:
     """Write one file of HTML."""
-    script, style, shader = (_text(name) for name in ("page.js", "page.css", "march.glsl"))
+    style, shader = _text("page.css"), _text("march.glsl")
+    script = "\n".join(map(_text, SCRIPTS))
     text = rendered(
         FOLDER / "page.html",
         page=page,
@@ -137,11 +143,11 @@ def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
         raise InputError(f"The page {path} is damaged: {error}. Export it again.") from error
 
 
-def is_page(path: Path) -> bool:
-    """Tell whether a file begins as our pages do."""
+def is_page(path: Path, mark: bytes = MARK) -> bool:
+    """Tell whether a file begins as our pages do, or as others of ours with a mark of their own."""
     try:
         with open_regular(path, None) as file:
-            return MARK in file.read(200)
+            return mark in file.read(200)
     except InputError:
         return False
 
@@ -159,6 +165,9 @@ def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]
     """Return what one turns around, and how far things are from it, in the world."""
     if record.space == "ndc":
         return [0.0, 0.0, -2.0], 1.0
+    contraction = baked.contraction
+    if contraction is not None:
+        return list(contraction.center), 3**0.5 * contraction.half
     half = 0.5 * 8 * baked.spacing * np.array(baked.shape)
     return (np.array(baked.lower) + half).tolist(), float(np.linalg.norm(half))
 

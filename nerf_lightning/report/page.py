@@ -37,6 +37,8 @@ class Report:
 
     title: str
     subtitle: str = ""
+    scene_page: str = ""
+    """The address of the page on which the scene can be walked around in."""
     facts: Pairs = field(default_factory=list)
     """The numbers on top: label and value."""
     missing: list[str] = field(default_factory=list)

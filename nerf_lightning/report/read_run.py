@@ -16,6 +16,7 @@ from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.embedding import embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page
 from nerf_lightning.report.page import Report
+from nerf_lightning.report.pages import address_from, page_of_run
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.visualization.camera_layout import coverage_picture
 
@@ -24,7 +25,13 @@ VIDEOS = {"video.mp4": "new views", "depth.mp4": "their depth", "progress.mp4": 
 COSTS = {"views": 2.0, "curves": 3.0, "films": 1.0, "capture": 10.0}
 
 
-def read_run(run: Path, metrics: Path, most_video_bytes: int, examine: Callable[[], list[Check]] | None) -> Report:
+def read_run(
+    run: Path,
+    metrics: Path,
+    most_video_bytes: int,
+    examine: Callable[[], list[Check]] | None,
+    folder: Path | None = None,
+) -> Report:
     """Return all of a run that can be shown.
 
     Args:
@@ -32,8 +39,11 @@ def read_run(run: Path, metrics: Path, most_video_bytes: int, examine: Callable[
         metrics: the `metrics.json` whose numbers are shown; `images` beside it holds the views.
         most_video_bytes: a film that is larger is left out.
         examine: reads the capture and judges it, as the doctor does; None leaves that out.
+        folder: where the page will lie; None: in the run folder.
     """
-    reader = _RunReader(run, Report(title=run.absolute().name))
+    scene = page_of_run(run)
+    link = "" if scene is None else address_from(scene.absolute(), (folder or run).absolute())
+    reader = _RunReader(run, Report(title=run.absolute().name, scene_page=link))
     stages: tuple[Callable[[], None], ...] = (
         partial(reader.measured, metrics),
         reader.curves,

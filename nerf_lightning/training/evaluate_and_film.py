@@ -13,8 +13,10 @@ from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
+from nerf_lightning.export.page import QUALITIES, PageExport
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.refinements.carry import motions, moved_far
 from nerf_lightning.nerf.types.scene import Scene
@@ -36,6 +38,8 @@ class Finish:
 
     scoring: Scoring | None
     path: CameraPath | None
+    page: PageExport | None = None
+    """Is made after all that happens here, by the command."""
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "Finish":
@@ -47,7 +51,8 @@ class Finish:
         scoring, path = build(config.evaluation), build(config.path)
         if config.final.video:
             require_ffmpeg()
-        return cls(scoring if config.final.evaluate else None, path if config.final.video else None)
+        page = _page(config.final.page)
+        return cls(scoring if config.final.evaluate else None, path if config.final.video else None, page)
 
     def require_film(self, scene: Scene) -> None:
         """Refuse a path that cannot be laid around the scene, or frames for which there is no memory.
@@ -86,6 +91,15 @@ class Finish:
             lines.append(f"TensorBoard  tensorboard --logdir {folder / 'tensorboard'}")
         say(*lines)
         return None if psnr is None else float(psnr)
+
+
+def _page(asked: bool | str) -> PageExport | None:
+    if isinstance(asked, bool):
+        return PageExport() if asked else None
+    for quality in QUALITIES:
+        if quality == asked:
+            return PageExport(quality)
+    raise InputError(f"final.page={asked}: give true, false, or the quality of a page: {', '.join(QUALITIES)}.")
 
 
 def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[str]]:

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from support.configs import composed, loaded, options
 
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import Export, RunsExport
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
 
 BUILT = {
@@ -144,7 +144,7 @@ def test_every_trainer_builds(option):
 
 @pytest.mark.parametrize("option", options("what"))
 def test_every_export_builds(option):
-    assert isinstance(build(composed("export", f"what={option}").what), Export)
+    assert isinstance(build(composed("export", f"what={option}").what), (Export, RunsExport))
 
 
 @pytest.mark.parametrize("command", ["train", "eval", "render", "bench", "export", "view", "selftest"])

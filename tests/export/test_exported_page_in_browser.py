@@ -2,6 +2,7 @@
 
 import io
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,14 +10,22 @@ import torch
 from PIL import Image
 from support.baked_ball import all_around, beside, record_of, shiny_model
 from support.browser import drag, opened
+from support.contracted_hall import hall_model, hall_scene
 
+from nerf_lightning.commands.page_path import page_path
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.page_file import read_baked
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
+from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.shots import Subject, lay_path, make_shots
 
 pytestmark = pytest.mark.slow
 
@@ -50,15 +59,18 @@ def press(driver, key: str) -> None:
     driver.execute_script(f"document.body.dispatchEvent({event})", key)
 
 
-def marched(page, view: int, width: int, height: int) -> np.ndarray:
+def marched(page, view: int, width: int, height: int, behind="white") -> np.ndarray:
     """What the file shows through a camera in a window, its picture in the middle."""
-    about, baked = read_baked(page)
-    lens = about["cameras"][view]
-    scale = min(width / lens["width"], height / lens["height"])
-    c2w = torch.tensor([*lens["axes"], lens["eye"]]).T[None]
-    cameras = pinhole_cameras(c2w, scale * lens["focal"][0], width, height)
+    lens = read_baked(page)[0]["cameras"][view]
+    c2w = torch.tensor([*lens["axes"], lens["eye"]]).T
+    return marched_through(page, c2w, lens["focal"][0], (lens["width"], lens["height"]), width, height, behind)
+
+
+def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
+    scale = min(width / size[0], height / size[1])
+    cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
     rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), 0)
-    return over(Marcher(baked).render(rays), "white").clamp(0, 1).numpy()
+    return over(Marcher(read_baked(page)[1]).render(rays), behind).clamp(0, 1).numpy()
 
 
 def psnr(one, other) -> float:
@@ -107,6 +119,103 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
             assert np.abs(shot(driver) - colors).mean() > 0.02
         press(driver, "i")
         assert run("return document.getElementById('numbers').open")
+
+
+def test_a_scene_without_bounds_is_shown_as_the_marcher_computes_it(tmp_path):
+    what, scene = PageExport("small", 48, photographs=2, max_views=0), hall_scene()
+    what.beside = beside(scene)
+    with torch.no_grad():
+        page = what.export(hall_model(), record_of(scene), tmp_path, 1 << 14)[0]
+    with opened(page.as_uri(), 256, 360) as driver:
+        wait_for(driver, "still")
+        driver.execute_script("document.body.classList.add('bare')")
+        found = shot(driver)
+        height, width = found.shape[:2]
+        assert psnr(found, marched(page, 0, width, height, "black")) > 38
+        assert found.std() > 0.1
+        assert found.min(axis=2).mean() > 0.05  # the wall is there
+        assert driver.get_log("browser") == []
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A page of a capture in other units and axes, with an orbit of ten seconds; and its record."""
+    what, scene = PageExport("small", 32, photographs=3, max_views=0), all_around()
+    turn = torch.linalg.qr(torch.tensor([[0.2, 1.0, 0.3], [-0.5, 0.1, 1.0], [1.0, 0.4, 0.2]]))[0]
+    record = record_of(scene, to_user=similarity(turn * turn.det(), torch.tensor([50.0, -3.0, 2.0]), 3.0))
+    orbit = page_path(Orbit(120, fps=12), record, tmp_path_factory.mktemp("run"))
+    what.beside = replace(beside(scene), keyframes=orbit)
+    with torch.no_grad():
+        return what.export(shiny_model(), record, tmp_path_factory.mktemp("moving"), 4096)[0], record
+
+
+def seen_by(path, page, record, second: float, found: np.ndarray) -> np.ndarray:
+    """What the program's camera of this second sees in a window like the one that was found."""
+    cameras = lay_path(path, record)[round(second * path.fps)]
+    height, width = found.shape[:2]
+    size = (int(cameras.width), int(cameras.height))
+    return marched_through(page, cameras.c2w, cameras.focal[0], size, width, height)
+
+
+def to_second(driver, second: float) -> np.ndarray:
+    line = "const time = document.getElementById('time'); time.value = arguments[0];"
+    driver.execute_script(f"{line} time.dispatchEvent(new Event('input'))", str(second))
+    wait_for(driver, "still")
+    return shot(driver)
+
+
+def test_a_camera_path_is_played_as_it_is_filmed_and_one_that_is_recorded_is_filmed_as_it_was_played(moving, tmp_path):
+    page, record = moving
+    with opened(page.as_uri(), 256, 480) as driver:
+        run = driver.execute_script
+        saves = {"behavior": "allow", "downloadPath": str(tmp_path)}
+        driver.execute_cdp_cmd("Browser.setDownloadBehavior", saves)
+        wait_for(driver, "still")
+        assert run("return document.getElementById('length').value") == "10.0 s"
+        run("document.body.classList.add('bare')")
+        found = to_second(driver, 4.25)
+        assert found.std() > 0.1
+        assert psnr(found, seen_by(Orbit(120, fps=12), page, record, 4.25, found)) > 36  # a curve through 25 of 120
+        press(driver, " ")
+        wait_for(driver, "moving")
+        assert run("return document.getElementById('play').textContent") == "pause"
+        press(driver, " ")
+        wait_for(driver, "still")
+        for view in range(3):
+            run(f"document.querySelectorAll('#photographs button')[{view}].click()")
+            drag(driver, 30, 10)
+            wait_for(driver, "still")
+            recorded = shot(driver)
+            press(driver, "k")
+        assert run("return document.getElementById('length').value") == "3 keyframes, 4.0 s"
+        run("document.getElementById('save').click()")
+        file = tmp_path / "camera_path.yaml"
+        wait_until_there(file)
+        config = compose_config("render", ["ckpt=RUN", "path=keyframes", f"path.file={file}"])[0]
+        path = build(config.path)
+        assert len(lay_path(path, record).c2w) == 121
+        for second in (1.5, 4.0):
+            found = to_second(driver, second)
+            assert psnr(found, seen_by(path, page, record, second, found)) > 38
+        assert psnr(found, recorded) > 38
+        run("for (const _ of [1, 2, 3]) document.getElementById('remove').click()")
+        assert run("return document.getElementById('length').value") == "10.0 s"
+        assert driver.get_log("browser") == []
+    # And filmed by the program itself.
+    shots = make_shots([Subject(shiny_model(), record, "white")], replace_frames(path, 3), 4096)
+    assert float(shots[0].picture(1).opacity.max()) > 0.9
+
+
+def wait_until_there(file) -> None:
+    end = time.monotonic() + 30
+    while not file.exists():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def replace_frames(path: KeyframePath, num_frames: int) -> KeyframePath:
+    path.asked_frames = num_frames
+    return path
 
 
 @pytest.mark.parametrize("page", ["small"], indirect=True)

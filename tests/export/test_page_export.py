@@ -102,10 +102,6 @@ def test_without_photographs_the_cameras_are_still_there(tmp_path):
 
 def test_refusals(tmp_path):
     model, record = shiny_model(), record_of(all_around())
-    contracted = replace(record, space="contracted")
-    parts = ("what=page: ball was trained with all of space contracted", "nerf view", "scene.space=bounded")
-    refused(PageExport().export, model, contracted, tmp_path, 4096, parts=parts)
-    assert not list(tmp_path.iterdir())
     target = tmp_path / "page.html"
     target.write_text("<html>somebody's own</html>")
     refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html", "would be lost", "Move it away"))

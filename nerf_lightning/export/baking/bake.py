@@ -16,6 +16,7 @@ from nerf_lightning.export.baking.seen_colors import (
     LOOKS,
     RANGES,
     TRIES,
+    TRIES_AROUND,
     camera_views,
     fitted_colors,
     in_world,
@@ -78,6 +79,13 @@ def _who_sees(grid: DensityGrid, record: SceneRecord, looks: int, report: Report
     voxels = np.argwhere(dilated(grid.optical > LEAST_OPTICAL)).astype(np.int32)
     world = in_world(grid.places(voxels), record)
     eyes, views = camera_views(record)
+    contraction = grid.contraction
+    if contraction is not None:
+        units, eyes_of = contraction.unit(world).numpy(), contraction.unit(torch.from_numpy(eyes[:, :3])).numpy()
+        given = (voxels, world.numpy(), units, eyes_of, views, contraction.near / contraction.half)
+        cameras, light = kernels("bricks.contracted").seeing_cameras(grid.optical, *given, looks, TRIES_AROUND)
+        report("seen", 1.0)
+        return SeenVoxels(voxels, world, cameras, light)
     in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / grid.spacing, eyes[:, 3:]], axis=1)
     asked = (voxels, world.numpy(), in_grid.astype(np.float32), views)
     cameras, light = kernels().seeing_cameras(grid.optical, *asked, looks, TRIES)
@@ -120,6 +128,7 @@ def _in_bricks(
         colored=colored,
         colors=np.ascontiguousarray(colors[:, there][:, order]),
         ranges=RANGES,
+        contraction=grid.contraction,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE
 
 LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
@@ -41,6 +42,8 @@ class BakedField:
     """Three channels for each spherical harmonic; the coloured values in their order."""
     ranges: tuple[float, float]
     """Half range of the coefficients of degree 1 and 2."""
+    contraction: Contraction | None = None
+    """Of a scene without bounds: lower and spacing are in its contracted cube."""
 
     @property
     def num_harmonics(self) -> int:

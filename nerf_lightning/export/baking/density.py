@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
+from nerf_lightning.export.baking.contraction import Contraction, is_place, num_values
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks
@@ -34,9 +35,23 @@ class DensityGrid:
     lower: Float[Tensor, "3"]
     spacing: float
     optical: Float[ndarray, "x y z"]
+    contraction: Contraction | None = None
+    """Of a scene without bounds, whose contracted cube is what the grid lies in."""
 
     def places(self, voxels: Int[ndarray, "voxels 3"]) -> Float[Tensor, "voxels 3"]:
         """Return where voxels lie, scene frame."""
+        places = self._in_grid(voxels)
+        return places if self.contraction is None else self.contraction.world(places)
+
+    def lengths(self, voxels: Int[ndarray, "voxels 3"]) -> Float[ndarray, "voxels"]:
+        """Return how long voxels are, scene units; 0 where the grid holds no place of the scene."""
+        if self.contraction is None:
+            return np.full(len(voxels), self.spacing, np.float32)
+        places = self._in_grid(voxels)
+        length = self.contraction.half * self.spacing * self.contraction.radius(places).square()
+        return (length * is_place(places)).numpy()
+
+    def _in_grid(self, voxels: Int[ndarray, "voxels 3"]) -> Float[Tensor, "voxels 3"]:
         return (self.lower + self.spacing * torch.from_numpy(voxels)).float()
 
 
@@ -46,9 +61,12 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
     Raises:
         InputError: there is nothing, or the grid does not fit into memory.
     """
-    box = _box_of_content(model, record, tile_points, report)
+    contraction = Contraction.of(record) if record.space == "contracted" else None
+    box = None if contraction is not None else _box_of_content(model, record, tile_points, report)
 
     def sides_of(count: int) -> tuple[float, tuple[int, int, int]]:
+        if box is None:
+            return 4.0 / num_values(count), (num_values(count),) * 3
         sides = (box[1] - box[0]).double()
         spacing = float(sides.max()) / count
         x, y, z = (SIDE * int(-(-float(side) // (SIDE * spacing)) or 1) for side in sides)
@@ -65,8 +83,9 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
         bytes_of,
         lambda count: f"what.resolution={count}",
     )
-    lower = box.double().mean(dim=0) - 0.5 * spacing * (torch.tensor(shape) - 1)
-    grid = DensityGrid(lower, spacing, np.zeros(shape, np.float32))
+    middle_to_lower = 0.5 * spacing * (torch.tensor(shape) - 1)
+    lower = torch.full((3,), -2.0) if box is None else box.double().mean(dim=0) - middle_to_lower
+    grid = DensityGrid(lower, spacing, np.zeros(shape, np.float32), contraction)
     _fill(model, grid, tile_points, report)
     if not (grid.optical > LEAST_OPTICAL).any():
         raise InputError(_nothing(record))
@@ -116,7 +135,8 @@ def _asked(
     device = next(model.parameters()).device
     optical = np.empty(len(voxels), np.float32)
     for part in tiles(len(voxels), tile_points):
-        optical[part] = grid.spacing * model.density(grid.places(voxels[part]).to(device)).cpu().numpy()
+        density = model.density(grid.places(voxels[part]).to(device)).cpu().numpy()
+        optical[part] = grid.lengths(voxels[part]) * density
         if report is not None:
             report(stage, part.stop / len(voxels))
     return optical

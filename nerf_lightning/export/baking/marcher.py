@@ -43,13 +43,17 @@ class Marcher:
         self.colors = np.stack(tiles, axis=-1)
 
     def render(self, rays: RayBundle) -> MarchedRays:
-        """Return what rays meet in the box."""
-        shape = rays.near.shape
-        lower, spacing = torch.tensor(self.baked.lower), self.baked.spacing
-        origins = ((rays.origins - lower) / spacing).float().reshape(-1, 3).contiguous()
+        """Return what rays meet in the box, or in all of space."""
+        shape, contraction = rays.near.shape, self.baked.contraction
+        module, unit, begin = "bricks.cpu", self.baked.spacing, tuple[float, ...]()
+        apart = rays.origins - torch.tensor(self.baked.lower)
+        if contraction is not None:
+            module, unit, begin = "bricks.contracted", contraction.half, (contraction.near / contraction.half,)
+            apart = rays.origins - torch.tensor(contraction.center)
+        origins = (apart / unit).float().reshape(-1, 3).contiguous()
         directions, looks = rays.directions.float().reshape(-1, 3), rays.view_directions.float().reshape(-1, 3)
         basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
-        found = kernels().march_tiles(
+        found = kernels(module).march_tiles(
             origins.numpy(),
             directions.contiguous().numpy(),
             basis.contiguous().numpy(),
@@ -58,9 +62,10 @@ class Marcher:
             self.colors,
             self.baked.scale,
             STEP,
+            *begin,
         )
         columns = torch.from_numpy(found)
-        depth = spacing * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
+        depth = unit * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
         mean: Float[ndarray, "columns"] = found[:, 5:].mean(axis=0)
         return MarchedRays(
             columns[:, :3].view(*shape, 3),

@@ -2,12 +2,14 @@
 
 import gzip
 import zlib
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.baked_field import EXPONENT_STEP, LEAST_EXPONENT, BakedField
+from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE
 
 LEVEL = 6
@@ -25,6 +27,7 @@ def described(baked: BakedField) -> dict[str, Any]:
         "harmonics": baked.num_harmonics,
         "exponents": [LEAST_EXPONENT, EXPONENT_STEP],
         "ranges": list(baked.ranges),
+        "contraction": None if baked.contraction is None else asdict(baked.contraction),
     }
 
 
@@ -63,6 +66,10 @@ def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
         x, y, z = about["lower"]
         nx, ny, nz = about["shape"]
         low, high = about["ranges"]
+        outside = about["contraction"]
+        if outside is not None:
+            cx, cy, cz = map(float, outside["center"])
+            outside = Contraction((cx, cy, cz), float(outside["half"]), float(outside["near"]))
         return BakedField(
             (x, y, z),
             about["spacing"],
@@ -72,6 +79,7 @@ def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
             np.unpackbits(bits, bitorder="little").astype(bool).reshape(bricks, SIDE, SIDE, SIDE),
             colors.reshape(channels, colored),
             (low, high),
+            outside,
         )
     except (OSError, EOFError, zlib.error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"The field in the page is damaged or cut off: {error}. Export it again.") from error

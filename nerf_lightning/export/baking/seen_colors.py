@@ -20,6 +20,8 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 # Of each voxel, so many cameras that see it are asked, and so many in all to find them.
 LOOKS, TRIES = {1: 4, 4: 10, 9: 12}, 48
+# Without bounds, where most voxels lie behind walls and all are asked in vain.
+TRIES_AROUND = 24
 # What holds back coefficients of degree 1 and 2, as a share of a voxel's light.
 RIDGE = 0.02
 # Half range of the bytes of coefficients, of degree 1 and of degree 2.

@@ -26,6 +26,10 @@ uniform int shown;
 #ifdef NDC
 uniform vec2 ndc;
 #endif
+#ifdef CONTRACTED
+uniform vec3 middle;
+uniform float half_side, nearest;
+#endif
 out vec4 pixel;
 
 float way_out(vec3 at, vec3 along) {
@@ -65,12 +69,73 @@ vec3 slope(vec3 start, vec3 within) {
   return found;
 }
 
-void main() {
-  vec2 plane = (vec2(gl_FragCoord.x, height - gl_FragCoord.y) - center) / focal;
-  vec3 look = normalize(turn * vec3(plane.x, -plane.y, -1.0));
-  vec3 origin = eye, along = look;
+float through = 1.0, depth = 0.0;
+vec3 color = vec3(0.0), normal = vec3(0.0);
+
+// What a step of a share of a voxel's length stops at a place of a brick, at a distance in the scene.
+void stop(int tile, vec3 within, float share, float away, vec3 look) {
+  vec3 start = 9.0 * vec3(tile % atlas.x, tile / atlas.x % atlas.y, tile / (atlas.x * atlas.y));
+  vec3 coordinate = (start + within.zyx + 0.5) / vec3(atlas * 9);
+  vec4 value = texture(base, coordinate);
+  float alpha = 1.0 - exp(-(exp2(exponents.x + exponents.y * 255.0 * value.w) - exp2(exponents.x)) * share);
+  if (alpha < LEAST_ALPHA) return;
+  float weight = through * alpha;
+  if (shown == 2) {
+    vec3 uphill = slope(start, within);
+    normal -= weight * uphill / max(length(uphill), 1e-6);
+  } else if (shown == 0) {
+    color += weight * harmonic_color(coordinate, value.xyz, look);
+  }
+  depth += weight * away;
+  through *= 1.0 - alpha;
+}
+
+#ifdef CONTRACTED
+// As kernels/bricks/contracted.py: rays are straight in each part of the contracted cube.
+float largest(vec3 each) { return max(each.x, max(each.y, each.z)); }
+
+float ahead(float way, float speed, float r, float v) {
+  float left = speed * r - way * v;
+  return left > 1e-9 ? way * r / left : -1.0;
+}
+
+void march(vec3 eye_place, vec3 look) {
+  float t = nearest / half_side, cell = 4.0 / (SIDE * float(shape.x));
+  vec3 origin = (eye_place - middle) / half_side;
+  for (int turns = 0; turns < 4096 && through > LEAST_TRANSMITTANCE; turns++) {
+    vec3 place = origin + t * look, along = look, size = abs(place);
+    float r = largest(size), v = 0.0;
+    if (r > 1e4) return;
+    if (r > 1.0) {
+      int axis = size.x == r ? 0 : size.y == r ? 1 : 2;
+      float f = 1.0 / r, outward = look[axis];
+      v = outward * place[axis] * f;
+      place *= f;
+      along = (look - place * v) * f;
+      place[axis] *= 2.0 - f;
+      along[axis] = outward * f * f;
+    } else r = 1.0;
+    float speed = length(along);
+    along /= speed;
+    vec3 at = (place + 2.0) / cell;
+    ivec3 brick = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
+    int tile = texelFetch(index, brick.zyx, 0).x;
+    float way = ahead(cell * (tile >= 0 ? step_length : max(way_out(at, along), 0.0) + 0.01), speed, r, v);
+    if (way < 0.0) return;
+    if (tile >= 0) {
+      at += 0.5 * step_length * along;
+      float shrunk = min(1.0, 2.0 - largest(abs(at * cell - 2.0)));
+      vec3 within = clamp(at - SIDE * vec3(brick), 0.0, SIDE);
+      stop(tile, within, way * shrunk * shrunk / cell, half_side * (t + 0.5 * way), look);
+    }
+    t += way;
+  }
+}
+#else
+void march(vec3 origin, vec3 look) {
+  vec3 along = look;
 #ifdef NDC
-  if (look.z > -1e-3) { pixel = vec4(behind, 1.0); return; }
+  if (look.z > -1e-3) return;
   origin += max(0.0, -(1.0 + eye.z) / look.z) * look;
   vec3 start_point = vec3(-ndc * origin.xy / origin.z, 1.0 + 2.0 / origin.z);
   along = normalize(vec3(-ndc * look.xy / look.z, 1.0) - start_point);
@@ -81,11 +146,10 @@ void main() {
   vec3 a = -origin / speed, b = (vec3(shape) * SIDE - origin) / speed;
   vec3 first = min(a, b), last = max(a, b);
   float enter = max(0.0, max(first.x, max(first.y, first.z))), leave = min(last.x, min(last.y, last.z));
-  float through = 1.0, depth = 0.0, number = 0.0, nothing = exp2(exponents.x);
-  vec3 color = vec3(0.0), normal = vec3(0.0), size = vec3(atlas * 9);
+  float number = 0.0;
   for (int turns = 0; turns < 8192 && through > LEAST_TRANSMITTANCE; turns++) {
     float t = enter + (number + 0.5) * step_length;
-    if (t >= leave) break;
+    if (t >= leave) return;
     vec3 at = origin + t * along;
     ivec3 brick = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
     int tile = texelFetch(index, brick.zyx, 0).x;
@@ -95,22 +159,15 @@ void main() {
       continue;
     }
     number += 1.0;
-    vec3 start = 9.0 * vec3(tile % atlas.x, tile / atlas.x % atlas.y, tile / (atlas.x * atlas.y));
-    vec3 within = clamp(at - SIDE * vec3(brick), 0.0, SIDE);
-    vec3 coordinate = (start + within.zyx + 0.5) / size;
-    vec4 value = texture(base, coordinate);
-    float alpha = 1.0 - exp(-(exp2(exponents.x + exponents.y * 255.0 * value.w) - nothing) * step_length);
-    if (alpha < LEAST_ALPHA) continue;
-    float weight = through * alpha;
-    if (shown == 2) {
-      vec3 uphill = slope(start, within);
-      normal -= weight * uphill / max(length(uphill), 1e-6);
-    } else if (shown == 0) {
-      color += weight * harmonic_color(coordinate, value.xyz, look);
-    }
-    depth += weight * t * spacing;
-    through *= 1.0 - alpha;
+    stop(tile, clamp(at - SIDE * vec3(brick), 0.0, SIDE), step_length, t * spacing, look);
   }
+}
+#endif
+
+void main() {
+  vec2 plane = (vec2(gl_FragCoord.x, height - gl_FragCoord.y) - center) / focal;
+  vec3 look = normalize(turn * vec3(plane.x, -plane.y, -1.0));
+  march(eye, look);
   float opacity = 1.0 - through;
   if (shown == 1) {
     float near = 1.0 - clamp((depth / max(opacity, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0);

@@ -139,7 +139,7 @@ class Picture {
 
   linked() {
     const gl = this.gl, program = gl.createProgram();
-    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}`;
+    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}${this.about.contraction ? "#define CONTRACTED\n" : ""}`;
     const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
     for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, head + byId("shader").textContent]]) {
       const shader = gl.createShader(kind);
@@ -194,6 +194,11 @@ class Picture {
     gl.uniform2fv(this.at("exponents"), about.exponents);
     gl.uniform2fv(this.at("ranges"), about.ranges);
     if (about.ndc) gl.uniform2fv(this.at("ndc"), about.ndc);
+    if (about.contraction) {
+      gl.uniform3fv(this.at("middle"), about.contraction.center);
+      gl.uniform1f(this.at("half_side"), about.contraction.half);
+      gl.uniform1f(this.at("nearest"), about.contraction.near);
+    }
   }
 
   // The lens fits into the window, its middle in the window's; `share` of the window's pixels along each side.
@@ -224,6 +229,7 @@ const plus = (a, b, by = 1) => a.map((x, i) => x + by * b[i]);
 const minus = (a, b) => plus(a, b, -1);
 const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
 const length = (a) => Math.sqrt(dot(a, a));
+const unit = (a) => a.map((x) => x / Math.max(1e-12, length(a)));
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
 function turned(vector, axis, angle) {
@@ -267,6 +273,12 @@ class View {
     this.photograph = null;
   }
 
+  // A camera in the middle of whose picture lies what it looks at.
+  look(eye, target, up, lens) {
+    const back = unit(minus(eye, target)), right = unit(cross(up, back));
+    Object.assign(this, { eye, target, lens, axes: [right, cross(back, right), back], photograph: null });
+  }
+
   pan(right, up) {
     const unit = length(minus(this.eye, this.target));
     this.move(-right * unit, -up * unit, 0);
@@ -286,10 +298,13 @@ const PAUSE = 180, SLOW = 45, FAST = 22, COARSEST = 0.15;
 class Frames {
   constructor(picture, view) {
     Object.assign(this, { picture, view, share: 0.6, movedAt: -Infinity, before: 0, waits: false, keys: new Set() });
+    this.player = new Player(this);
     this.step = this.step.bind(this);
   }
 
+  // Whoever takes the camera stops the one that goes along the path.
   moved() {
+    this.player.pause();
     this.movedAt = performance.now();
     this.ask();
   }
@@ -305,8 +320,9 @@ class Frames {
     const elapsed = now - this.before;
     this.before = now;
     if (this.keys.size && elapsed < 500) fly(this, elapsed / 1000);
+    if (this.player.playing) this.player.advance();
     place(this.view);
-    if (this.keys.size || performance.now() - this.movedAt < PAUSE) {
+    if (this.keys.size || this.player.playing || performance.now() - this.movedAt < PAUSE) {
       if (elapsed > SLOW && elapsed < 1000) this.share = Math.max(COARSEST, 0.85 * this.share);
       if (elapsed < FAST) this.share = Math.min(1, 1.05 * this.share);
       this.picture.draw(this.view, this.share);
@@ -388,11 +404,12 @@ function listenToKeys(frames) {
   const once = {
     1: () => show(frames, 0), 2: () => show(frames, 1), 3: () => show(frames, 2),
     b: () => byId("background").click(), h: () => document.body.classList.toggle("bare"), home: () => jump(frames, frames.view.about.first),
-    i: () => byId("numbers").showModal(), "[": () => next(frames, -1), "]": () => next(frames, 1),
+    i: () => byId("numbers").showModal(), " ": () => frames.player.toggle(), k: () => frames.player.add(), "[": () => next(frames, -1), "]": () => next(frames, 1),
   };
   addEventListener("keydown", (event) => {
     const key = event.key.toLowerCase();
     if (event.ctrlKey || event.metaKey || event.altKey || byId("numbers").open || event.target.matches("input, select")) return;
+    if (key === " " && event.target.matches("button")) return;  // it is pressed by that
     if (held(key)) {
       event.preventDefault();
       frames.keys.add(key);
@@ -410,6 +427,7 @@ function show(frames, what) {
 }
 
 function jump(frames, number) {
+  frames.player.pause();
   frames.view.jump(number);
   frames.ask();
 }
@@ -448,6 +466,7 @@ async function start() {
     listenToPointers(picture.canvas, frames);
     listenToKeys(frames);
     listenToControls(frames);
+    frames.player.listen();
     document.body.classList.add("running");
     frames.ask();
   } catch (error) {

@@ -7,7 +7,8 @@ from nerf_lightning.nerf.kernels.backends import twin
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 
 CPU_TWINS = (
-    *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "fusion.cpu", "texels.cpu"),
+    *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "bricks.contracted"),
+    *("fusion.cpu", "texels.cpu"),
     *(["mlp.bfloat16"] if cpu_multiplies_bfloat16() else []),
 )
 

@@ -63,6 +63,11 @@ class KeyframePath(CameraPath):
         scale = cameras.width[0] / around.width
         return replace(cameras, focal=(scale * curve.focal(at)[:, None]).expand(-1, 2).to(cameras.focal).contiguous())
 
+    @property
+    def seconds(self) -> float:
+        """How long it takes from the first camera to the last, or back to the first."""
+        return (self._count() - (not self.closed)) / self.fps
+
     def _count(self) -> int:
         if self.asked_frames is not None:
             return self.asked_frames

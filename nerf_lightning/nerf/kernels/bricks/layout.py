@@ -15,15 +15,15 @@ TILE = SIDE + 1
 """And with the border that the next bricks lend, so that every place of a brick lies between values of its tile."""
 
 
-def kernels() -> ModuleType:
-    """Return the compiled kernels; without them, a page would take hours.
+def kernels(module: str = "bricks.cpu") -> ModuleType:
+    """Return the compiled kernels, of scenes in a box or `bricks.contracted`; without them, a page would take hours.
 
     Raises:
         InputError: they cannot be compiled here.
     """
-    found = twin("bricks.cpu")
+    found = twin(module)
     if found is None:
-        raise InputError(f"Baking needs numba, which cannot be used here: {why_not('bricks.cpu')}. Reinstall numba.")
+        raise InputError(f"Baking needs numba, which cannot be used here: {why_not(module)}. Reinstall numba.")
     return found
 
 

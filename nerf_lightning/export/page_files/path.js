@@ -1,0 +1,127 @@
+// ---- A camera path: keyframes as nerf render path=keyframes reads them, in the capture's own frame ---------------
+
+const LEG = 2;  // seconds from a keyframe that is added to the one before
+const POINTS = ["position", "look_at", "up"];
+
+// The curve through values at increasing times that nerf render takes: cubic, Catmull and Rom's tangents.
+function hermite(times, values, at) {
+  const leg = Math.max(0, Math.min(times.length - 2, times.findLastIndex((time) => time <= at)));
+  const long = (i) => times[i + 1] - times[i], slope = (i) => minus(values[i + 1], values[i]).map((x) => x / long(i));
+  const tangent = (i) => {
+    if (i === 0 || i === times.length - 1) return slope(Math.min(i, times.length - 2));
+    const [a, b] = [long(i - 1), long(i)];
+    return plus(slope(i).map((x) => x * a), slope(i - 1), b).map((x) => x / (a + b));
+  };
+  const h = long(leg), s = (at - times[leg]) / h, terms = [
+    [(1 + 2 * s) * (1 - s) ** 2, values[leg]], [s * (1 - s) ** 2 * h, tangent(leg)],
+    [s * s * (3 - 2 * s), values[leg + 1]], [s * s * (s - 1) * h, tangent(leg + 1)],
+  ];
+  return terms.reduce((sum, [share, value]) => plus(sum, value, share), values[0].map(() => 0));
+}
+
+class CameraPath {
+  constructor(about) {
+    Object.assign(this, { given: about.path, own: [], film: about.film });
+    const rows = about.to_user.slice(0, 3).map((row) => row.slice(0, 3));
+    this.offset = about.to_user.slice(0, 3).map((row) => row[3]);
+    this.scale = length(rows[0]);
+    this.rows = rows.map(unit);
+    this.columns = [0, 1, 2].map((i) => this.rows.map((row) => row[i]));
+  }
+
+  // What somebody recorded here, else what came with the page.
+  get keyframes() { return this.own.length ? this.own : this.given; }
+  get seconds() { return this.keyframes.length > 1 ? this.keyframes.at(-1).time : 0; }
+
+  toUser(point) { return this.rows.map((row, i) => this.scale * dot(row, point) + this.offset[i]); }
+  fromUser(point) { return this.columns.map((column) => dot(column, minus(point, this.offset)) / this.scale); }
+
+  add(view) {
+    const [width, height] = this.film;
+    const tangent = 0.5 * view.lens.height / view.lens.focal[1] * width / height;
+    this.own.push({
+      position: this.toUser(view.eye), look_at: this.toUser(view.target), up: this.rows.map((row) => dot(row, view.axes[1])),
+      fov: 2 * Math.atan(tangent) * 180 / Math.PI, time: LEG * this.own.length,
+    });
+  }
+
+  show(view, seconds) {
+    const keys = this.keyframes, times = keys.map((key) => key.time);
+    const along = (value) => hermite(times, keys.map(value), seconds);
+    const [eye, target, up] = POINTS.map((name) => along((key) => key[name]));
+    const focal = Math.exp(along((key) => [-Math.log(Math.tan(key.fov * Math.PI / 360))])[0]) * this.film[0] / 2;
+    const lens = { focal: [focal, focal], center: this.film.map((side) => side / 2), width: this.film[0], height: this.film[1] };
+    view.look(this.fromUser(eye), this.fromUser(target), this.columns.map((column) => dot(column, up)), lens);
+  }
+
+  yaml() {
+    const number = (x) => x.toFixed(9);
+    const lines = (key) => [...POINTS.map((name) => `${name}: [${key[name].map(number).join(", ")}]`), `fov: ${number(key.fov)}`, `time: ${number(key.time)}`];
+    return `keyframes:\n${this.keyframes.map((key) => `- ${lines(key).join("\n  ")}\n`).join("")}`;
+  }
+}
+
+class Player {
+  constructor(frames) {
+    Object.assign(this, { frames, path: new CameraPath(frames.view.about), playing: false, seconds: 0 });
+  }
+
+  listen() {
+    const on = (id, name, what) => byId(id).addEventListener(name, what);
+    byId("path").addEventListener("submit", (event) => event.preventDefault());
+    on("play", "click", () => this.toggle());
+    on("time", "input", () => { this.pause(); this.to(Number(byId("time").value)); });
+    on("add", "click", () => this.add());
+    on("remove", "click", () => { this.path.own.pop(); this.changed(); });
+    on("save", "click", () => save("camera_path.yaml", this.path.yaml()));
+    this.changed();
+  }
+
+  add() {
+    this.pause();
+    this.path.add(this.frames.view);
+    this.changed();
+  }
+
+  // The time line after the keyframes have changed.
+  changed() {
+    const { own, seconds } = this.path, time = byId("time");
+    if (!seconds) this.pause();
+    time.max = String(seconds || 1);
+    this.seconds = own.length ? seconds : 0;
+    time.value = String(this.seconds);
+    for (const id of ["play", "time", "save"]) byId(id).disabled = !seconds;
+    byId("remove").disabled = !own.length;
+    const count = own.length ? `${own.length} keyframe${own.length > 1 ? "s" : ""}, ` : "";
+    byId("length").value = own.length || seconds ? `${count}${seconds.toFixed(1)} s` : "no camera path yet";
+  }
+
+  toggle() {
+    this.playing = !this.playing && this.path.seconds > 0;
+    this.began = performance.now() / 1000 - this.seconds;
+    byId("play").textContent = this.playing ? "pause" : "play";
+    this.frames.ask();
+  }
+
+  pause() { if (this.playing) this.toggle(); }
+
+  // Round and round, however long a frame takes.
+  advance() {
+    this.to((performance.now() / 1000 - this.began) % this.path.seconds);
+    byId("time").value = String(this.seconds);
+  }
+
+  to(seconds) {
+    this.seconds = seconds;
+    this.path.show(this.frames.view, seconds);
+    this.frames.ask();
+  }
+}
+
+function save(name, text) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([text], { type: "text/yaml" }));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}

@@ -1,0 +1,85 @@
+"""Any camera path as keyframes: for a player that knows no other kind, and for a person to change by hand."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.cameras import focal_from_fov
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
+from nerf_lightning.video.paths.base import CameraPath, PathFrame
+from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframes import Keyframe, Point
+
+MOST = 24
+"""Keyframes that stand for a path which has none of its own: on a circle, the curve through them is one to 1e-4."""
+NEAREST_TARGET = 0.1
+"""What a camera looks at is ahead of it by this share of the scene's radius at least."""
+# A path whose last camera is so near its first one, in steps of its first frame, goes on in a circle.
+CLOSED = 1.5
+
+
+def as_keyframes(path: CameraPath, around: PathFrame) -> list[Keyframe]:
+    """Return keyframes, each with all that a camera needs, through which a curve follows a path; of one camera, none.
+
+    Raises:
+        InputError: the path cannot be laid around this capture.
+    """
+    if isinstance(path, KeyframePath):
+        return _of_file(path, around) if path.times or path.seconds else []
+    cameras = path.cameras(around)
+    count = len(cameras.c2w)
+    chosen = torch.linspace(0, count - 1, min(MOST, count)).round().long()
+    times = chosen.double() / path.fps
+    if _closes(cameras.c2w):
+        chosen, times = torch.cat([chosen, chosen[:1]]), torch.cat([times, times.new_tensor([count / path.fps])])
+    focal = cameras.focal[chosen, 0] * around.width / cameras.width[chosen]
+    return _keyframes(cameras.c2w[chosen].double(), focal, times, [None] * len(chosen), around)
+
+
+def _of_file(path: KeyframePath, around: PathFrame) -> list[Keyframe]:
+    """Return the keyframes that it has."""
+    curve = KeyframeCurve(path.keyframes, around, path.times, path.closed)
+    times = curve.knots if path.times else curve.knots * path.seconds
+    focal = curve.focal(curve.knots)
+    if path.fov is not None:
+        focal = torch.full_like(focal, focal_from_fov(around.width, math.radians(path.fov)))
+    targets = [each.look_at for each in path.keyframes]
+    given = [*targets, *targets[: len(times) - len(targets)]]  # a closed curve passes the first one twice
+    return _keyframes(curve.poses(curve.knots), focal, times, given, around)
+
+
+def _closes(c2w: Float[Tensor, "frames 3 4"]) -> bool:
+    if len(c2w) < 3:
+        return False
+    apart = (c2w - c2w.roll(1, dims=0)).flatten(1).norm(dim=1)
+    return bool(0 < apart[0] < CLOSED * apart[1])
+
+
+def _keyframes(
+    c2w: Float[Tensor, "keys 3 4"],
+    focal: Float[Tensor, "keys"],
+    times: Float[Tensor, "keys"],
+    targets: Sequence[Point | None],
+    around: PathFrame,
+) -> list[Keyframe]:
+    if len(c2w) < 2:
+        return []
+    to_user, eyes = around.to_user.double(), c2w[:, :, 3]
+    away = ((eyes - around.center.double()) * c2w[:, :, 2]).sum(dim=1).clamp(min=NEAREST_TARGET * around.radius)
+    ahead = points_to_user(eyes - away[:, None] * c2w[:, :, 2], to_user)
+    eyes, ups = points_to_user(eyes, to_user), directions_to_user(c2w[:, :, 1], to_user)
+    fovs = torch.rad2deg(2 * torch.atan(0.5 * around.width / focal.double()))
+    rows = zip(eyes.tolist(), targets, ahead.tolist(), ups.tolist(), fovs.tolist(), times.tolist(), strict=True)
+    return [
+        Keyframe(_point(eye), look_at=target or _point(far), up=_point(up), fov=fov, time=time)
+        for eye, target, far, up, fov, time in rows
+    ]
+
+
+def _point(values: Sequence[float]) -> Point:
+    x, y, z = values
+    return x, y, z

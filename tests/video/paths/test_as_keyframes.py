@@ -1,0 +1,71 @@
+"""Any path as keyframes: the curve through them is the path."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_chosen_paths import frame, keyframe_file, keys
+
+from nerf_lightning.nerf.geometry.frames import similarity
+from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.video.paths.as_keyframes import MOST, as_keyframes
+from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.video.paths.keyframes import Keyframe
+from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.pan import Pan
+from nerf_lightning.video.paths.spiral import Spiral
+
+
+def elsewhere():
+    """Like `frame`, in a capture of other units and axes."""
+    turn = rotation_from_quaternion(torch.tensor([[0.8, 0.0, 0.6, 0.0]], dtype=torch.float64))[0]
+    return replace(frame(), to_user=similarity(turn, torch.tensor([5.0, -3.0, 2.0], dtype=torch.float64), 3.0))
+
+
+@pytest.mark.parametrize("path", [Orbit(120, fps=12), Spiral(90, fps=10), Pan(40, view=1)])
+def test_the_curve_through_the_keyframes_of_a_path_is_the_path(path):
+    around = elsewhere()
+    found = as_keyframes(path, around)
+    assert MOST <= len(found) <= MOST + 1
+    times = [each.time for each in found]
+    at = torch.arange(path.num_frames, dtype=torch.float64) / path.fps
+    curve, wanted = KeyframeCurve(found, around, times), path.cameras(around)
+    reach = wanted.c2w[:, :, 3].std(dim=0).norm() + 0.1
+    assert (curve.poses(at)[:, :, 3] - wanted.c2w[:, :, 3]).norm(dim=1).max() < 0.01 * reach
+    torch.testing.assert_close(curve.poses(at)[:, :, :3], wanted.c2w[:, :, :3].double(), atol=0.01, rtol=0)
+    torch.testing.assert_close(curve.focal(at), wanted.focal[:, 0].float())
+
+
+def test_a_circle_ends_where_it_began():
+    found = as_keyframes(Orbit(60, fps=12), frame())
+    assert found[0].position == found[-1].position
+    assert found[-1].time == pytest.approx(5.0)
+    assert as_keyframes(Pan(60, view=1), frame())[-1].time == pytest.approx(59 / 30)
+
+
+def test_keyframes_of_a_file_stay_as_they_are(tmp_path):
+    timed = [
+        Keyframe((5.0, 2.0, 4.0), look_at=(1.0, 2.0, 3.0), up=(0.0, 0.0, 1.0), fov=50.0, time=2.0),
+        Keyframe((1.0, 7.0, 5.0), look_at=(1.0, 2.5, 3.0), up=(0.0, 0.0, 1.0), fov=40.0, time=3.5),
+    ]
+    found = as_keyframes(KeyframePath(keyframe_file(tmp_path, *timed)), elsewhere())
+    assert [each.time for each in found] == [0.0, 1.5]
+    for given, each in zip(timed, found, strict=True):
+        assert each.position == pytest.approx(given.position)
+        assert each.look_at == given.look_at
+        assert each.fov == pytest.approx(given.fov, abs=1e-4)
+
+
+def test_a_file_may_leave_out_what_a_player_needs(tmp_path):
+    path = KeyframePath(keys(tmp_path), closed=True)
+    found = as_keyframes(path, frame())
+    assert [each.look_at is not None and each.up is not None and each.fov is not None for each in found] == [True] * 4
+    assert found[0].position == pytest.approx(found[-1].position)
+    assert found[-1].time == pytest.approx(4.0)  # 120 frames of 30 a second
+    assert as_keyframes(KeyframePath(keys(tmp_path), fov=33.0), frame())[1].fov == pytest.approx(33.0, abs=1e-4)
+
+
+def test_one_camera_makes_no_path(tmp_path):
+    assert as_keyframes(Orbit(1), frame()) == []
+    assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
