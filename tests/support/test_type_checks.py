@@ -139,3 +139,15 @@ def test_values_that_decide_are_looked_at_each_time():
     named(torch.ones(3), "up")
     with pytest.raises(TypeCheckError, match="way"):
         named(torch.ones(3), "left")
+
+
+def test_what_has_a_shape_need_not_be_an_array():
+    class Grid:
+        shape = (2, 3)
+
+    @decorated
+    def rows(grid: Grid, values: Float[Tensor, " n"]) -> Grid:
+        return grid
+
+    for _ in range(2):
+        assert rows(Grid(), torch.ones(3)).shape == (2, 3)

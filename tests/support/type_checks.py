@@ -140,8 +140,8 @@ def _shapes(value: Any) -> Any:
     kind = type(value)
     if kind is tuple:
         return (kind, *map(_shapes, value))
-    shape = getattr(value, "shape", None)
-    return kind if shape is None else (kind, value.dtype, shape)
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    return kind if shape is None or dtype is None else (kind, dtype, shape)
 
 
 def _follows_from_shapes(hint: Any) -> bool:
