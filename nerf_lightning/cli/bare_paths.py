@@ -1,4 +1,4 @@
-"""Paths that stand alone on the command line, turned into overrides."""
+"""Paths on the command line: those that stand alone become overrides, those with a `=` in them are quoted."""
 
 from pathlib import Path
 
@@ -26,3 +26,18 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
 
 def _is_path(word: str) -> bool:
     return "=" not in word or Path(word).exists()
+
+
+def quoted_paths(arguments: list[str]) -> list[str]:
+    """Return the arguments, the values quoted that are paths with a `=` in them, which Hydra would not read.
+
+    The folders of a sweep's jobs have one: `ckpt=outputs/sweeps/SWEEP/0_seed=0`.
+    """
+    return [_with_quotes(word) if word.count("=") > 1 and not word.startswith("-") else word for word in arguments]
+
+
+def _with_quotes(word: str) -> str:
+    from nerf_lightning.config.overrides import quoted
+
+    key, _, value = word.partition("=")
+    return f"{key}={quoted(value)}" if "=" in value and Path(value).exists() else word

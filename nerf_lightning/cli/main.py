@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.cli.broken_pipe import ends_quietly
 from nerf_lightning.cli.loading import announce_start, quick_imports
+from nerf_lightning.cli.bare_paths import quoted_paths
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.errors import InputError
@@ -139,7 +140,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
         allow_as_typed(arguments)
-        sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
+        sys.argv = [f"nerf {command}", *options_first(quoted_paths(prepared(command, sweep_arguments(arguments))))]
         compose_once()
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
