@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
+from nerf_lightning.cli.bare_paths import quoted_paths
 from nerf_lightning.cli.broken_pipe import ends_quietly
 from nerf_lightning.cli.loading import announce_start, quick_imports
-from nerf_lightning.cli.bare_paths import quoted_paths
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.errors import InputError
