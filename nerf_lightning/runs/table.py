@@ -248,7 +248,8 @@ def _row(group: Group, shown: list[str], curve: Curve) -> Row:
             row["curve"] = curve or None
     row |= {column: _spread(group, key)[0] for key, column in PLAIN.items()}
     row["steps"] = None if row["steps"] is None else round(row["steps"])
-    return row | {"time": None, "source": None}
+    others = f" and {len(group) - 1} more" if len(group) > 1 else ""
+    return row | {"time": None, "folder": f"{first.folder}{others}", "source": None}
 
 
 def _values_of(folder: Path, keys: Sequence[str]) -> dict[str, str]:
