@@ -39,7 +39,7 @@ class CamerasExport(Export):
     Args:
         images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
         format: `transforms` writes `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the
-            pictures of the training; `nerfstudio` `camera_path.json`, a film from photograph to photograph for `ns-render
+            pictures of the training; `nerfstudio` `camera_path.json`, a film of the photographs for `ns-render
             camera-path`; `blender` `cameras_blender.py`, which makes the same film's keyframes when Blender runs it.
         fps: photographs per second of such a film.
 
