@@ -17,6 +17,7 @@ from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.ranks import processes_here
 from nerf_lightning.video.encoding import CODECS, require_encoder
+from nerf_lightning.video.exr import Channels, exr_channels, require_openexr
 from nerf_lightning.video.frames import FilmFrames, Range
 from nerf_lightning.video.panels import FILMS, film_pictures, panel
 from nerf_lightning.video.paths.base import CameraPath
@@ -98,6 +99,8 @@ def film_steps(
     )
     require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
+    if settings.form == "exr":
+        films = ["exr"]  # all in one file
     frames = FilmFrames(
         folder, films, len(shots[0].cameras.c2w), settings.form, shows_encoding, [FILMS["rgb"]] * settings.alpha
     )
@@ -107,8 +110,11 @@ def film_steps(
         mine = ranks.every_other(missing)
         yield 0, len(mine)
         for done, number in enumerate(mine, start=1):
-            for name, picture in _frame(shots, settings, number, seen).items():
-                frames.save(name, number, picture)
+            if settings.form == "exr":
+                frames.save("exr", number, _channels(shots[0], settings, number))
+            else:
+                for name, picture in _frame(shots, settings, number, seen).items():
+                    frames.save(name, number, picture)
             yield done, len(mine)
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
@@ -116,6 +122,12 @@ def film_steps(
     finally:
         frames.close()
     return frames.results()
+
+
+def _channels(shot: Shot, settings: FilmSettings, number: int) -> Channels:
+    picture = shot.picture(number)
+    depth = shot.z_depth(number, picture) if "depth" in settings.outputs else None
+    return exr_channels(picture, depth, "rgb" in settings.outputs, settings.alpha)
 
 
 def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ _"]]:
@@ -133,8 +145,12 @@ def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) 
 def _check(subjects: list[Subject], settings: FilmSettings) -> None:
     if ENDINGS[settings.form] in CODECS:
         require_encoder(ENDINGS[settings.form])
-    if settings.alpha and len(subjects) > 1:
-        raise InputError("alpha=true: checkpoints side by side stand on white paper. Render them one by one.")
+    if settings.form == "exr":
+        require_openexr()
+    if (settings.alpha or settings.form == "exr") and len(subjects) > 1:
+        raise InputError(
+            "alpha=true and format=exr: checkpoints side by side stand on white paper. Render them one by one."
+        )
     for subject in subjects:
         name = f" ({subject.label})" if len(subjects) > 1 else ""
         if "levels" in settings.outputs and subject.model.first_picture is None:
@@ -177,7 +193,7 @@ def bytes_per_pixel(settings: FilmSettings, scenes: Sequence[SceneRecord]) -> in
     """Return what a frame takes for each pixel of a panel; models are rendered one after the other."""
     bent = any(scene.cameras.ndc is not None for scene in scenes)
     twice = settings.hold_camera or settings.crop is not None or settings.near is not None
-    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs else PLAIN
+    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs or settings.form == "exr" else PLAIN
     return picture + PANEL * len(settings.outputs) * len(scenes)
 
 

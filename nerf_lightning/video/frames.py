@@ -23,6 +23,7 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.video.animation import write_animation
 from nerf_lightning.video.encoding import write_video
+from nerf_lightning.video.exr import Channels, save_exr
 from nerf_lightning.video.settings import ENDINGS, Form
 from nerf_lightning.visualization.pictures import save_png
 
@@ -39,7 +40,8 @@ class FilmFrames:
         folder: where the films go.
         films: their names.
         count: how many frames each has.
-        form: `frames` are the result; the others keep frames in a hidden folder until one file is made of them.
+        form: `frames` and `exr` are the result; the others keep frames in a hidden folder until one file is made of
+            them.
         shows_encoding: show in the terminal how far `finish` is.
         transparent: those of the films whose frames have alpha.
     """
@@ -56,7 +58,8 @@ class FilmFrames:
         self.shows_encoding, self.transparent = shows_encoding, transparent
         self.folder, self.films, self.count, self.form = folder, films, count, form
         self.hidden = folder / ".frames"
-        self.root = folder if form == "frames" else self.hidden
+        self.root = self.hidden if ENDINGS[form] else folder
+        self.suffix = ".exr" if form == "exr" else ".png"
         self.lock = FileLock(self.hidden / LOCK)
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
@@ -82,15 +85,19 @@ class FilmFrames:
         near, far = note["depth_range"]
         return missing, (near, far)
 
-    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width channels"]) -> None:
-        """Keep one frame.
+    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width channels"] | Channels) -> None:
+        """Keep one frame: a picture, or of an EXR its channels.
 
         Raises:
             InputError: the disk is full, or cannot be written.
         """
         try:
             with self._kept():
-                save_png(self._file(film, number), picture)
+                file = self._file(film, number)
+                if isinstance(picture, Tensor):
+                    save_png(file, picture)
+                else:
+                    save_exr(file, picture)
         except InputError as error:
             raise InputError(f"{error} {self._cure()}") from error
 
@@ -100,7 +107,7 @@ class FilmFrames:
         Raises:
             InputError: ffmpeg fails, or the disk is full; the frames stay.
         """
-        if self.form != "frames":
+        if ENDINGS[self.form]:
             write = write_animation if self.form == "animation" else write_video
             for film, file in zip(self.films, self.results(), strict=True):
                 try:
@@ -110,7 +117,7 @@ class FilmFrames:
                     raise InputError(f"{error} {self._cure()}") from error
             self._remove()
         self.close()
-        if self.form != "frames":
+        if ENDINGS[self.form]:
             with suppress(OSError):  # another process has come
                 self.hidden.rmdir()
 
@@ -123,7 +130,7 @@ class FilmFrames:
         return [self.folder / f"{film}{ENDINGS[self.form]}" for film in self.films]
 
     def _file(self, film: str, number: int) -> Path:
-        return self.root / film / f"frame_{number:04d}.png"
+        return self.root / film / f"frame_{number:04d}{self.suffix}"
 
     def _is_there(self, number: int) -> bool:
         files = [self._file(film, number) for film in self.films]
@@ -163,9 +170,9 @@ class FilmFrames:
         for folder in self.hidden.iterdir():
             if folder.is_dir():
                 shutil.rmtree(folder)
-        if self.form == "frames":
+        if not ENDINGS[self.form]:
             for film in self.films:
-                for file in (self.folder / film).glob("frame_*.png"):
+                for file in (self.folder / film).glob(f"frame_*{self.suffix}"):
                     file.unlink()
 
     @contextmanager

@@ -9,10 +9,18 @@ from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
-Form = Literal["video", "webm", "prores", "animation", "frames"]
-ENDINGS: dict[Form, str] = {"video": ".mp4", "webm": ".webm", "prores": ".mov", "animation": ".webp", "frames": ""}
+Form = Literal["video", "webm", "prores", "animation", "frames", "exr"]
+ENDINGS: dict[Form, str] = {
+    "video": ".mp4",
+    "webm": ".webm",
+    "prores": ".mov",
+    "animation": ".webp",
+    "frames": "",
+    "exr": "",
+}
 Projection = Literal["perspective", "equirectangular"]
 Corner = tuple[float, float, float]
+EXR_OUTPUTS = ("rgb", "depth")
 SWITCHES = ("mosaic", "hold_camera", "alpha")
 
 
@@ -54,7 +62,12 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
     if config["format"] not in get_args(Form):
         raise InputError(
             f"format={config['format']}: choose video (mp4), webm (VP9), prores (ProRes 4444 in mov), animation (WebP, "
-            "which pages play by themselves) or frames (PNG files)."
+            "which pages play by themselves), frames (PNG files) or exr (OpenEXR files)."
+        )
+    if config["format"] == "exr" and (config["mosaic"] or not set(outputs) <= set(EXR_OUTPUTS)):
+        raise InputError(
+            f"format=exr holds {' and '.join(EXR_OUTPUTS)} as numbers. Leave mosaic and other outputs out, or give "
+            "format=frames."
         )
     if config["alpha"]:
         _check_alpha(config, outputs)
@@ -74,7 +87,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
 def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
     refusals = {
         "format=video makes mp4, which has no alpha. Give format=webm (for browsers), format=prores (for editing), "
-        "format=animation or format=frames": config["format"] == "video",
+        "format=animation, format=frames or format=exr": config["format"] == "video",
         f"background={config['background']} would lie behind the scene. Leave one of the two out": (
             config["background"] is not None
         ),
