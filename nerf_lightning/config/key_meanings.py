@@ -165,7 +165,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
     (
         OF_OTHER_COMMANDS,
         """
-        ckpt trust what.** labels outputs mosaic format background crop near hold_camera projection
+        ckpt trust what.** labels outputs mosaic format alpha background crop near hold_camera projection
         host port open_browser photographs max_height
         run measured max_megabytes runs scenes models sort published force curves out
         rounds steps warmup_steps target_psnr kernels render_rays

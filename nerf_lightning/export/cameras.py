@@ -1,15 +1,17 @@
-"""The cameras, in the user's frame, as other programs read them: `transforms.json`, and a COLMAP model in text."""
+"""The cameras, in the user's frame, as other programs read them: `transforms.json`, a COLMAP model, an animation."""
 
 import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_colmap
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
+from nerf_lightning.export.base import Export, require_no_folders
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import poses_from_user
@@ -17,6 +19,8 @@ from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import Cameras, LensModel, SceneRecord
 
+CamerasFormat = Literal["transforms", "nerfstudio", "blender"]
+ANIMATIONS = {"nerfstudio": "camera_path.json", "blender": "cameras_blender.py"}
 CAMERA_MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
     "radial_tangential": "OPENCV",
@@ -30,18 +34,29 @@ log = logging.getLogger(__name__)
 
 
 class CamerasExport(Export):
-    """Write `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the pictures of the training.
+    """Write where the photographs were taken, and through what lens.
 
     Args:
         images: folder of the photographs beside the json, put before each name there; None: the names as recorded.
+        format: `transforms` writes `transforms.json` (nerfstudio's) and `sparse/0` (COLMAP's, as text), for the
+            pictures of the training; `nerfstudio` `camera_path.json`, a film of the photographs for `ns-render
+            camera-path`; `blender` `cameras_blender.py`, which makes the same film's keyframes when Blender runs it.
+        fps: photographs per second of such a film.
+
+    Raises:
+        InputError: fewer than one photograph per second.
     """
 
-    def __init__(self, images: str | None = None):
-        self.images = images
+    def __init__(self, images: str | None = None, format: CamerasFormat = "transforms", fps: int = 24):
+        if fps < 1:
+            raise InputError(f"what.fps={fps}: give 1 or more photographs per second.")
+        self.images, self.format, self.fps = images, format, fps
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the files."""
         cameras = in_user_frame(record)
+        if self.format != "transforms":
+            return [self._animation(cameras, record.view_names, folder / ANIMATIONS[self.format])]
         transforms = folder / "transforms.json"
         write_json(transforms, self._transforms(record, cameras))
         reason = beyond_colmap(cameras)
@@ -53,6 +68,20 @@ class CamerasExport(Export):
             with whole_file(sparse / name) as part:
                 part.write_text(text, encoding="utf-8")
         return [transforms, sparse]
+
+    def _animation(self, cameras: Cameras, names: Sequence[str], path: Path) -> Path:
+        require_no_folders([path])
+        blender = self.format == "blender"
+        text = blender_script(cameras, names, self.fps) if blender else None
+        lost = beyond_pinholes(cameras, shifts=blender)
+        if lost:
+            log.warning("%s does not say %s.", path.name, ", or ".join(lost))
+        if text is None:
+            write_json(path, nerfstudio_path(cameras, self.fps))
+        else:
+            with whole_file(path) as part:
+                part.write_text(text, encoding="ascii")
+        return path
 
     def _transforms(self, record: SceneRecord, cameras: Cameras) -> dict[str, Any]:
         prefix = f"{self.images.rstrip('/')}/" if self.images else ""

@@ -16,6 +16,8 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.nerf.geometry.frames import upright_rotation
 
 MeshFormat = Literal["ply", "obj", "glb"]
+MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points as LAS"}
+"""What each extra of this package is needed for."""
 
 
 def save_mesh(
@@ -143,8 +145,8 @@ def require_library(name: str, extra: str = "mesh") -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        what = "a mesh" if extra == "mesh" else "a mesh with a texture"
+        package = name.partition(".")[0].replace("skimage", "scikit-image")
         raise InputError(
-            f"Exporting {what} needs {name.partition('.')[0].replace('skimage', 'scikit-image')}, which is not "
+            f"Exporting {MADE_BY[extra]} needs {package}, which is not "
             f"installed or does not load here ({error}). Install it with: pip install 'nerf-lightning[{extra}]'"
         ) from error

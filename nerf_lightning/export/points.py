@@ -1,7 +1,8 @@
-"""A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY."""
+"""A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
 
 import logging
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,7 +12,9 @@ from torch import Tensor
 
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import Export, require_no_folders
+from nerf_lightning.export.las_file import save_las
+from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.machine import require_memory
@@ -28,13 +31,16 @@ BYTES_PER_PIXEL = 90
 BYTES_PER_POINT = 150
 # So many of the nearest other views are asked whether they agree.
 NEIGHBOURS = 8
+PointFormat = Literal["ply", "las"]
 COSTS = {"depth": 10.0, "agreement": 1.0}
 
 log = logging.getLogger(__name__)
 
 
 class PointsExport(Export):
-    """Write `points.ply`: a point per pixel of the training views, those removed that other views do not confirm.
+    """Write `points.ply` or `points.las`: a point per pixel of the training views.
+
+    Points that other views do not confirm are left out.
 
     Args:
         num_points: most points; of more, some are drawn.
@@ -43,6 +49,8 @@ class PointsExport(Export):
         min_opacity: share of the light that a pixel must stop.
         agreement: how many of the nearest 8 other views must see the same surface.
         tolerance: share of the distance by which their depths may differ.
+        format: of the file; PLY has normals; LAS (1.2, point format 2) is what programs for surveys read, has none, and
+            needs `pip install 'nerf-lightning[las]'`.
     """
 
     def __init__(
@@ -53,6 +61,7 @@ class PointsExport(Export):
         min_opacity: float = 0.9,
         agreement: int = 2,
         tolerance: float = 0.01,
+        format: PointFormat = "ply",
     ):
         for name, value, least in (
             ("num_points", num_points, 1),
@@ -70,9 +79,13 @@ class PointsExport(Export):
             raise InputError(f"what.tolerance={tolerance}: give a share of the distance, above 0.")
         self.num_points, self.max_views, self.longest = num_points, max_views, longest
         self.min_opacity, self.agreement, self.tolerance = min_opacity, agreement, tolerance
+        self.format = format
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
+        require_no_folders([folder / f"points.{self.format}"])
+        if self.format == "las":
+            require_library("laspy", "las")  # before the work, not after it
         views = evenly_spaced_subset(record.splits["train"], self.max_views)
         self._require_memory(record.cameras[views])
         cameras = at_most(record.cameras, self.longest)
@@ -104,10 +117,14 @@ class PointsExport(Export):
     def _save(self, cloud: Float[Tensor, "points 9"], record: SceneRecord, folder: Path) -> Path:
         if len(cloud) > self.num_points:
             cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[: self.num_points]]
-        to_user, path = record.to_user.double(), folder / "points.ply"
+        to_user, path = record.to_user.double(), folder / f"points.{self.format}"
         points = points_to_user(cloud[:, :3].double(), to_user)
-        normals = directions_to_user(cloud[:, 3:6].double(), to_user)
-        save_points(path, points.numpy(), normals.numpy(), to_bytes(cloud[:, 6:]).numpy())
+        colors = to_bytes(cloud[:, 6:]).numpy()
+        if self.format == "las":
+            save_las(path, points.numpy(), colors)
+        else:
+            normals = directions_to_user(cloud[:, 3:6].double(), to_user)
+            save_points(path, points.numpy(), normals.numpy(), colors)
         return path
 
     def _require_memory(self, cameras: Cameras) -> None:

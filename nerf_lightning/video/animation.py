@@ -16,13 +16,13 @@ QUALITY = 80
 
 
 def write_animation(
-    path: Path, frames: Iterable[UInt8[Tensor, "height width 3"]], fps: int, total: int | None = None
+    path: Path, frames: Iterable[UInt8[Tensor, "height width channels"]], fps: int, total: int | None = None
 ) -> None:
     """Write frames of one size as an animated WebP, whole or not at all.
 
     Args:
         path: where to. Missing folders are made.
-        frames: pictures, row 0 on top.
+        frames: pictures in RGB, or in RGB and straight alpha, row 0 on top.
         fps: frames per second; each is shown for a whole number of milliseconds, equal neighbours as one.
         total: how many frames there should be, where it is known.
 

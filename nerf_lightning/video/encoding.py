@@ -1,4 +1,4 @@
-"""Videos: H.264 in mp4 by the ffmpeg that imageio-ffmpeg carries.
+"""Videos by the ffmpeg that imageio-ffmpeg carries: H.264 in mp4; with alpha VP9 in webm, and ProRes 4444 in mov.
 
 ffmpeg is run here, not by imageio's writer, which rescales odd sizes and says nothing when ffmpeg fails.
 """
@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
@@ -21,36 +22,59 @@ from nerf_lightning.files.atomic import whole_file
 # The picture is converted by the rule of BT.709 and says so: untagged, players guess the rule from the size.
 # Newer ffmpegs convert by the tag alone, those before 7 need the filter.
 _COLORS = "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
-# yuv420p and faststart: what browsers and phones can play, from the first byte on.
-_CODEC = f"{_COLORS} -an -c:v libx264 -crf 16 -preset medium -pix_fmt yuv420p -movflags +faststart -f mp4"
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How ffmpeg writes the videos of one ending."""
+
+    encoder: str
+    settings: str
+    plain: str
+    """Format of the pixels of pictures without alpha."""
+    with_alpha: str | None
+    """Of those with it; None: it has none."""
+
+
+CODECS = {
+    # yuv420p and faststart: what browsers and phones can play, from the first byte on.
+    ".mp4": Codec("libx264", "-crf 16 -preset medium -movflags +faststart -f mp4", "yuv420p", None),
+    # Frames out of order, which alt-refs are, would come without their alpha.
+    ".webm": Codec(
+        "libvpx-vp9", "-crf 20 -b:v 0 -deadline good -cpu-used 3 -auto-alt-ref 0 -f webm", "yuv420p", "yuva420p"
+    ),
+    ".mov": Codec("prores_ks", "-profile:v 4444 -alpha_bits 16 -f mov", "yuv444p10le", "yuva444p10le"),
+}
 
 
 def write_video(
-    path: Path, frames: Iterable[UInt8[Tensor, "height width 3"]], fps: int, total: int | None = None
+    path: Path, frames: Iterable[UInt8[Tensor, "height width channels"]], fps: int, total: int | None = None
 ) -> None:
-    """Write frames of one size as an mp4 that plays everywhere, whole or not at all.
+    """Write frames of one size as a video, whole or not at all.
 
-    Frames are taken one at a time and never rescaled. H.264 wants even sides: an odd one gets one more pixel,
+    Frames are taken one at a time and never rescaled. The codecs want even sides: an odd one gets one more pixel,
     a copy of the edge.
 
     Args:
-        path: where to; ends in .mp4. Missing folders are made.
-        frames: pictures, row 0 on top.
+        path: where to. It ends in .mp4, which plays everywhere, or, for frames with alpha too, in .webm or .mov.
+            Missing folders are made.
+        frames: pictures in RGB, or in RGB and straight alpha, row 0 on top.
         fps: frames per second.
         total: how many frames there should be, where it is known.
 
     Raises:
-        InputError: the name does not end in .mp4, there is no ffmpeg, or ffmpeg fails (it is quoted).
-        ValueError: no frames, another number than `total`, or frames of different sizes.
+        InputError: the name has another ending, there is no ffmpeg, or ffmpeg fails (it is quoted).
+        ValueError: no frames, another number than `total`, frames of different sizes, or with alpha in an mp4.
     """
-    if path.suffix.lower() != ".mp4":
-        raise InputError(f"{path}: videos are written as mp4; choose a name that ends in .mp4")
+    codec = CODECS.get(path.suffix.lower())
+    if codec is None:
+        raise InputError(f"{path}: videos are written as mp4; choose a name that ends in .mp4 (or .webm, or .mov)")
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: a video needs at least one frame")
-    height, width, _ = (pad_to_even(first)).shape
-    with whole_file(path) as part, _encoder(part, width, height, fps) as pipe:
+    height, width, channels = pad_to_even(first).shape
+    with whole_file(path) as part, _encoder(part, codec, (width, height), channels == 4, fps) as pipe:
         count = 0
         for frame in _chain(first, frames):
             if frame.shape != first.shape:
@@ -61,7 +85,7 @@ def write_video(
             raise ValueError(f"{path}: {count} frames came, {total} were promised")
 
 
-def pad_to_even(picture: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "even_height even_width 3"]:
+def pad_to_even(picture: UInt8[Tensor, "height width channels"]) -> UInt8[Tensor, "even_height even_width channels"]:
     """Return the picture with even sides; an odd one repeats its last row or column."""
     height, width, _ = picture.shape
     rows = torch.arange(height + height % 2).clamp(max=height - 1)
@@ -75,10 +99,14 @@ def _chain(first: Tensor, rest: Iterator[Tensor]) -> Iterator[Tensor]:
 
 
 @contextmanager
-def _encoder(path: Path, width: int, height: int, fps: int) -> Iterator[IO[bytes]]:
+def _encoder(path: Path, codec: Codec, size: tuple[int, int], has_alpha: bool, fps: int) -> Iterator[IO[bytes]]:
     """Lend the pipe that takes raw frames; wait for ffmpeg at the end, and stop it at once on an error."""
-    source = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-    command = [require_ffmpeg(), *source.split(), *_CODEC.split(), str(path)]
+    pixels, stored = ("rgba", codec.with_alpha) if has_alpha else ("rgb24", codec.plain)
+    if stored is None:
+        raise ValueError(f"{path}: {codec.encoder} has no alpha")
+    source = f"-y -v error -f rawvideo -pix_fmt {pixels} -s {size[0]}x{size[1]} -r {fps} -i -"
+    target = f"{_COLORS} -an -c:v {codec.encoder} {codec.settings} -pix_fmt {stored}"
+    command = [require_ffmpeg(), *source.split(), *target.split(), str(path)]
     with TemporaryFile() as words:
         try:
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words)
@@ -110,6 +138,22 @@ _CURE = (
     "Install one with `pip install imageio-ffmpeg`, name one in the environment variable IMAGEIO_FFMPEG_EXE, "
     "or write PNG frames instead."
 )
+
+
+def require_encoder(ending: str) -> None:
+    """Refuse videos of an ending whose encoder this machine's ffmpeg lacks.
+
+    Raises:
+        InputError: it does, or there is no ffmpeg.
+    """
+    name, program = CODECS[ending].encoder, require_ffmpeg()
+    asked = [program, "-v", "error", "-hide_banner", "-h", f"encoder={name}"]
+    try:
+        answer = subprocess.run(asked, capture_output=True, stdin=subprocess.DEVNULL, check=False).stdout
+    except OSError as error:
+        raise InputError(f"ffmpeg ({program}) does not start: {error}. {_CURE}") from error
+    if f"Encoder {name}".encode() not in answer:
+        raise InputError(f"A video that ends in {ending} needs {name}, which ffmpeg ({program}) lacks. {_CURE}")
 
 
 def require_ffmpeg() -> str:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Generator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -16,12 +16,14 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.ranks import processes_here
-from nerf_lightning.video.encoding import require_ffmpeg
+from nerf_lightning.video.encoding import CODECS, require_encoder
+from nerf_lightning.video.exr import Channels, exr_channels, require_openexr
 from nerf_lightning.video.frames import FilmFrames, Range
 from nerf_lightning.video.panels import FILMS, film_pictures, panel
 from nerf_lightning.video.paths.base import CameraPath
-from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.settings import ENDINGS, FilmSettings
 from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
+from nerf_lightning.visualization.pictures import straight_colors
 
 FilmSteps = Generator[tuple[int, int], None, list[Path]]
 """A film in the making: how many frames of how many are there, again and again, and at the end the films."""
@@ -90,20 +92,29 @@ def film_steps(
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
     _check(subjects, settings)
+    if settings.alpha:
+        subjects = [replace(subject, background="black") for subject in subjects]
     shots = make_shots(
         subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
     )
     require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
-    frames = FilmFrames(folder, films, len(shots[0].cameras.c2w), settings.form, shows_encoding)
+    if settings.form == "exr":
+        films = ["exr"]  # all in one file
+    frames = FilmFrames(
+        folder, films, len(shots[0].cameras.c2w), settings.form, shows_encoding, [FILMS["rgb"]] * settings.alpha
+    )
     try:
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
         mine = ranks.every_other(missing)
         yield 0, len(mine)
         for done, number in enumerate(mine, start=1):
-            for name, picture in _frame(shots, settings, number, seen).items():
-                frames.save(name, number, picture)
+            if settings.form == "exr":
+                frames.save("exr", number, _channels(shots[0], settings, number))
+            else:
+                for name, picture in _frame(shots, settings, number, seen).items():
+                    frames.save(name, number, picture)
             yield done, len(mine)
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
@@ -113,18 +124,33 @@ def film_steps(
     return frames.results()
 
 
-def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ 3"]]:
+def _channels(shot: Shot, settings: FilmSettings, number: int) -> Channels:
+    picture = shot.picture(number)
+    depth = shot.z_depth(number, picture) if "depth" in settings.outputs else None
+    return exr_channels(picture, depth, "rgb" in settings.outputs, settings.alpha)
+
+
+def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ _"]]:
     panels = []
     for shot in shots:
         picture = shot.picture(number)
         normals = shot.normals(number, picture) if "normals" in settings.outputs else None
         panels.append({name: panel(name, picture, seen, shot.unit, normals) for name in settings.outputs})
-    return film_pictures(panels, [shot.subject.label for shot in shots], settings.mosaic)
+    pictures = film_pictures(panels, [shot.subject.label for shot in shots], settings.mosaic)
+    if settings.alpha:
+        pictures[FILMS["rgb"]] = straight_colors(picture.rgb, picture.opacity)
+    return pictures
 
 
 def _check(subjects: list[Subject], settings: FilmSettings) -> None:
-    if settings.form == "video":
-        require_ffmpeg()
+    if ENDINGS[settings.form] in CODECS:
+        require_encoder(ENDINGS[settings.form])
+    if settings.form == "exr":
+        require_openexr()
+    if (settings.alpha or settings.form == "exr") and len(subjects) > 1:
+        raise InputError(
+            "alpha=true and format=exr: checkpoints side by side stand on white paper. Render them one by one."
+        )
     for subject in subjects:
         name = f" ({subject.label})" if len(subjects) > 1 else ""
         if "levels" in settings.outputs and subject.model.first_picture is None:
@@ -132,10 +158,10 @@ def _check(subjects: list[Subject], settings: FilmSettings) -> None:
                 f"outputs: this model{name} has one level that makes pictures, so there is no difference of levels to "
                 "show. Leave levels out; model=nerf and its smaller versions have two."
             )
-        if settings.crop is not None and subject.background == "none":
+        if settings.crop is not None and subject.background == "none" and not settings.alpha:
             raise InputError(
-                f"crop: this model{name} has no background that could be seen around the box. Add background=white or "
-                "background=black."
+                f"crop: this model{name} has no background that could be seen around the box. Add background=white, "
+                "background=black, or alpha=true with another format."
             )
 
 
@@ -167,7 +193,7 @@ def bytes_per_pixel(settings: FilmSettings, scenes: Sequence[SceneRecord]) -> in
     """Return what a frame takes for each pixel of a panel; models are rendered one after the other."""
     bent = any(scene.cameras.ndc is not None for scene in scenes)
     twice = settings.hold_camera or settings.crop is not None or settings.near is not None
-    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs else PLAIN
+    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs or settings.form == "exr" else PLAIN
     return picture + PANEL * len(settings.outputs) * len(scenes)
 
 

@@ -7,7 +7,7 @@ seen) and over which depths their colours reach.
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,12 +23,12 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.video.animation import write_animation
 from nerf_lightning.video.encoding import write_video
-from nerf_lightning.video.settings import Form
+from nerf_lightning.video.exr import Channels, save_exr
+from nerf_lightning.video.settings import ENDINGS, Form
 from nerf_lightning.visualization.pictures import save_png
 
 Range = tuple[float, float]
 LOCK = "lock"
-ENDING: dict[Form, str] = {"video": ".mp4", "animation": ".webp", "frames": ""}
 
 log = logging.getLogger(__name__)
 
@@ -40,16 +40,26 @@ class FilmFrames:
         folder: where the films go.
         films: their names.
         count: how many frames each has.
-        form: `video` and `animation` keep frames in a hidden folder until one file is made of them; `frames` are the
-            result.
+        form: `frames` and `exr` are the result; the others keep frames in a hidden folder until one file is made of
+            them.
         shows_encoding: show in the terminal how far `finish` is.
+        transparent: those of the films whose frames have alpha.
     """
 
-    def __init__(self, folder: Path, films: Sequence[str], count: int, form: Form, shows_encoding: bool = True) -> None:
-        self.shows_encoding = shows_encoding
+    def __init__(
+        self,
+        folder: Path,
+        films: Sequence[str],
+        count: int,
+        form: Form,
+        shows_encoding: bool = True,
+        transparent: Collection[str] = (),
+    ) -> None:
+        self.shows_encoding, self.transparent = shows_encoding, transparent
         self.folder, self.films, self.count, self.form = folder, films, count, form
         self.hidden = folder / ".frames"
-        self.root = folder if form == "frames" else self.hidden
+        self.root = self.hidden if ENDINGS[form] else folder
+        self.suffix = ".exr" if form == "exr" else ".png"
         self.lock = FileLock(self.hidden / LOCK)
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
@@ -75,15 +85,19 @@ class FilmFrames:
         near, far = note["depth_range"]
         return missing, (near, far)
 
-    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width 3"]) -> None:
-        """Keep one frame.
+    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width channels"] | Channels) -> None:
+        """Keep one frame: a picture, or of an EXR its channels.
 
         Raises:
             InputError: the disk is full, or cannot be written.
         """
         try:
             with self._kept():
-                save_png(self._file(film, number), picture)
+                file = self._file(film, number)
+                if isinstance(picture, Tensor):
+                    save_png(file, picture)
+                else:
+                    save_exr(file, picture)
         except InputError as error:
             raise InputError(f"{error} {self._cure()}") from error
 
@@ -93,8 +107,8 @@ class FilmFrames:
         Raises:
             InputError: ffmpeg fails, or the disk is full; the frames stay.
         """
-        if self.form != "frames":
-            write = write_video if self.form == "video" else write_animation
+        if ENDINGS[self.form]:
+            write = write_animation if self.form == "animation" else write_video
             for film, file in zip(self.films, self.results(), strict=True):
                 try:
                     with self._kept():
@@ -103,7 +117,7 @@ class FilmFrames:
                     raise InputError(f"{error} {self._cure()}") from error
             self._remove()
         self.close()
-        if self.form != "frames":
+        if ENDINGS[self.form]:
             with suppress(OSError):  # another process has come
                 self.hidden.rmdir()
 
@@ -113,21 +127,21 @@ class FilmFrames:
 
     def results(self) -> list[Path]:
         """Return the files, or the folders of frames."""
-        return [self.folder / f"{film}{ENDING[self.form]}" for film in self.films]
+        return [self.folder / f"{film}{ENDINGS[self.form]}" for film in self.films]
 
     def _file(self, film: str, number: int) -> Path:
-        return self.root / film / f"frame_{number:04d}.png"
+        return self.root / film / f"frame_{number:04d}{self.suffix}"
 
     def _is_there(self, number: int) -> bool:
         files = [self._file(film, number) for film in self.films]
         return all(file.is_file() and file.stat().st_size > 0 for file in files)
 
-    def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width 3"]]:
-        numbers = range(self.count)
+    def _read(self, film: str) -> Iterator[UInt8[Tensor, "height width channels"]]:
+        numbers, channels = range(self.count), 4 if film in self.transparent else 3
         for number in tracked(numbers, f"encoding {film}") if self.shows_encoding else numbers:
             file = self._file(film, number)
             try:
-                yield torch.from_numpy(read_rgba(file)[..., :3].copy())
+                yield torch.from_numpy(read_rgba(file)[..., :channels].copy())
             except InputError as error:
                 raise InputError(f"The frame {file} cannot be read. Remove it.") from error
 
@@ -156,9 +170,9 @@ class FilmFrames:
         for folder in self.hidden.iterdir():
             if folder.is_dir():
                 shutil.rmtree(folder)
-        if self.form == "frames":
+        if not ENDINGS[self.form]:
             for film in self.films:
-                for file in (self.folder / film).glob("frame_*.png"):
+                for file in (self.folder / film).glob(f"frame_*{self.suffix}"):
                     file.unlink()
 
     @contextmanager

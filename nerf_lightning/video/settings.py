@@ -9,10 +9,19 @@ from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
-Form = Literal["video", "animation", "frames"]
+Form = Literal["video", "webm", "prores", "animation", "frames", "exr"]
+ENDINGS: dict[Form, str] = {
+    "video": ".mp4",
+    "webm": ".webm",
+    "prores": ".mov",
+    "animation": ".webp",
+    "frames": "",
+    "exr": "",
+}
 Projection = Literal["perspective", "equirectangular"]
 Corner = tuple[float, float, float]
-SWITCHES = ("mosaic", "hold_camera")
+EXR_OUTPUTS = ("rgb", "depth")
+SWITCHES = ("mosaic", "hold_camera", "alpha")
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,8 @@ class FilmSettings:
     mosaic: bool = False
     """One film of all outputs, in place of one for each."""
     form: Form = "video"
+    alpha: bool = False
+    """The film of the colours has them straight, with the opacity as alpha; nothing lies behind the scene."""
     near: float | None = None
     """Where rays begin; None: where the photographs' do."""
     crop: tuple[Corner, Corner] | None = None
@@ -50,19 +61,42 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
     if config["format"] not in get_args(Form):
         raise InputError(
-            f"format={config['format']}: choose video (mp4), animation (WebP, which pages play by themselves) or "
-            "frames (PNG files)."
+            f"format={config['format']}: choose video (mp4), webm (VP9), prores (ProRes 4444 in mov), animation (WebP, "
+            "which pages play by themselves), frames (PNG files) or exr (OpenEXR files)."
         )
+    if config["format"] == "exr" and (config["mosaic"] or not set(outputs) <= set(EXR_OUTPUTS)):
+        raise InputError(
+            f"format=exr holds {' and '.join(EXR_OUTPUTS)} as numbers. Leave mosaic and other outputs out, or give "
+            "format=frames."
+        )
+    if config["alpha"]:
+        _check_alpha(config, outputs)
     require_one_of(get_args(Projection), projection=config["projection"])
     return FilmSettings(
         outputs=outputs,
         mosaic=config["mosaic"],
         form=config["format"],
+        alpha=config["alpha"],
         near=_near(config["near"]),
         crop=_crop(config["crop"]),
         hold_camera=config["hold_camera"],
         projection=config["projection"],
     )
+
+
+def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
+    refusals = {
+        "format=video makes mp4, which has no alpha. Give format=webm (for browsers), format=prores (for editing), "
+        "format=animation, format=frames or format=exr": config["format"] == "video",
+        f"background={config['background']} would lie behind the scene. Leave one of the two out": (
+            config["background"] is not None
+        ),
+        "mosaic=true sets pictures on white paper. Leave one of the two out": config["mosaic"],
+        "the colours get it, and outputs has no rgb": "rgb" not in outputs,
+    }
+    for reason, refused in refusals.items():
+        if refused:
+            raise InputError(f"alpha=true: {reason}.")
 
 
 def as_list(value: Any) -> list[Any]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.geometry.cameras import at_most, coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
@@ -76,11 +76,24 @@ class Shot:
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the unit normals of what the picture shows, in the user's axes."""
+        normals = normals_from_depth(self._surface(frame, picture))
+        return normals @ (self.subject.scene.to_user[:3, :3] / self.unit).mT
+
+    def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
+        """Return how far what the picture shows lies from the camera, in the user's units.
+
+        Along the camera's axis; of a panorama, which has none, along the ray.
+        """
+        local = camera_coordinates(self.cameras, frame, self._surface(frame, picture))
+        panorama = self.cameras.lens_model == "equirectangular"
+        return self.unit * (local.norm(dim=-1) if panorama else -local[..., 2])
+
+    def _surface(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
+        """Return the points of the scene that the picture shows."""
         rays, straight = view_rays(self.rays, frame, self.clip)
         bent = self.cameras.ndc is not None
         surface = picture.depth if bent else surface_depth(picture.depth, picture.opacity, rays.far)
-        normals = normals_from_depth(straight.origins + surface[..., None] * straight.directions)
-        return normals @ (self.subject.scene.to_user[:3, :3] / self.unit).mT
+        return straight.origins + surface[..., None] * straight.directions
 
     def small(self) -> "Shot":
         """Return a few of the frames, in small."""

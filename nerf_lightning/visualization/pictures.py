@@ -25,7 +25,7 @@ _BACKDROP = 0.93
 """Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far."""
 
 
-def to_bytes(rgb: Float[Tensor, "*h w 3"]) -> UInt8[Tensor, "*h w 3"]:
+def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
     """Return colours in [0, 1] as bytes on the CPU: clamped, then rounded to the nearest; NaN becomes black.
 
     >>> to_bytes(torch.tensor([[-1.0, 0.5, 2.0]])).tolist()
@@ -34,8 +34,21 @@ def to_bytes(rgb: Float[Tensor, "*h w 3"]) -> UInt8[Tensor, "*h w 3"]:
     return (torch.nan_to_num(rgb.detach().float()).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
-def save_png(path: Path, picture: UInt8[Tensor, "height width 3"]) -> None:
-    """Write a picture as PNG: whole or not at all. Missing folders are made."""
+def straight_colors(
+    rgb: Float[Tensor, "height width 3"], opacity: Float[Tensor, "height width"]
+) -> UInt8[Tensor, "height width 4"]:
+    """Return what was rendered over black as straight colours and alpha; where nothing is seen, all four are 0.
+
+    >>> straight_colors(torch.tensor([[[0.25, 0.0, 0.5]]]), torch.tensor([[0.5]])).tolist()
+    [[[128, 0, 255, 128]]]
+    """
+    alpha = opacity[..., None]
+    shown = alpha > 0.5 / 255  # what alpha has as bytes
+    return to_bytes(torch.where(shown, torch.cat([rgb / alpha.clamp(min=0.5 / 255), alpha], dim=-1), 0.0))
+
+
+def save_png(path: Path, picture: UInt8[Tensor, "height width channels"]) -> None:
+    """Write a picture, in RGB or in RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
     with whole_file(path) as part:
         Image.fromarray(picture.numpy()).save(part, format="PNG")
 

@@ -1,5 +1,6 @@
 """Point clouds: on known surfaces, with normals; what one view alone sees is left out."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
+from nerf_lightning.export.las_file import save_las, scale_and_offset
 from nerf_lightning.export.points import BYTES_PER_PIXEL, BYTES_PER_POINT, PointsExport
 from nerf_lightning.export.visibility import num_agreeing, see
 from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
@@ -139,3 +141,40 @@ def test_a_cloud_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypa
 def test_settings_that_make_no_sense_are_refused(settings):
     with pytest.raises(InputError, match=f"what.{next(iter(settings))}="):
         PointsExport(**settings)
+
+
+def test_las_holds_the_points_of_the_ply_with_their_colours(tmp_path):
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed (the extra las)")
+    far_away = torch.tensor([690_000.0, 5_330_000.0, 520.0])  # as in UTM: places that float32 does not tell apart
+    scene = record(to_user=similarity(torch.eye(3), far_away, 100.0))
+    expected, _ = exported(tmp_path, solid(ball()), scene)
+    (path,) = PointsExport(format="las").export(solid(ball()), scene, tmp_path, TILE)
+    assert path.name == "points.las"
+    las = laspy.read(path)
+    assert (str(las.header.version), las.header.point_format.id) == ("1.2", 2)
+    assert len(set(las.header.scales)) == 1
+    np.testing.assert_allclose(np.asarray(las.xyz), expected.vertices, atol=0.5)  # float32 is as coarse, in the PLY
+    radius = np.linalg.norm(np.asarray(las.xyz) - far_away.numpy(), axis=1) / 100.0
+    assert np.abs(radius - 0.8).max() < 0.06
+    colors = np.stack([las.red, las.green, las.blue], axis=1)
+    np.testing.assert_array_equal(colors, 257 * np.asarray(expected.colors)[:, :3].astype(int))
+
+
+@pytest.mark.parametrize("extent", [0.0, 1e-6, 3.7, 8e5])
+@pytest.mark.parametrize("place", [0.0, -1e7])
+def test_the_steps_of_a_las_file_suit_the_extent(tmp_path, extent, place):
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed (the extra las)")
+    points = place + extent * np.random.default_rng(0).random((50, 3))
+    scale, _ = scale_and_offset(points)
+    assert np.log10(scale) == pytest.approx(np.round(np.log10(scale)))
+    save_las(tmp_path / "points.las", points, np.zeros((50, 3), np.uint8))
+    read_back = np.asarray(laspy.read(tmp_path / "points.las").xyz)
+    assert np.abs(read_back - points).max() <= 0.51 * scale[0] + np.spacing(abs(place))
+    assert scale[0] <= max(1e-8 * extent, 10 * np.spacing(np.abs(points).max()), 1e-29)
+
+
+def test_without_laspy_las_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(InputError, match=r"points as LAS needs laspy, .* pip install 'nerf-lightning\[las\]'"):
+        PointsExport(format="las").export(solid(ball()), record(), tmp_path, TILE)
+    assert not list(tmp_path.iterdir())
