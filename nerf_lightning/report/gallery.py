@@ -128,13 +128,15 @@ def _thumbnail(page: Path) -> str:
     with open_regular(page, None) as file:
         found = STILL.search(file.read(MOST_HEAD))
     try:
-        image = Image.open(io.BytesIO(base64.b64decode(found[1], validate=True))) if found else None
-        if image is None or image.format != "JPEG" or image.width * image.height > MOST_PIXELS:
+        if not found:
+            return ""
+        image = Image.open(io.BytesIO(base64.b64decode(found[1], validate=True)), formats=["JPEG"])
+        if image.width * image.height > MOST_PIXELS:
             return ""
         image.thumbnail((THUMBNAIL, THUMBNAIL))
         content = io.BytesIO()
         image.convert("RGB").save(content, format="JPEG", quality=JPEG_QUALITY)
-    except (OSError, ValueError, binascii.Error):
+    except (OSError, ValueError, binascii.Error, Image.DecompressionBombError):
         return ""
     return data_address("image/jpeg", content.getvalue())
 
