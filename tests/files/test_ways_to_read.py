@@ -53,6 +53,7 @@ OTHERWISE = {
     "sfm/video_frames.py": ["imiter"],
     "files/atomic.py": ["open", "open"],
     "export/points.py": ["open"],
+    "export/las_file.py": ["open"],
     # The still picture of a page, of limited size, decoded and encoded anew.
     "report/gallery.py": ["open", "read_text"],
     "files/tensor_files.py": ["load"],
