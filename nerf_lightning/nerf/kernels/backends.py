@@ -7,11 +7,14 @@ import os
 import shutil
 import stat
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
 import torch
+
+LONG_SECONDS = 2.0
 
 log = logging.getLogger(__name__)
 
@@ -28,12 +31,30 @@ def twin(module: str) -> ModuleType | None:
             _configure_numba()
         found = _imported(module)
         # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
-        found.trial()
+        with _told_if_long(library):
+            found.trial()
         return found
     except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
         _reasons[module] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         _warn_once(library, _reasons[module])
         return None
+
+
+@contextmanager
+def _told_if_long(library: str) -> Iterator[None]:
+    """Say what takes so long, where it does: a person who has just installed the program waits for its first line."""
+    timer = threading.Timer(LONG_SECONDS, _tell_once, [library])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@functools.cache
+def _tell_once(library: str) -> None:
+    log.info("%s compiles the kernels for this machine: up to a minute, the first time only", library)
 
 
 def why_not(module: str) -> str:

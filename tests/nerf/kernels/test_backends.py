@@ -4,6 +4,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from types import ModuleType
 
 import numba
@@ -20,7 +21,7 @@ def anew(monkeypatch):
     former = numba.config.CACHE_DIR
 
     def forget():
-        for cached in (backends.twin, backends._warn_once, backends._cache_elsewhere):
+        for cached in (backends.twin, backends._warn_once, backends._tell_once, backends._cache_elsewhere):
             cached.cache_clear()
         backends._reasons.clear()
 
@@ -52,6 +53,18 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     assert backends.why_not("adam.cpu") == "RuntimeError: LLVM cannot select this"
     assert len(caplog.records) == 1
     assert "the torch twins of its kernels run instead" in caplog.text
+
+
+@pytest.mark.parametrize(("takes", "said"), [(0.3, 1), (0.0, 0)])
+def test_whoever_waits_for_the_compiler_is_told_once(anew, monkeypatch, caplog, takes, said):
+    slow = module_whose_trial()
+    slow.trial = lambda: time.sleep(takes)
+    monkeypatch.setattr(backends.importlib, "import_module", lambda name: slow)
+    monkeypatch.setattr(backends, "LONG_SECONDS", 0.05)
+    with caplog.at_level(logging.INFO):
+        backends.twin("hash_grid.cpu")
+        backends.twin("march.cpu")
+    assert [each.count("the first time only") for each in caplog.messages] == [1] * said
 
 
 def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, caplog):
