@@ -241,8 +241,7 @@ class TrainStep:
 
         Returns:
             `losses` and `color_errors` (mean squared) per level, detached, which add up over all shares to the batch's;
-            and of each ray its `foreground`
-            light, its last level's `rgb`, its `target` colour and its `weight`.
+            and of each ray its `foreground` light, its last level's `rgb`, its `target` colour and its `weight`.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
         counts = [count.clone() for count in self.model.counts()]

@@ -29,6 +29,9 @@ from nerf_lightning.nerf.kernels.bricks.cpu import (
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
+COMPILED_WITH = "c1261bf3"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
+
 MOST_STEPS = 4096
 FARTHEST = np.float32(1e4)
 """Halves of the inner cube: beyond, places in the grid are no longer told apart."""

@@ -15,6 +15,9 @@ from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
 from nerf_lightning.nerf.kernels.prefetch import prefetch
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
+COMPILED_WITH = "3ff815cc"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
+
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 

@@ -28,8 +28,9 @@ from nerf_lightning.nerf.kernels.mlp.vectors import (
 from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.products import tiles_of_rows
 
-VECTORS = 1
-"""Raised with each change of `vectors`, so that numba compiles anew."""
+COMPILED_WITH = "ab402674"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
+
 ROWS = 128
 """So many go through all layers together."""
 
@@ -43,11 +44,11 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     """Return the outputs, and the inputs of all layers where they are to be kept.
 
     Args:
-        points: float32.
+        points: inputs of the first layer.
         weights: float32.
         keep: whether a backward pass follows.
     """
-    points, widths = points.contiguous(), _widths(weights)
+    points, widths = points.float().contiguous(), _widths(weights)
     rows, words = points.shape[0], sum(widths[:-1]) // 2
     packed, dims = _packed(weights, widths, transposed=False), np.array(widths)
     padded = -(-rows // ROWS) * ROWS
@@ -68,7 +69,7 @@ def backward(
     grad_points = grad.new_empty(kept.shape[0] if wants_points else 0, weights[0].shape[1])
     tiles = tiles_of_rows(rows)
     sums = torch.zeros(len(tiles), sum(a * b for a, b in pairwise(widths)))
-    arrays = grad.numpy(), packed, dims, kept.numpy(), grad_points.numpy()
+    arrays = grad.float().contiguous().numpy(), packed, dims, kept.numpy(), grad_points.numpy()
 
     def tile(number: int) -> None:
         part = tiles[number]

@@ -22,15 +22,10 @@ def mlp(
     """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32."""
     if points.device.type != "cpu" or points.dtype == torch.float64 or not is_on("mlp.cpu"):
         return mlp_torch(points, weights, products)
-    kernels = _in_bfloat16(weights) if products == "bfloat16" else None
-    if kernels is not None:
-        if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
-            return _FusedMLP.apply(points, kernels, *weights)
-        return kernels.forward(points.detach().float(), [weight.detach().float() for weight in weights], keep=False)[0]
-    dtype = torch.bfloat16 if products == "bfloat16" else points.dtype
+    kernels, dtype = _kernels_for(points, weights, products)
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
-        return _TiledMLP.apply(points, dtype, *weights)
-    return mlp_cpu.forward(points, [weight.to(dtype) for weight in weights], keep=False)[0]
+        return _TiledMLP.apply(points, kernels, dtype, *weights)
+    return kernels.forward(points.detach(), [weight.detach().to(dtype) for weight in weights], keep=False)[0]
 
 
 def mlp_torch(
@@ -42,45 +37,30 @@ def mlp_torch(
     return linear(points, weights[-1], None, products)
 
 
-def _in_bfloat16(weights: list[Tensor]) -> ModuleType | None:
-    """Return the kernels for the CPU's own bfloat16, where it has it and they take such a perceptron."""
-    if not cpu_multiplies_bfloat16() or not is_on("mlp.bfloat16"):
-        return None
-    kernels = twin("mlp.bfloat16")
-    return kernels if kernels is not None and kernels.takes([weight.shape[1] for weight in weights]) else None
-
-
-class _FusedMLP(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, kernels: ModuleType, *weights: Tensor) -> Tensor:
-        used = [weight.detach().float() for weight in weights]
-        out, ctx.kept = kernels.forward(points.detach().float(), used, keep=True)
-        ctx.used, ctx.kernels = used, kernels
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-        of_points, of_weights = ctx.kernels.backward(
-            grad.float().contiguous(), ctx.used, ctx.kept, ctx.needs_input_grad[0]
-        )
-        ctx.kept = None
-        return of_points, None, *of_weights
+def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> tuple[ModuleType, torch.dtype]:
+    """Return the CPU's kernels, and what they take the weights in; those for its own bfloat16 round by themselves."""
+    if products != "bfloat16":
+        return mlp_cpu, points.dtype
+    if cpu_multiplies_bfloat16() and is_on("mlp.bfloat16"):
+        own = twin("mlp.bfloat16")
+        if own is not None and own.takes([weight.shape[1] for weight in weights]):
+            return own, torch.float32
+    return mlp_cpu, torch.bfloat16
 
 
 class _TiledMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, dtype: torch.dtype, *weights: Tensor) -> Tensor:
+    def forward(ctx: Any, points: Tensor, kernels: ModuleType, dtype: torch.dtype, *weights: Tensor) -> Tensor:
         used = [weight.detach().to(dtype) for weight in weights]
-        out, activations = mlp_cpu.forward(points.detach(), used, keep=True)
-        ctx.used, ctx.activations = used, activations
+        out, activations = kernels.forward(points.detach(), used, keep=True)
+        ctx.kernels, ctx.used, ctx.activations = kernels, used, activations
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-        grad_points, grad_weights = mlp_cpu.backward(
+        grad_points, grad_weights = ctx.kernels.backward(
             grad.contiguous(), ctx.used, ctx.activations, ctx.needs_input_grad[0]
         )
         ctx.activations = None
-        return grad_points, None, *grad_weights
+        return grad_points, None, None, *grad_weights

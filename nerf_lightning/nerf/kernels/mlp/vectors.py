@@ -1,10 +1,8 @@
 """Vectors of 16 numbers for numba: products, roundings and pairs in bfloat16, by the CPU's own instructions.
 
 LLVM is handed the instructions of AVX512-BF16 as they are, so no compiler is needed; a CPU without them must not come
-here. numba keeps what it compiled for as long as the kernels' own file stays the same, and does not look into this one:
-whoever changes it raises `bfloat16.VECTORS`.
-
-Addresses are whole numbers of bytes; a word is an int32 that holds two bfloat16 numbers, the first in its lower half.
+here. Addresses are whole numbers of bytes; a word is an int32 that holds two bfloat16 numbers, the first in its lower
+half.
 """
 
 from typing import Any
