@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -50,6 +51,10 @@ class Field(nn.Module, ABC):
             features: what `density` returned for the same points, with or without gradients; None: nothing was asked
                 before. What comes out is the same, and its gradients too.
         """
+
+    def parts(self) -> FieldParts | None:
+        """Return what kernels need that render whole rays by themselves; None where the field is of another kind."""
+        return None
 
     @abstractmethod
     def reset_parameters(self) -> None:

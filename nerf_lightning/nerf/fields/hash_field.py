@@ -13,6 +13,7 @@ from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -121,6 +122,14 @@ class HashField(Field):
         raw_rgb = self._through(self.color_mlp, torch.cat([hidden, *seen], dim=-1))
         density = self._density(hidden, points.positions)
         return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
+
+    def parts(self) -> FieldParts | None:
+        """Return table and weights, of a field over a box whose colours are the same for all photographs."""
+        grid = self.position_encoder.grid()
+        if grid is None or self.contracted.is_on() or self.appearance:
+            return None
+        density, color = list(self.density_mlp), list(self.color_mlp)
+        return FieldParts(self.aabb, *grid, float(self.bias), density, color, self.direction_encoder)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
