@@ -17,8 +17,9 @@ from torch import Tensor
 from nerf_lightning.console import ProgressLines, progress_bar
 from nerf_lightning.cores import num_cores
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
+from nerf_lightning.data.bricks.family import Model, model
+from nerf_lightning.data.bricks.solids import Solids
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
-from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
@@ -28,6 +29,8 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Sce
 
 RENDER_VERSION = 1
 """Part of the cache's key: raise it whenever a pixel changes."""
+FAMILY_VERSION = 1
+"""The same for the models beside the fire engine: raise it whenever one of them changes."""
 CHUNK = 3_000_000
 """Rays that one thread takes at a time: enough to share the search for shadows, few enough for memory."""
 MOST_THREADS = 4
@@ -40,6 +43,8 @@ class BricksReader(Reader):
     """Render the embedded scene, with exact depth and normals.
 
     Args:
+        variant: which model of the family: 0 is the fire engine; each other number is a vehicle or a tower of its own,
+            in its own colours and light.
         resolution: width and height of every picture in pixels.
         num_train: number of training views, spread over the upper hemisphere.
         num_val: number of validation views, in the gaps between the training views.
@@ -54,6 +59,7 @@ class BricksReader(Reader):
 
     def __init__(
         self,
+        variant: int = 0,
         resolution: int = 128,
         num_train: int = 100,
         num_val: int = 20,
@@ -64,6 +70,7 @@ class BricksReader(Reader):
         cache_dir: str | None = None,
         name: str = "bricks",
     ) -> None:
+        self.variant = variant
         self.resolution = resolution
         self.counts = {"train": num_train, "val": num_val, "test": num_test}
         self.near = near
@@ -83,8 +90,10 @@ class BricksReader(Reader):
         cameras = bricks_cameras(**self.counts, resolution=self.resolution)
         folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder("bricks")
         settings = {"version": RENDER_VERSION, "resolution": self.resolution, **self.counts}
-        pixels = views * self.resolution**2
-        rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras))
+        if self.variant:
+            settings |= {"variant": self.variant, "family": FAMILY_VERSION}
+        pixels, shown = views * self.resolution**2, model(self.variant)
+        rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras, shown))
         splits, names = self._splits()
         return Scene(
             name=self.name,
@@ -98,7 +107,7 @@ class BricksReader(Reader):
             ),
             near=torch.full((views,), float(self.near)),
             far=torch.full((views,), float(self.far)),
-            aabb=torch.from_numpy(model_box()),
+            aabb=torch.from_numpy(model_box(shown)),
             splits=splits,
             view_names=names,
             background=self.background,
@@ -116,6 +125,10 @@ class BricksReader(Reader):
         return splits, tuple(names)
 
     def _check(self) -> None:
+        if self.variant < 0:
+            raise InputError(
+                f"The bricks scene has no scene.variant={self.variant}: 0 is the fire engine; 1, 2, 3, ... are others."
+            )
         if self.resolution < 1:
             raise InputError(
                 f"The bricks scene cannot be rendered at scene.resolution={self.resolution}: give a width in pixels, "
@@ -138,15 +151,15 @@ class BricksReader(Reader):
             )
 
 
-def model_box() -> Float[ndarray, "2 3"]:
-    """Return the lower and upper corner of a box that holds the model with a little room."""
-    corners = Tracer(fire_engine()).corners.reshape(-1, 3)
+def model_box(shown: Model) -> Float[ndarray, "2 3"]:
+    """Return the lower and upper corner of a box that holds a model with a little room."""
+    corners = Solids.of(shown.parts).corners().reshape(-1, 3)
     return np.stack([corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN]).astype(np.float32)
 
 
-def render(cameras: Cameras) -> Rendered:
+def render(cameras: Cameras, shown: Model) -> Rendered:
     """Render every view, on a few cores, with a progress bar on stderr."""
-    tracer = Tracer(fire_engine())
+    tracer = Tracer(shown.parts, shown.light)
     resolution = int(cameras.width[0])
     views = [
         Pinhole(c2w.double().numpy(), float(focal[0]), resolution)
