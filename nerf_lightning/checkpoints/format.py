@@ -58,7 +58,9 @@ def scene() -> Record:
             "background": Choice(get_args(Background)),
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),
-        }
+        },
+        # Of several captures that were joined; earlier versions wrote neither.
+        {"capture_of": Maybe(numbers), "captures": Many(name, views, tuple)},
     )
 
 

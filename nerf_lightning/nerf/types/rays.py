@@ -24,6 +24,8 @@ class RayBundle(TensorStruct):
     photograph: Int[Tensor, "*rays"] | None = None
     """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
     films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen."""
+    capture: Int[Tensor, "*rays"] | None = None
+    """Number of the capture that each ray runs through; None: the first, which is mostly the only one."""
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,10 @@ class SceneRecord:
     to_user: Float[Tensor, "4 4"]
     """Similarity that takes scene coordinates to the user's own frame."""
     space: Space = "bounded"
+    capture_of: tuple[int, ...] | None = None
+    """Number of the capture that each view belongs to, where several were joined; None: one capture."""
+    captures: tuple[str, ...] = ()
+    """The names of the captures that were joined."""
 
 
 @dataclass(frozen=True, kw_only=True)
