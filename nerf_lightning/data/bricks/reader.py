@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from rich.progress import Progress
 from torch import Tensor
@@ -51,6 +51,9 @@ class BricksReader(Reader):
         num_test: number of test views, on an orbit.
         near: distance from a camera at which content may begin; the model lies between 2.7 and 5.4.
         far: distance at which content ends.
+        gain: every colour c (an sRGB code between 0 and 1) is photographed as gain * c^gamma, as a camera with other
+            settings would show it.
+        gamma: see gain.
         background: what the transparent pixels are blended with.
         cache_dir: folder of the rendered pictures; by default in the user's cache folder
             (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
@@ -66,6 +69,8 @@ class BricksReader(Reader):
         num_test: int = 25,
         near: float = 2.0,
         far: float = 6.0,
+        gain: float = 1.0,
+        gamma: float = 1.0,
         background: Background = "white",
         cache_dir: str | None = None,
         name: str = "bricks",
@@ -75,6 +80,7 @@ class BricksReader(Reader):
         self.counts = {"train": num_train, "val": num_val, "test": num_test}
         self.near = near
         self.far = far
+        self.gain, self.gamma = gain, gamma
         self.background = background
         self.cache_dir = cache_dir
         self.name = name
@@ -99,7 +105,7 @@ class BricksReader(Reader):
             name=self.name,
             cameras=cameras,
             pixels=PixelStore(
-                rgba=torch.from_numpy(rendered.rgba),
+                rgba=self._photographed(torch.from_numpy(rendered.rgba)),
                 offset=torch.arange(views) * self.resolution**2,
                 width=cameras.width,
                 height=cameras.height,
@@ -112,9 +118,22 @@ class BricksReader(Reader):
             view_names=names,
             background=self.background,
             to_user=torch.eye(4),
-            protocol={"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"},
+            protocol=self._protocol(),
             truth=Truth(torch.from_numpy(rendered.depth), torch.from_numpy(rendered.normals)),
         )
+
+    def _photographed(self, rgba: UInt8[Tensor, "pixels 4"]) -> UInt8[Tensor, "pixels 4"]:
+        """Return the pictures as a camera with this gain and gamma shows them; alpha stays."""
+        if self.gain == self.gamma == 1.0:
+            return rgba
+        shown = (255.0 * self.gain * (torch.arange(256) / 255.0) ** self.gamma).round().clamp(max=255).to(torch.uint8)
+        return torch.cat([shown[rgba[:, :3].long()], rgba[:, 3:]], dim=1)
+
+    def _protocol(self) -> dict[str, str]:
+        protocol = {"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"}
+        if (self.gain, self.gamma) != (1.0, 1.0):
+            protocol["colors of the photographs"] = f"{self.gain:g} c^{self.gamma:g}"
+        return protocol
 
     def _splits(self) -> tuple[dict[str, tuple[int, ...]], tuple[str, ...]]:
         splits, names, first = {}, [], 0
@@ -143,6 +162,10 @@ class BricksReader(Reader):
             raise InputError(
                 f"The bricks scene was given scene.near={self.near} and scene.far={self.far}: near must be 0 or more "
                 "and less than far (2 and 6 hold the model)."
+            )
+        if not (self.gain > 0 and self.gamma > 0):
+            raise InputError(
+                f"The bricks scene was given scene.gain={self.gain} and scene.gamma={self.gamma}: give numbers above 0."
             )
         if self.background not in get_args(Background):
             raise InputError(
