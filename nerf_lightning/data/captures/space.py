@@ -4,8 +4,6 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.data.captures.capture import Capture
