@@ -17,13 +17,14 @@ from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
-from nerf_lightning.evaluation.metrics_files import summary, write_metrics
+from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
@@ -83,7 +84,8 @@ class Scoring:
         views = self._views(scene)
         shown_views = evenly_spaced_subset(views, self.num_pictures)
         kept = KeptViews(folder, self.split, self.num_worst)
-        rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+        show_photographs(model, scene)
+        rays_of = RayGenerator.of_views(scene, model)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
         for view in tracked(mine, f"evaluating {self.split}"):
@@ -106,6 +108,9 @@ class Scoring:
             "origin": origin or {},
             "environment": environment(),
         }
+        if scene.capture_of is not None:
+            names = {scene.view_names[view]: scene.captures[scene.capture_of[view]] for view in views}
+            result["captures"] = of_captures(rows, names, scene.trained_captures)
         if ranks.is_first():
             write_metrics(folder, result)
         return result
