@@ -41,7 +41,8 @@ class ImageNetwork(LearntPart):
         """Return the features of pictures of one size, rows and columns a `scale`th of it, rounded up."""
         height, width = pictures.shape[-2:]
         unit = 2 * self.scale
-        bottom, right = -height % unit, -width % unit
+        # Of a single feature at the smallest scale no deviation could be taken.
+        bottom, right = -height % unit, max(2 * unit, width + -width % unit) - width
         found = functional.pad(normalized(pictures, self.norm), (0, right, 0, bottom), mode="replicate")
         levels: list[Tensor] = []
         for level in self.down:

@@ -105,8 +105,6 @@ class ViewTransformer(Model):
             raise ValueError(f"width={width} cannot be shared by heads={heads}: give a multiple")
         if image_scale & (image_scale - 1):
             raise ValueError(f"image_scale={image_scale}: give 2, 4 or 8")
-        if image_norm not in ("none", "instance", "neurn"):
-            raise ValueError(f"image_norm={image_norm}: give none, instance or neurn")
         if experts in (1, 2):
             raise ValueError(f"experts={experts}: give 0 for none, or 3 at least, of which two are chosen")
         self.sampler, self.num_sources = sampler, num_sources
