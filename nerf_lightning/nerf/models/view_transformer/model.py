@@ -182,7 +182,7 @@ class ViewTransformer(Model):
             if gates is not None and random is not None:
                 of_block = self._penalty(gates, rays, sources)
                 penalty = of_block if penalty is None else penalty + of_block
-        rgb = self.color(self.norm(states).mean(dim=1))
+        rgb = self.color(self.norm(states.float()).mean(dim=1))
         return [self._rendering(rgb, weights, samples, visible, background, penalty)]
 
     def points_per_ray(self, training: bool) -> float:
