@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.view_transformer.attention import FeedForward, RayAttention, ViewAttention
+from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor, Views
 from nerf_lightning.nerf.models.view_transformer.experts import Experts, Gates, imbalance, roughness
 from nerf_lightning.nerf.models.view_transformer.image_network import ImageNetwork
 from nerf_lightning.nerf.models.view_transformer.image_norm import ImageNorm
@@ -46,6 +48,8 @@ RANGES = {
     "smoothness": (0.0, 1e6),
 }
 
+COLORS = {"pooled": PooledColor, "blended": BlendedColor}
+
 log = logging.getLogger(__name__)
 
 
@@ -70,6 +74,9 @@ class ViewTransformer(Model):
         image_rate: learning rate of the image network at the beginning; null: that of all.
         image_norm: what is done to photographs before the image network, against exposures that differ: none;
             instance (mean 0 and deviation 1 in each channel); neurn (the local deviation, arXiv 2505.06894).
+        color: what makes a ray's colour of the states of its points: pooled (a linear layer on their mean, as
+            published), or blended (the sources' colours, weighted by two attentions, and what the mean adds; it learns
+            in fewer steps).
         experts: so many experts in the place of the feed-forward layer after the views in every second block, of
             which two are asked about each point (GNT-MOVE, ICCV 2023); 0: none.
         balance: weight of the loss that makes the experts be asked equally often.
@@ -95,6 +102,7 @@ class ViewTransformer(Model):
         image_blocks: int = 2,
         image_rate: float | None = None,
         image_norm: ImageNorm = "none",
+        color: Literal["pooled", "blended"] = "pooled",
         experts: int = 0,
         balance: float = 0.01,
         smoothness: float = 0.01,
@@ -116,7 +124,7 @@ class ViewTransformer(Model):
             _Block(width, heads, encoded=number % 2 == 0, experts=experts if number % 2 else 0)
             for number in range(blocks)
         )
-        self.norm, self.color = nn.LayerNorm(width), nn.Linear(width, 3)
+        self.color = COLORS[color](width)
         self.tables: ViewTables | None = None
         self.least_cosine: Tensor | None = None
         self.warned = False
@@ -172,17 +180,17 @@ class ViewTransformer(Model):
         visible = projected.visible & sources.given[sources.target][:, None]
         projected = replace(projected, visible=visible)
         views = self._looked_up(sources, projected)
-        states = views.masked_fill(~visible[..., None], -torch.inf).amax(dim=-2)
+        states = views.states.masked_fill(~visible[..., None], -torch.inf).amax(dim=-2)
         states = torch.where(visible.any(dim=-1)[..., None], states, 0.0)
         positions = rays.origins[:, None] + samples.midpoints[..., None] * rays.directions[:, None]
         penalty, weights = None, None
         for number, block in enumerate(self.blocks):
             last = number == len(self.blocks) - 1
-            states, gates, weights = block(states, views, projected, positions, rays, random, last)
+            states, gates, weights = block(states, views.states, projected, positions, rays, random, last)
             if gates is not None and random is not None:
                 of_block = self._penalty(gates, rays, sources)
                 penalty = of_block if penalty is None else penalty + of_block
-        rgb = self.color(self.norm(states.float()).mean(dim=1))
+        rgb, weights = self.color(states, views, weights)
         return [self._rendering(rgb, weights, samples, visible, background, penalty)]
 
     def points_per_ray(self, training: bool) -> float:
@@ -236,13 +244,13 @@ class ViewTransformer(Model):
         inverse = self.sampler(replace(rays, near=1.0 / near, far=1.0 / far), [], random).edges
         return RaySamples(torch.where(deep, 1.0 / inverse, even))
 
-    def _looked_up(self, sources: SourceViews, projected: Projected) -> Float[Tensor, "rays samples sources width"]:
+    def _looked_up(self, sources: SourceViews, projected: Projected) -> Views:
         views, numbered = torch.unique(sources.places, return_inverse=True)
         used, device = views.tolist(), views.device
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
         features = self.tables.features(used, self.image_network, device).look_up(view, projected.at)
         colors = self.tables.colors(used, device).look_up(view, projected.at)
-        return self.look(torch.cat([colors, features], dim=-1))
+        return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.visible)
 
     def _penalty(self, gates: Gates, rays: RayBundle, sources: SourceViews) -> Float[Tensor, "rays"]:
         penalty = self.smoothness * roughness(gates, rays, sources.target)
