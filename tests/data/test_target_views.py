@@ -73,8 +73,9 @@ def test_the_crop_comes_first():
 
 def test_pictures_smaller_than_their_share_of_rays_come_again():
     scene = ball_scene(num_views=4, size=3)
-    pixels = loader(scene=scene).pixels_at(0, 0)
-    assert len(rows(pixels).unique(dim=0)) == 2 * 9
+    pixels, counts = rows(loader(scene=scene).pixels_at(0, 0)).unique(dim=0, return_counts=True)
+    assert len(pixels) == 2 * 9
+    assert int(counts.max()) == 2
 
 
 @pytest.mark.parametrize(
