@@ -147,6 +147,7 @@ def known() -> dict[str, Any]:
         "one": scene.cameras.c2w, "other": 1.3 * scene.cameras.c2w.flip(0), "by": to_user.double(),
         "angles": torch.rand(RAYS, 2, generator=drawn), "vector": 0.3 * points, "light": background,
         "gain": background + 0.5, "tile_points": 500, "fitted": picture[..., 0] > 0.3, "whole_from": 3.0,
+        "views": (0, 2, 3),
     }  # fmt: skip
 
 

@@ -48,7 +48,7 @@ class ImageNetwork(LearntPart):
         for level in self.down:
             found = level(found)
             levels.append(found)
-        wide = functional.interpolate(levels[-1], scale_factor=2, mode="bilinear", align_corners=False)
+        wide = functional.interpolate(levels[-1], scale_factor=2, mode="nearest")
         features = self.out(self.join(torch.cat([wide, levels[-2]], dim=1)))
         return features[:, :, : -(-height // self.scale), : -(-width // self.scale)]
 
@@ -64,14 +64,14 @@ class _Residual(nn.Module):
 
 def _convolve(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode="replicate", bias=False),
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
         nn.InstanceNorm2d(outputs, affine=True),
     )
 
 
 def _halve(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, padding_mode="replicate", bias=False),
+        nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, bias=False),
         nn.InstanceNorm2d(outputs, affine=True),
         nn.ReLU(inplace=True),
     )

@@ -48,6 +48,8 @@ RANGES = {
     "smoothness": (0.0, 1e6),
 }
 
+LEAST_SEEN = 0.5
+"""Of rays that are rendered together: rays past the corners of all photographs are nothing to speak of."""
 COLORS = {"pooled": PooledColor, "blended": BlendedColor}
 
 log = logging.getLogger(__name__)
@@ -268,11 +270,11 @@ class ViewTransformer(Model):
         seen = visible.flatten(1).any(dim=1)
         behind = torch.zeros_like(rgb) if background is None else background
         opacity = seen.to(rgb)
-        if not self.warned and not bool(seen.all()):
+        if not self.training and not self.warned and float(opacity.mean()) < LEAST_SEEN:
             self.warned = True
             log.warning(
-                "no photograph that is looked at sees anything of some rays: they show the background. "
-                "The camera stands outside of what the capture covers"
+                "no photograph that is looked at sees anything of most rays, and they show the background: the camera "
+                "stands outside of what the capture covers"
             )
         return DenseRendering(
             rgb=torch.where(seen[:, None], rgb, behind),

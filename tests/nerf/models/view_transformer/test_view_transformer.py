@@ -72,8 +72,10 @@ def test_a_view_does_not_depend_on_its_own_photograph():
 
 def test_where_no_photograph_sees_anything_the_background_is_shown_and_said(caplog):
     scene = ball_scene()
-    model = looking_model(scene)
+    model = looking_model(scene).eval()
     rays = rays_of_views(scene, [1])
+    assert rendered(model, rays).opacity.min() == 1.0
+    assert not caplog.text
     away = replace(rays, directions=-rays.directions, view_directions=-rays.view_directions)
     away = replace(away, origins=100.0 * rays.origins)
     seen = rendered(model, away)
