@@ -10,6 +10,7 @@ from support.scenes import ball_scene
 from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.data.captures.joined import joined, one_capture, shown_capture
 from nerf_lightning.data.readers.many import ManyReader, numbers_in
+from nerf_lightning.doctor.examine import examine
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.types.scene import Scene
@@ -135,3 +136,8 @@ def test_planted_gain_and_gamma_change_colours_as_said_and_no_alpha(cache: str) 
     assert torch.equal(planted[:, 3], plain[:, 3])
     expected = 255.0 * 0.7 * (plain[:, :3] / 255.0) ** 1.6
     torch.testing.assert_close(planted[:, :3], expected, atol=0.51, rtol=0.0)
+
+
+def test_the_doctor_examines_one_capture_at_a_time(scene: Scene) -> None:
+    with pytest.raises(InputError, match="joins 3 captures, and the doctor examines one"):
+        examine(scene)
