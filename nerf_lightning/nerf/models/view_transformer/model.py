@@ -16,7 +16,7 @@ from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, Pool
 from nerf_lightning.nerf.models.view_transformer.experts import Experts, Gates, imbalance, roughness
 from nerf_lightning.nerf.models.view_transformer.image_network import ImageNetwork
 from nerf_lightning.nerf.models.view_transformer.image_norm import ImageNorm
-from nerf_lightning.nerf.models.view_transformer.projection import Projected, project_samples, seen_cosines
+from nerf_lightning.nerf.models.view_transformer.projection import Projected, project_samples
 from nerf_lightning.nerf.models.view_transformer.source_views import SourceViews, choose_sources
 from nerf_lightning.nerf.models.view_transformer.view_tables import ViewTables
 from nerf_lightning.nerf.products import Linear, Products
@@ -128,7 +128,6 @@ class ViewTransformer(Model):
         )
         self.color = COLORS[color](width)
         self.tables: ViewTables | None = None
-        self.least_cosine: Tensor | None = None
         self.warned = False
 
     @property
@@ -155,7 +154,6 @@ class ViewTransformer(Model):
                 f"{fewest} to look at: give it more training views, or model.num_sources={max(1, fewest - 1)}."
             )
         self.tables, self.warned = ViewTables(photographs), False
-        self.least_cosine = seen_cosines(photographs.cameras)
 
     def forward(
         self, rays: RayBundle, background: Float[Tensor, "*rays 3"] | None, random: RayRandom | None
@@ -170,18 +168,18 @@ class ViewTransformer(Model):
         Raises:
             InputError: there are no photographs to render from.
         """
-        if self.tables is None:
+        tables = self.tables
+        if tables is None:
             raise InputError("model=view_transformer renders from photographs, and was given none: call look_at first.")
-        photographs = self.tables.photographs.to(rays.near.device)
+        photographs = tables.photographs.to(rays.near.device)
         sources = choose_sources(photographs, rays, self.num_sources, random)
         samples = self._samples(rays, random)
         places = sources.places[sources.target]
-        projected = project_samples(
-            photographs.cameras, self.least_cosine.to(rays.near.device), places, rays, samples.midpoints
-        )
+        least_cosine = tables.least_cosine.to(rays.near.device)
+        projected = project_samples(photographs.cameras, least_cosine, places, rays, samples.midpoints)
         visible = projected.visible & sources.given[sources.target][:, None]
         projected = replace(projected, visible=visible)
-        views = self._looked_up(sources, projected)
+        views = self._looked_up(tables, sources, projected)
         states = views.states.masked_fill(~visible[..., None], -torch.inf).amax(dim=-2)
         states = torch.where(visible.any(dim=-1)[..., None], states, 0.0)
         positions = rays.origins[:, None] + samples.midpoints[..., None] * rays.directions[:, None]
@@ -235,8 +233,9 @@ class ViewTransformer(Model):
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
         for module in reversed(list(self.modules())):  # a part has the last word on those within it
-            if module is not self and hasattr(module, "reset_parameters"):
-                module.reset_parameters()
+            reset = getattr(module, "reset_parameters", None)
+            if module is not self and reset is not None:
+                reset()
 
     def _samples(self, rays: RayBundle, random: RayRandom | None) -> RaySamples:
         far = rays.far
@@ -246,12 +245,12 @@ class ViewTransformer(Model):
         inverse = self.sampler(replace(rays, near=1.0 / near, far=1.0 / far), [], random).edges
         return RaySamples(torch.where(deep, 1.0 / inverse, even))
 
-    def _looked_up(self, sources: SourceViews, projected: Projected) -> Views:
+    def _looked_up(self, tables: ViewTables, sources: SourceViews, projected: Projected) -> Views:
         views, numbered = torch.unique(sources.places, return_inverse=True)
         used, device = views.tolist(), views.device
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
-        features = self.tables.features(used, self.image_network, device).look_up(view, projected.at)
-        colors = self.tables.colors(used, device).look_up(view, projected.at)
+        features = tables.features(used, self.image_network, device).look_up(view, projected.at)
+        colors = tables.colors(used, device).look_up(view, projected.at)
         return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.visible)
 
     def _penalty(self, gates: Gates, rays: RayBundle, sources: SourceViews) -> Float[Tensor, "rays"]:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from nerf_lightning.nerf.models.view_transformer.image_network import ImageNetwork
+from nerf_lightning.nerf.models.view_transformer.projection import seen_cosines
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.photographs import Photographs
 
@@ -66,6 +67,7 @@ class ViewTables:
 
     def __init__(self, photographs: Photographs):
         self.photographs = photographs
+        self.least_cosine = seen_cosines(photographs.cameras)
         self._colors, self._features = _Kept(), _Kept()
 
     def colors(self, views: Sequence[int], device: torch.device) -> ViewTable:
