@@ -155,7 +155,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         scene.verify doctor final.evaluate final.video final.page final.report path.file path.view path.views
         evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
-        evaluation.lpips_weights evaluation.lpips_net evaluation.colors
+        evaluation.lpips_weights evaluation.lpips_net evaluation.colors evaluation.nearest_views
         """,
     ),
     (CURVE, "path.**"),

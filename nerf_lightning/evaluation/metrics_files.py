@@ -63,6 +63,6 @@ def write_metrics(folder: Path, result: dict[str, Any]) -> None:
     """Write `metrics.json`, and `metrics.csv` with a row per picture."""
     write_json(folder / "metrics.json", result)
     with whole_file(folder / "metrics.csv") as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({key: for_csv(value) for key, value in row.items()} for row in result["per_image"])

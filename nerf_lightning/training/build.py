@@ -232,6 +232,11 @@ def build_step(
     model = build(config.model) if model is None else model
     refinement: Refinement = build(config.refinement)
     refinement.fit_to(scene)
+    if model.needs_photographs and refinement.moves():
+        raise InputError(
+            "A model that looks at photographs takes their cameras as they are, so nothing is learnt of them: leave "
+            "refinement out. Refine the cameras of a capture with a model of its own (model=fast)."
+        )
     scene = replace(scene, refined=refinement.moves())
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":

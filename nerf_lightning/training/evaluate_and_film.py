@@ -147,6 +147,13 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]
+    if metrics.get("nearest_views") is not None:
+        without = metrics["nearest_views"]
+        lines.append(
+            f"no model     nearest photograph {without['nearest']:.2f} dB, blend of {without['photographs']} "
+            f"{without['blend']:.2f} dB; through a plane {without['nearest_on_plane']:.2f} and "
+            f"{without['blend_on_plane']:.2f} dB"
+        )
     if metrics["depth_error"] is not None:
         normal = metrics["normal_error"]
         angle = "" if normal is None else f"   normal error {normal:.1f} degrees"

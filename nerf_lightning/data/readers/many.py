@@ -74,7 +74,8 @@ class ManyReader(Reader):
         Raises:
             InputError: no captures, captures that cannot be joined, or anything wrong with one of them.
         """
-        if (self.root is None) == (self.variants is None and self.unseen is None) or (self.root and self.variants):
+        nothing = self.root is None and self.variants is None and self.unseen is None
+        if nothing or (self.root is not None and self.variants is not None):
             raise InputError(
                 "scene=many needs a folder of captures (scene.root=DIR), or numbers of bricks models to learn from "
                 "(scene.variants=1-50), and not both."
