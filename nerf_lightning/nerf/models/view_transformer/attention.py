@@ -46,9 +46,10 @@ class ViewAttention(nn.Module):
     ) -> Float[Tensor, "rays samples width"]:
         """Return the states after a look at the views."""
         known = (self.of_view(views) + self.of_turn(self.turn(turned))).float()
+        key, value = known.split([self.narrow, known.shape[-1] - self.narrow], dim=-1)
         query = self.query(self.norm(states))[..., None, :]
-        scores = self.weigh(functional.relu(known[..., : self.narrow] - query))
-        seen = attend(scores.float(), known[..., self.narrow :], visible)
+        scores = self.weigh(functional.relu(key - query))
+        seen = attend(scores.float(), value, visible)
         return states + self.out(seen) * visible.any(dim=-1)[..., None]
 
 

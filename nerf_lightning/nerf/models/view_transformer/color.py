@@ -1,25 +1,12 @@
 """From the states of a ray's points to its colour: read off their mean, or blended of what the sources show there."""
 
-from dataclasses import dataclass
-
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.nerf.models.view_transformer.attention import NARROWER
+from nerf_lightning.nerf.models.view_transformer.views import Views
 from nerf_lightning.nerf.products import Linear, own_precision
-from nerf_lightning.nerf.types.tensor_struct import TensorStruct
-
-
-@dataclass(frozen=True)
-class Views(TensorStruct):
-    """What the sources show at the points of rays."""
-
-    states: Float[Tensor, "rays samples sources width"]
-    """Colour and features together."""
-    colors: Float[Tensor, "rays samples sources 3"]
-    """In [0, 1]."""
-    visible: Bool[Tensor, "rays samples sources"]
 
 
 class PooledColor(nn.Module):

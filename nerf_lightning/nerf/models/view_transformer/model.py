@@ -12,13 +12,15 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.view_transformer.attention import FeedForward, RayAttention, ViewAttention
-from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor, Views
+from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor
 from nerf_lightning.nerf.models.view_transformer.experts import Experts, Gates, imbalance, roughness
 from nerf_lightning.nerf.models.view_transformer.image_network import ImageNetwork
 from nerf_lightning.nerf.models.view_transformer.image_norm import ImageNorm
 from nerf_lightning.nerf.models.view_transformer.projection import Projected, project_samples
 from nerf_lightning.nerf.models.view_transformer.source_views import SourceViews, choose_sources
+from nerf_lightning.nerf.models.view_transformer.start import Largest, Spread
 from nerf_lightning.nerf.models.view_transformer.view_tables import ViewTables
+from nerf_lightning.nerf.models.view_transformer.views import Views
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -50,6 +52,7 @@ RANGES = {
 
 LEAST_SEEN = 0.5
 """Of rays that are rendered together: rays past the corners of all photographs are nothing to speak of."""
+STARTS = {"largest": Largest, "spread": Spread}
 COLORS = {"pooled": PooledColor, "blended": BlendedColor}
 
 log = logging.getLogger(__name__)
@@ -76,6 +79,8 @@ class ViewTransformer(Model):
         image_rate: learning rate of the image network at the beginning; null: that of all.
         image_norm: what is done to photographs before the image network, against exposures that differ: none;
             instance (mean 0 and deviation 1 in each channel); neurn (the local deviation, arXiv 2505.06894).
+        start: what the state of a point begins with: largest (in each channel the largest of its views, as
+            published), or spread (and how far they differ, which says whether they see the same thing).
         color: what makes a ray's colour of the states of its points: pooled (a linear layer on their mean, as
             published), or blended (the sources' colours, weighted by two attentions, and what the mean adds; it learns
             in fewer steps).
@@ -104,6 +109,7 @@ class ViewTransformer(Model):
         image_blocks: int = 2,
         image_rate: float | None = None,
         image_norm: ImageNorm = "none",
+        start: Literal["largest", "spread"] = "largest",
         color: Literal["pooled", "blended"] = "pooled",
         experts: int = 0,
         balance: float = 0.01,
@@ -122,6 +128,7 @@ class ViewTransformer(Model):
         self.image_network = ImageNetwork(image_features, image_scale, image_width, image_blocks, image_norm)
         self.image_network.learning_rate = image_rate
         self.look = nn.Sequential(Linear(image_features + 3, width), nn.ReLU(inplace=True), Linear(width, width))
+        self.begin = STARTS[start](width)
         self.blocks = nn.ModuleList(
             _Block(width, heads, encoded=number % 2 == 0, experts=experts if number % 2 else 0)
             for number in range(blocks)
@@ -180,8 +187,7 @@ class ViewTransformer(Model):
         visible = projected.visible & sources.given[sources.target][:, None]
         projected = replace(projected, visible=visible)
         views = self._looked_up(tables, sources, projected)
-        states = views.states.masked_fill(~visible[..., None], -torch.inf).amax(dim=-2)
-        states = torch.where(visible.any(dim=-1)[..., None], states, 0.0)
+        states = self.begin(views)
         positions = rays.origins[:, None] + samples.midpoints[..., None] * rays.directions[:, None]
         penalty, weights = None, None
         for number, block in enumerate(self.blocks):

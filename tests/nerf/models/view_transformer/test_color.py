@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor, Views
+from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor
+from nerf_lightning.nerf.models.view_transformer.views import Views
 
 
 def views(sources=4):
