@@ -85,6 +85,11 @@ def test_what_needs_density_is_refused_by_name(nerf, run, tmp_path):
         assert not (tmp_path / what).exists()
 
 
+def test_what_is_seen_is_exported(nerf, run, tmp_path):
+    succeeds(nerf("export", f"ckpt={run}", "what=images", f"paths.output_dir={tmp_path}", "trainer=cpu"), "depth")
+    assert len(list((tmp_path / "depth").glob("*.png"))) == 1
+
+
 def test_a_model_of_one_scene_takes_no_other(nerf, finished_run, tmp_path):
     result = nerf("render", f"ckpt={finished_run}", *OTHER, f"paths.output_dir={tmp_path}/film")
     said(result, "knows the scene")
