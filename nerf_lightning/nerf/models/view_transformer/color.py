@@ -44,6 +44,7 @@ class BlendedColor(nn.Module):
         narrow = max(1, width // NARROWER)
         self.norm, self.color, self.where = nn.LayerNorm(width), nn.Linear(width, 3), nn.Linear(width, 1)
         self.of_view, self.of_state = Linear(width, narrow), Linear(width, narrow, bias=False)
+        self.of_turn = nn.Linear(4, narrow, bias=False)
         self.which = nn.Linear(narrow, 1)
         self.reset_parameters()
 
@@ -58,8 +59,8 @@ class BlendedColor(nn.Module):
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
         """Return colours, and the weights of samples in them."""
         states = self.norm(states.float())
-        hidden = functional.relu(self.of_view(views.states) + self.of_state(states)[..., None, :])
-        which = self.which(hidden.float())[..., 0].masked_fill(~views.visible, -1e9).softmax(dim=-1)
+        of_views = self.of_view(views.states) + self.of_turn(views.turned) + self.of_state(states)[..., None, :]
+        which = self.which(functional.relu(of_views.float()))[..., 0].masked_fill(~views.visible, -1e9).softmax(dim=-1)
         seen = (which[..., None] * views.colors).sum(dim=-2)
         of_points = self.where(states)[..., 0].masked_fill(~views.visible.any(dim=-1), -1e9).softmax(dim=-1)
         return (of_points[..., None] * seen).sum(dim=1) + self.color(states.mean(dim=1)), of_points

@@ -257,7 +257,7 @@ class ViewTransformer(Model):
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
         features = tables.features(used, self.image_network, device).look_up(view, projected.at)
         colors = tables.colors(used, device).look_up(view, projected.at)
-        return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.visible)
+        return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.turned, projected.visible)
 
     def _penalty(self, gates: Gates, rays: RayBundle, sources: SourceViews) -> Float[Tensor, "rays"]:
         penalty = self.smoothness * roughness(gates, rays, sources.target)

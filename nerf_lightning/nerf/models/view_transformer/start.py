@@ -51,5 +51,6 @@ def moments(
     values: Float[Tensor, "*points sources channels"], share: Float[Tensor, "*points sources"]
 ) -> tuple[Float[Tensor, "*points channels"], Float[Tensor, "*points channels"]]:
     """Return the mean of values over the sources, and their variance; 0 where the shares are."""
-    mean = (share[..., None, :] @ values)[..., 0, :]
-    return mean, (share[..., None, :] @ (values - mean[..., None, :]).square())[..., 0, :]
+    share = share[..., None]
+    mean = (share * values).sum(dim=-2)
+    return mean, (share * (values - mean[..., None, :]).square()).sum(dim=-2)

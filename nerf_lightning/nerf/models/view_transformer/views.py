@@ -16,4 +16,6 @@ class Views(TensorStruct):
     """Colour and features together."""
     colors: Float[Tensor, "rays samples sources 3"]
     """In [0, 1]."""
+    turned: Float[Tensor, "rays samples sources 4"]
+    """How the ray looks on the point against how the source does (`projection.Projected`)."""
     visible: Bool[Tensor, "rays samples sources"]
