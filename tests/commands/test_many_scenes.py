@@ -63,7 +63,9 @@ def test_it_is_measured_on_its_own_scenes_again_and_on_one_that_is_named(nerf, r
     assert again["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
     other = nerf("eval", f"ckpt={run}", *OTHER, f"paths.output_dir={tmp_path}/other", "trainer=cpu")
     succeeds(other, "test PSNR")
-    assert json.loads((tmp_path / "other" / "metrics.json").read_text())["protocol"]["scene"] == "bricks"
+    metrics = json.loads((tmp_path / "other" / "metrics.json").read_text())
+    assert metrics["protocol"]["scene"] == "bricks"
+    assert metrics["origin"]["trained_on"] == ["bricks_1", "bricks_2"]
 
 
 def test_it_films_a_scene_that_it_has_never_seen_from_its_photographs(nerf, run, tmp_path):
