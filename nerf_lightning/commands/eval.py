@@ -30,6 +30,8 @@ def evaluate(config: DictConfig) -> float:
         origin = measured_of(
             model, checkpoint.config, checkpoint.choices, settings.device, settings.precision, checkpoint.step
         )
+        if model.needs_photographs:
+            origin["trained_on"] = list(checkpoint.scene.trained_captures)
         scoring = build(config.evaluation)
         with torch.no_grad():
             metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)

@@ -44,6 +44,8 @@ def export_one(config: DictConfig) -> list[Path]:
     path = build(config.path) if what.shows_photographs else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
+    if what.needs_density and opened.model.needs_photographs:
+        opened.model.density(torch.zeros(1, 3, device=opened.settings.device))  # or says by name that there is none
     if path is not None:
         asked = config.what.photographs or config.what.max_views
         photographs = read_photographs(config, opened) if asked else None

@@ -19,12 +19,12 @@ def run(config: DictConfig) -> None:
     require_viser()
     named_places(config.viewer.hosts)
     opened = open_checkpoint(config)
-    record = opened.checkpoint.scene
+    record, scene = opened.checkpoint.scene, None
     if opened.model.needs_photographs:
         scene = scene_to_look_at(opened, config.scene if config.photographs else None)
         record = scene_record(scene)
-    else:
-        scene = read_photographs(config, opened) if config.photographs else None
+    elif config.photographs:
+        scene = read_photographs(config, opened)
     background = known_background(config.background or record.background)
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "viewer"))

@@ -63,7 +63,9 @@ def test_it_is_measured_on_its_own_scenes_again_and_on_one_that_is_named(nerf, r
     assert again["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
     other = nerf("eval", f"ckpt={run}", *OTHER, f"paths.output_dir={tmp_path}/other", "trainer=cpu")
     succeeds(other, "test PSNR")
-    assert json.loads((tmp_path / "other" / "metrics.json").read_text())["protocol"]["scene"] == "bricks"
+    metrics = json.loads((tmp_path / "other" / "metrics.json").read_text())
+    assert metrics["protocol"]["scene"] == "bricks"
+    assert metrics["origin"]["trained_on"] == ["bricks_1", "bricks_2"]
 
 
 def test_it_films_a_scene_that_it_has_never_seen_from_its_photographs(nerf, run, tmp_path):
@@ -83,6 +85,11 @@ def test_what_needs_density_is_refused_by_name(nerf, run, tmp_path):
         assert "Traceback" not in result.err
         assert "model=view_transformer makes pictures of rays" in result.err.splitlines()[-1]
         assert not (tmp_path / what).exists()
+
+
+def test_what_is_seen_is_exported(nerf, run, tmp_path):
+    succeeds(nerf("export", f"ckpt={run}", "what=images", f"paths.output_dir={tmp_path}", "trainer=cpu"), "depth")
+    assert len(list((tmp_path / "depth").glob("*.png"))) == 1
 
 
 def test_a_model_of_one_scene_takes_no_other(nerf, finished_run, tmp_path):

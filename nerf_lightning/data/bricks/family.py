@@ -70,10 +70,10 @@ def _light(draws: Draws) -> Light:
     across = float(np.sqrt(1 - height**2))
     warm, strength = draws.number("light.warm", -0.16, 0.2), draws.number("light.strength", 0.6, 1.15)
     sky = draws.number("light.sky", 0.75, 1.3)
-    red, green, blue = DAY.key_color
+    (red, green, blue), (sky_red, sky_green, sky_blue) = DAY.key_color, DAY.sky_light
     return replace(
         DAY,
         key=np.array([across * np.cos(turn), across * np.sin(turn), height]),
         key_color=(strength * red * (1 + warm), strength * green, strength * blue * (1 - warm)),
-        sky_light=tuple(sky * channel for channel in DAY.sky_light),
+        sky_light=(sky * sky_red, sky * sky_green, sky * sky_blue),
     )

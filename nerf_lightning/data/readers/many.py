@@ -3,10 +3,12 @@
 import os
 from collections.abc import Iterable
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 
 from nerf_lightning.console import tracked
 from nerf_lightning.data.bricks.reader import BricksReader
+from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import joined
 from nerf_lightning.data.captures.reader import Spaces
 from nerf_lightning.data.readers.auto import AutoReader
@@ -61,12 +63,27 @@ class ManyReader(Reader):
         allow_outside: bool = False,
         name: str = "many",
     ):
-        self.root, self.variants, self.unseen = root, variants, unseen
-        self.bricks = {"resolution": resolution, "num_train": num_train, "num_val": num_val, "num_test": num_test}
-        self.colors = {"gain": gain, "gamma": gamma}
-        self.of_folder = {"downscale": downscale, "hold_every": hold_every, "space": space}
-        self.of_folder |= {"allow_outside": allow_outside}
-        self.background, self.cache_dir, self.name = background, cache_dir, name
+        self.root, self.variants, self.unseen, self.name = root, variants, unseen, name
+        self.bricks = partial(
+            BricksReader,
+            resolution=resolution,
+            num_train=num_train,
+            num_val=num_val,
+            num_test=num_test,
+            gain=gain,
+            gamma=gamma,
+            background=known_background(background),
+            cache_dir=cache_dir,
+        )
+        self.capture = partial(
+            AutoReader,
+            downscale=downscale,
+            hold_every=hold_every,
+            space=space,
+            background=background,
+            cache_dir=cache_dir,
+            allow_outside=allow_outside,
+        )
 
     def read(self) -> Scene:
         """Return all captures as one scene.
@@ -92,16 +109,7 @@ class ManyReader(Reader):
                 f"scene.unseen={self.unseen} names the bricks models {listed(map(str, both), 5)}, which "
                 f"scene.variants={self.variants} trains on. Leave them out of one of the two."
             )
-        readers: dict[str, Reader] = {
-            f"bricks_{number}": BricksReader(
-                variant=number,
-                **self.bricks,
-                **self.colors,
-                background=self.background,  # type: ignore[arg-type]
-                cache_dir=self.cache_dir,
-            )
-            for number in [*seen, *unseen]
-        }
+        readers: dict[str, Reader] = {f"bricks_{number}": self.bricks(number) for number in [*seen, *unseen]}
         return readers, {f"bricks_{number}" for number in unseen}
 
     def _in_folder(self, root: Path) -> tuple[dict[str, Reader], set[str]]:
@@ -119,12 +127,7 @@ class ManyReader(Reader):
             if not any(fnmatch(name, pattern) for name in names):
                 raise InputError(f"scene.unseen: no capture in {root} is called {pattern}; there are {listed(names)}.")
         unseen = {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
-        readers: dict[str, Reader] = {
-            each.name: AutoReader(
-                root=str(each), background=self.background, cache_dir=self.cache_dir, name=each.name, **self.of_folder
-            )
-            for each in found
-        }
+        readers: dict[str, Reader] = {each.name: self.capture(str(each), name=each.name) for each in found}
         return readers, unseen
 
 
