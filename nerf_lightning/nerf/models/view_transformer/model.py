@@ -9,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.view_transformer.attention import FeedForward, RayAttention, ViewAttention
+from nerf_lightning.nerf.models.view_transformer.block import Block
 from nerf_lightning.nerf.models.view_transformer.color import BlendedColor, PooledColor
-from nerf_lightning.nerf.models.view_transformer.experts import Experts, Gates, imbalance, roughness
+from nerf_lightning.nerf.models.view_transformer.experts import Gates, imbalance, roughness
 from nerf_lightning.nerf.models.view_transformer.image_network import ImageNetwork
 from nerf_lightning.nerf.models.view_transformer.image_norm import ImageNorm
 from nerf_lightning.nerf.models.view_transformer.projection import Projected, project_samples
@@ -31,7 +30,6 @@ from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
-FREQUENCIES = 10
 DEEP = 8.0
 """Rays that end so many times as far as they begin are sampled evenly in inverse distance."""
 NEAREST = 1e-3
@@ -130,7 +128,7 @@ class ViewTransformer(Model):
         self.look = nn.Sequential(Linear(image_features + 3, width), nn.ReLU(inplace=True), Linear(width, width))
         self.begin = STARTS[start](width)
         self.blocks = nn.ModuleList(
-            _Block(width, heads, encoded=number % 2 == 0, experts=experts if number % 2 else 0)
+            Block(width, heads, encoded=number % 2 == 0, experts=experts if number % 2 else 0)
             for number in range(blocks)
         )
         self.color = COLORS[color](width)
@@ -192,7 +190,7 @@ class ViewTransformer(Model):
         penalty, weights = None, None
         for number, block in enumerate(self.blocks):
             last = number == len(self.blocks) - 1
-            states, gates, weights = block(states, views.states, projected, positions, rays, random, last)
+            states, gates, weights = block(states, views, positions, rays, random, last)
             if gates is not None and random is not None:
                 of_block = self._penalty(gates, rays, sources)
                 penalty = of_block if penalty is None else penalty + of_block
@@ -290,46 +288,3 @@ class ViewTransformer(Model):
             samples=samples,
             penalty=penalty,
         )
-
-
-class _Block(nn.Module):
-    # Attention over views, feed-forward layer or experts, encodings where they enter, attention along the ray, and
-    # feed-forward layer again.
-    def __init__(self, width: int, heads: int, encoded: bool, experts: int):
-        super().__init__()
-        self.over_views = ViewAttention(width)
-        self.after_views = Experts(width, experts) if experts else FeedForward(width)
-        self.encoder = FrequencyEncoder(FREQUENCIES) if encoded else None
-        if self.encoder is not None:
-            joined = width + 2 * self.encoder.out_dim
-            self.enter = nn.Sequential(Linear(joined, width), nn.ReLU(inplace=True), Linear(width, width))
-        self.along_ray = RayAttention(width, heads)
-        self.after_ray = FeedForward(width)
-
-    def forward(
-        self,
-        states: Float[Tensor, "rays samples width"],
-        views: Float[Tensor, "rays samples sources width"],
-        projected: Projected,
-        positions: Float[Tensor, "rays samples 3"],
-        rays: RayBundle,
-        random: RayRandom | None,
-        with_weights: bool,
-    ) -> tuple[Tensor, Gates | None, Tensor | None]:
-        gates = None
-        states = self.over_views(states, views, projected.turned, projected.visible)
-        if isinstance(self.after_views, Experts):
-            states, gates = self.after_views(states, _noise(states, self.after_views.experts, random))
-        else:
-            states = self.after_views(states)
-        if self.encoder is not None:
-            direction = self.encoder(rays.view_directions)[:, None].expand(-1, states.shape[1], -1)
-            states = self.enter(torch.cat([states, self.encoder(positions), direction], dim=-1))
-        states, weights = self.along_ray(states, with_weights)
-        return self.after_ray(states), gates, weights
-
-
-def _noise(states: Tensor, experts: int, random: RayRandom | None) -> Float[Tensor, "rays samples experts"] | None:
-    if random is None:
-        return None
-    return random.normal("experts", states.shape[1] * experts).view(*states.shape[:2], experts)

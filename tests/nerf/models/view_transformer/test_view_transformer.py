@@ -74,10 +74,12 @@ def test_where_no_photograph_sees_anything_the_background_is_shown_and_said(capl
     scene = ball_scene()
     model = looking_model(scene).eval()
     rays = rays_of_views(scene, [1])
-    assert rendered(model, rays).opacity.min() == 1.0
-    assert not caplog.text
     away = replace(rays, directions=-rays.directions, view_directions=-rays.view_directions)
     away = replace(away, origins=100.0 * rays.origins)
+    assert rendered(model, rays).opacity.min() == 1.0
+    assert rendered(model.train(), away).opacity.max() == 0.0
+    assert not caplog.text
+    model.eval()
     seen = rendered(model, away)
     assert torch.equal(seen.rgb, torch.ones_like(seen.rgb))
     assert torch.equal(seen.opacity, torch.zeros_like(seen.depth))
