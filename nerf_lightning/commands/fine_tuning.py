@@ -13,6 +13,7 @@ from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.runs.output_folder import beside_checkpoint
 from nerf_lightning.runs.saved_overrides import former_overrides
 from nerf_lightning.training.auto_settings import AUTO
@@ -45,8 +46,9 @@ def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -
     length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null"]
     former = open_sections([*former_overrides(folder, length), *length])
     config, choices = compose_config("train", former)
-    if choices.get("model") == AUTO:
-        former.append(f"model={quoted(checkpoint.choices.get('model'))}")
+    settled = checkpoint.choices.get("model")
+    if choices.get("model") == AUTO and settled in {file.stem for file in (conf_folder() / "model").glob("*.yaml")}:
+        former.append(f"model={settled}")  # what the scene had chosen
         config, _ = compose_config("train", former)
     model = OmegaConf.to_container(config.model, resolve=False)
     return [*former, *dict.fromkeys(f"{_setting(model, name)}={width}" for name, width in widths.items())]

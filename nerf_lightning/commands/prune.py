@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from nerf_lightning import __version__, ranks
+from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.packing import NumberType
 from nerf_lightning.checkpoints.reading import LAST, Checkpoint
@@ -19,7 +19,6 @@ from nerf_lightning.console import say
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
-from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.training.open_checkpoint import open_checkpoint, trusted_modules
 from nerf_lightning.training.packed_weights import packed_weights
 
@@ -34,18 +33,13 @@ SETTINGS = {each.name: each.type for each in fields(Pruning)} | {
 
 
 def run(config: DictConfig) -> float | None:
-    """Write the smaller checkpoint; return the PSNR (dB) where it is fine-tuned, which sweepers may maximise."""
-    return on_all_processes("prune", config, prune_checkpoint)
+    """Write a smaller checkpoint, in this process alone, and fine-tune it where that is asked for.
 
-
-def prune_checkpoint(config: DictConfig) -> float | None:
-    """Write a narrower checkpoint beside the one that is given, and fine-tune it where that is asked for.
+    Returns the PSNR (dB) that fine-tuning came to, which sweepers may maximise.
 
     Raises:
         InputError: the checkpoint cannot be read, nothing of it can be left out, or too much is to be.
     """
-    if not ranks.is_first():
-        return None
     for name, kind in SETTINGS.items():
         require_fitting(config[name], kind, name)
     pruning = Pruning(**{each.name: config[each.name] for each in fields(Pruning)})

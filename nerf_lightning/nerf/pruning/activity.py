@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.models.base import Model
@@ -32,6 +33,9 @@ def mean_activity(
         scene: whose training views rays start from.
         key: of the random numbers.
         tile_points: most points that go through a field at once.
+
+    Raises:
+        InputError: a field is asked about nothing.
     """
     asked: list[tuple[str, Points]] = []
     sums: dict[str, list[Tensor]] = {}
@@ -47,6 +51,12 @@ def mean_activity(
             counts[name] += found[0].shape[0]
             sums[name] = [a + b for a, b in zip(sums[name], parts, strict=True)] if name in sums else parts
         asked.clear()
+    unasked = [name for name, count in counts.items() if not count]
+    if unasked:
+        raise InputError(
+            f"No ray of the training views asks model.{unasked[0]} about any point, so that nothing is known of "
+            "what its neurons do. Choose them by=importance."
+        )
     return {name: [layer / counts[name] for layer in layers] for name, layers in sums.items()}
 
 

@@ -64,6 +64,9 @@ def prune(
         pruning: which neurons stay.
         scene: from whose training views the neurons' activity is measured.
         tile_points: most points that go through a field at once.
+
+    Raises:
+        InputError: activity is to tell, and rays ask a field about nothing.
     """
     fields, state, shapes = prunable_fields(model), model.state_dict(), narrower.state_dict()
     key = fold(pruning.seed, "pruning")

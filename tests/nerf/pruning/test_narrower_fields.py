@@ -158,6 +158,13 @@ def test_activity_is_the_mean_over_the_points_that_are_asked_about():
         assert "density" not in vars(field)
 
 
+def test_a_field_that_is_asked_about_nothing_is_said():
+    model = tiny_model().eval()
+    fields = prunable_fields(model) | {"another": tiny_field()}
+    with pytest.raises(InputError, match=r"No ray of the training views asks model\.another about any point"):
+        mean_activity(model, fields, ball_scene(), key=4, tile_points=1 << 12)
+
+
 def test_the_bias_is_a_weight_that_makes_a_neuron_and_the_norm_is_not():
     for field in (tiny_field(), tiny_field(batch_norm=True)):
         state, (first, *_) = field.state_dict(), field.hidden_layers()
