@@ -38,7 +38,8 @@ def packed_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[s
             "drop_empty=true: this model has no occupancy grid, which would say what is empty. Leave it out."
         )
     reached = _reached(model) if drop_empty else {}
-    rows, switches = {}, {}
+    rows: dict[str, Any] = {}
+    switches: dict[str, Any] = {}
     for name, encoder in encoders.items() if tables != "float32" or reached else ():
         if tables == "float16" and float(encoder.table.abs().max()) > LARGEST_FLOAT16:
             raise InputError(

@@ -124,8 +124,8 @@ class NerfMLP(Field):
 
     def hidden_layers(self) -> list[HiddenLayer]:
         """Return the layers of the trunk, the feature and the colour's; encodings that join them stand behind them."""
-        readers = [(f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk))]
-        readers.append(("density_head.weight", "feature.weight"))
+        following = ((f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk)))
+        readers = (*following, ("density_head.weight", "feature.weight"))
         trunk = [HiddenLayer(self._rows(f"trunk.{number}"), each) for number, each in enumerate(readers)]
         feature = HiddenLayer(("feature.weight", "feature.bias"), ("color_hidden.0.weight",))
         return [*trunk, feature, HiddenLayer(self._rows("color_hidden"), ("color_head.weight",))]
