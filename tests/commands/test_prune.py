@@ -8,6 +8,8 @@ from support.running import refused, said
 from support.scenes import some_rays
 
 from nerf_lightning.checkpoints.reading import read_checkpoint, read_content
+from nerf_lightning.commands.fine_tuning import fine_tuning
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.load_model import load_model
 
 
@@ -63,6 +65,31 @@ def test_a_run_is_pruned_packed_measured_and_trained_on(nerf, stopped_fast, capt
     assert load_model(read_checkpoint(run)).last.field.density_mlp[0].shape[0] == 8
     # What training goes on from is in the run that followed, and not in the file that was made smaller.
     refused(read_content, small, True, parts=("last.ckpt", "lacks"))
+
+
+def test_what_fine_tunes_is_the_runs_own_training_at_the_narrower_widths(tmp_path):
+    run = tmp_path / "run"
+    for folder in (".hydra", "checkpoints"):
+        (run / folder).mkdir(parents=True)
+    write_checkpoint(run / "checkpoints" / "last.ckpt")
+    checkpoint = read_checkpoint(run)
+
+    def after(*typed):
+        (run / ".hydra" / "overrides.yaml").write_text(
+            yaml.safe_dump([*typed, "paths.output_dir=there", "init_from=a"])
+        )
+        return fine_tuning(checkpoint, {"levels.coarse.field": 16, "levels.fine.field": 16}, 5)
+
+    length = ["trainer.max_steps=5", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
+    typed = ["optimizer.lr=1e-3", "model=nerf_small"]
+    assert after(*typed, "trainer.max_steps=900", "data.crop_steps=9") == [*typed, *length, "field.width=16"]
+    # Where nothing was typed, it is the model that the scene had chosen, which the checkpoint remembers.
+    assert after("seed=3") == ["seed=3", *length, "model=nerf_tiny", "field.width=16"]
+    (run / ".hydra" / "overrides.yaml").write_text("- model=fast_proposal")
+    *_, proposal, fine = fine_tuning(checkpoint, {"levels.proposal.field": 8, "levels.fine.field": 32}, 5)
+    assert (proposal, fine) == ("model.levels.proposal.field.width=8", "field.width=32")
+    compose_config("train", [proposal, fine, "model=fast_proposal"])
+    assert fine_tuning(checkpoint, {}, 0) is None
 
 
 def test_without_neurons_that_went_the_smaller_file_shows_the_same(nerf, stopped_fast, tmp_path):
