@@ -42,6 +42,7 @@ from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.build import build_step
 from nerf_lightning.training.callbacks.watcher import Watcher
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -87,7 +88,7 @@ class Bench:
 
 def benchmark(config: DictConfig) -> float:
     """Measure as the config says."""
-    bench = _prepare(config)
+    bench = prepare(config, build(config.scene).read())
     reached = _train_first(bench, config)
     loaded_steps = LoadedSteps(bench.batches, bench.train_on, config.steps)
     kinds: dict[str, Callable[[], Any]] = {
@@ -140,10 +141,10 @@ def _train_first(bench: Bench, config: DictConfig) -> tuple[float, int] | None:
     return None
 
 
-def _prepare(config: DictConfig) -> Bench:
+def prepare(config: DictConfig, scene: Scene) -> Bench:
+    """Build what is to be measured."""
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    scene = build(config.scene).read()
     progress = Progress()
     step = build_step(config, settings, scene, progress).to(settings.device)
     step.num_steps = max(1, config.warmup_steps)
@@ -203,7 +204,7 @@ def _plainly(bench: Bench) -> Iterator[None]:
     for sampler in samplers:
         sampler.opaque_below = 0.0
     _release_gradients(bench)
-    with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu"):
+    with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu", "render.bfloat16"):
         yield
     bench.settings.prepare(bench.step.model)
     for sampler, value in zip(samplers, former, strict=True):

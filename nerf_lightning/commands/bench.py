@@ -4,7 +4,11 @@ from omegaconf import DictConfig
 
 
 def run(config: DictConfig) -> float:
-    """Measure, print a table, write bench.json; return training rays per second."""
+    """Measure, print a table, write bench.json; return training rays per second, or the largest exponent of a step."""
+    if config.scaling is not False:
+        from nerf_lightning.bench.scaling import benchmark_scaling
+
+        return max(benchmark_scaling(config).values())
     from nerf_lightning.bench.benchmark import benchmark
 
     return benchmark(config)

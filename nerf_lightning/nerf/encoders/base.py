@@ -5,6 +5,8 @@ from abc import ABC, abstractmethod
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+
 
 class Encoder(nn.Module, ABC):
     """Map coordinates to features that an MLP can resolve. `in_dim` is 3: positions or unit directions."""
@@ -37,6 +39,10 @@ class Encoder(nn.Module, ABC):
         Their gradients are all but zero in most rows, and they do not decay.
         """
         return []
+
+    def grid(self) -> tuple[Float[Tensor, "entries features"], HashGridLayout] | None:
+        """Return the table and its layout where the features are those of one hash grid and nothing else; else None."""
+        return None
 
     @abstractmethod
     def reset_parameters(self) -> None:

@@ -11,7 +11,7 @@ from torch.nn import functional
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
-from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.ranges import require_ranges
 
 INITIAL_RANGE = 1e-4
@@ -84,6 +84,10 @@ class HashGridEncoder(Encoder):
     def tables(self) -> list[nn.Parameter]:
         """Return the one table, in which all levels lie."""
         return [self.table]
+
+    def grid(self) -> tuple[Tensor, HashGridLayout] | None:
+        """Return the table and its layout; None while levels are blended in."""
+        return None if self._blends else (self.table, self.layout)
 
     def attach_gradients(
         self, points: Float[Tensor, "*points 3"], features: Float[Tensor, "*points features"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -69,6 +70,10 @@ class Field(nn.Module, ABC):
     def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
         """Return what the neurons of `hidden_layers` come to at points with directions, layer by layer."""
         return []
+
+    def parts(self) -> FieldParts | None:
+        """Return what kernels need that render whole rays by themselves; None where the field is of another kind."""
+        return None
 
     @abstractmethod
     def reset_parameters(self) -> None:

@@ -14,6 +14,7 @@ from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
@@ -134,6 +135,14 @@ class HashField(Field):
         """Return what the neurons of `hidden_layers` come to, layer by layer."""
         *density, features = _layer_by_layer(self.density_mlp, self.position_encoder(self._unit(points.positions)))
         return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
+
+    def parts(self) -> FieldParts | None:
+        """Return table and weights, of a field over a box whose colours are the same for all photographs."""
+        grid = self.position_encoder.grid()
+        if grid is None or self.contracted.is_on() or self.appearance:
+            return None
+        density, color = list(self.density_mlp), list(self.color_mlp)
+        return FieldParts(self.aabb, *grid, float(self.bias), density, color, self.direction_encoder)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.kernels.render.render import can_render_whole, render_whole
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
@@ -133,6 +134,10 @@ class PackedLevel(Level):
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         walk = self.sampler.walk(rays)
+        march, parts = walk.march(), self.field.parts()
+        if march is not None and parts is not None and can_render_whole(parts, self.field.products, rays.near.device):
+            rgb, opacity, depth = render_whole(rays, parts, *march, LEAST_ALPHA, self.sampler.opaque_below)
+            return _in_front_of(background, rays, rgb, 1.0 - opacity, depth)
         rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
         light = torch.ones_like(rays.near)  # what no sample has absorbed yet
         alive = torch.arange(rays.near.shape[0], device=rays.near.device)
@@ -146,12 +151,7 @@ class PackedLevel(Level):
             depth[alive] += before * (part.depth - (1.0 - part.opacity) * left.far)
             light[alive] = before * (1.0 - part.opacity)
             alive = alive[more & (light[alive] > self.sampler.opaque_below)]
-        return Rendering(
-            rgb=rgb if background is None else rgb + light[:, None] * background,
-            foreground=rgb,
-            opacity=1.0 - light,
-            depth=depth + light * rays.far,
-        )
+        return _in_front_of(background, rays, rgb, light, depth)
 
     def _colors(self, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
         # Most samples are all but transparent: their colour, which costs most, is not asked for.
@@ -163,3 +163,15 @@ class PackedLevel(Level):
         seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
         rgb[seen] = self.field(points[seen], features[seen]).rgb
         return FieldOutput(density=density, rgb=rgb)
+
+
+def _in_front_of(
+    background: Tensor | None, rays: RayBundle, foreground: Tensor, light: Tensor, depth: Tensor
+) -> Rendering:
+    """Return what is seen, given the light that comes through and the sum of w t."""
+    return Rendering(
+        rgb=foreground if background is None else foreground + light[:, None] * background,
+        foreground=foreground,
+        opacity=1.0 - light,
+        depth=depth + light * rays.far,
+    )

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
-from nerf_lightning.nerf.kernels.threads import in_parallel, threads_on
+from nerf_lightning.nerf.kernels.threads import FEWEST_ROWS, PARTS_PER_THREAD, in_parallel, threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
@@ -128,7 +128,9 @@ def _render_in_tiles(model: Model, rays: RayBundle, background: Background, at_o
         for column, result in zip(columns, _render_tile(model, rays[part].to(device), background), strict=True):
             column[part] = result
 
-    threads = threads_on(device) if count > at_once else 1
+    threads = threads_on(device)
+    if threads > 1:  # small pictures, too, are shared out
+        at_once = min(at_once, max(FEWEST_ROWS, -(-count // (PARTS_PER_THREAD * threads))))
     parts = list(tiles(count, at_once, multiple=threads))
     if threads > 1:
         in_parallel(render, parts)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
@@ -70,6 +71,10 @@ class Walk(ABC):
     @abstractmethod
     def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
         """Return the next samples of some of the rays, about `limit` each at most, and which rays have more of them."""
+
+    def march(self) -> tuple[March, Float[Tensor, "edges"], OccupancyCells] | None:
+        """Return where a march through a grid begins, for kernels that do all of it; None where that is no march."""
+        return None
 
 
 class PackedSampler(Sampler, ABC):

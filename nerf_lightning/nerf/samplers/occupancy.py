@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.carving.carve import possible_cells
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, March
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
 from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
@@ -293,3 +293,7 @@ class _Marches(Walk):
         samples, following = march(self.rays[alive], self.state[alive], self.lattice, self.cells, limit)
         self.state.next[alive] = following
         return samples, following < self.lattice.numel() - 2
+
+    def march(self) -> tuple[March, Float[Tensor, "edges"], OccupancyCells]:
+        """Return where each ray stands, and through what it goes."""
+        return self.state, self.lattice, self.cells

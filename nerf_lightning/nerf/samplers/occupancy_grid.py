@@ -1,12 +1,14 @@
 """The grid of an occupancy sampler: where its cells lie, and what is known of each."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over
 
 # The floor of a cell's density follows what is found down at once and up slowly, so that a cell with a surface in it
 # counts as thin, and only solid matter ends a march.
@@ -30,6 +32,8 @@ class OccupancyGrid(nn.Module):
     """1 where occupied."""
     blocks: Tensor
     """1 where any cell of a block is."""
+    leaps: Tensor | None
+    """How far the next such block is; None until it is asked for."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,6 +51,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
+        self.register_buffer("leaps", None, persistent=False)
 
     def require_sound_state(self) -> None:
         """Look at what was loaded.
@@ -62,7 +67,10 @@ class OccupancyGrid(nn.Module):
 
     def occupied(self) -> OccupancyCells:
         """Return what a march looks at: which cells are occupied now."""
-        return OccupancyCells(self.aabb, self.cells, self.blocks, self.floor)
+        leaps = self.leaps  # threads may ask at once: each takes what it sees
+        if leaps is None:
+            leaps = self.leaps = leaps_over(self.blocks)
+        return OccupancyCells(self.aabb, self.cells, leaps, self.floor)
 
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""
@@ -80,6 +88,11 @@ class OccupancyGrid(nn.Module):
         """Say which cells rays may not pass over."""
         self.cells.copy_(occupied)
         self.blocks.copy_(blocks_of(self.cells))
+        self.leaps = None
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self.leaps = None
 
     def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
         """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""

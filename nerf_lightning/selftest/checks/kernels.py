@@ -15,7 +15,7 @@ from nerf_lightning.nerf.kernels.compile import CPU_TWINS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
@@ -171,7 +171,7 @@ def _march(device: torch.device, capacity: int | None) -> float:
     enter, leave = distances_in_box(rays, 2.0 * box)
     state = March(enter, leave, torch.rand(RAYS, generator=random), whole)
     cells = (torch.rand(2, 16, 16, 16, generator=random) < 0.3).to(torch.uint8)
-    grid = OccupancyCells(box, cells, blocks_of(cells), 2.0 * torch.rand(cells.shape, generator=random))
+    grid = OccupancyCells(box, cells, leaps_over(blocks_of(cells)), 2.0 * torch.rand(cells.shape, generator=random))
     lattice = torch.arange(1.9, 6.2, 0.02)
     expected, _ = march_torch(rays, state, lattice, grid, None, None)
     found, _ = march(rays.to(device), state.to(device), lattice.to(device), grid.to(device), capacity=capacity)

@@ -5,7 +5,7 @@ import torch
 from support.scenes import some_rays
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.grid import FARTHEST, March, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 
@@ -24,7 +24,7 @@ def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0, densit
 
 
 def grid_of(cells, density):
-    return OccupancyCells(AABB, cells, blocks_of(cells), density * torch.rand(cells.shape))
+    return OccupancyCells(AABB, cells, leaps_over(blocks_of(cells)), density * torch.rand(cells.shape))
 
 
 @pytest.mark.parametrize("limit", [None, 1, 5])
@@ -42,6 +42,24 @@ def test_skipping_keeps_what_looking_everywhere_keeps(cascades, growth, share, l
     assert torch.equal(a.ray_index, b.ray_index)
     torch.testing.assert_close(a.starts, b.starts)
     torch.testing.assert_close(a.ends, b.ends)
+
+
+def test_large_empty_spaces_are_left_at_one_leap():
+    """A few cells in a large grid: leaps over many blocks, past whatever is next to them."""
+    given = a_march(count=2000, resolution=96, share=1e-3)
+    (fast, fast_next), (slow, slow_next) = march(*given), march_torch(*given, None, None)
+    assert int(((fast.bounds.diff() != slow.bounds.diff()) | (fast_next != slow_next)).sum()) <= 2
+    assert int(slow.bounds[-1]) > 100
+
+
+def test_leaps_are_distances_to_the_next_occupied_block():
+    blocks = (torch.rand(1, 12, 10, 11) < 0.003).to(torch.uint8)
+    blocks[0, 3, 4, 5] = 1
+    a, b = torch.cartesian_prod(*map(torch.arange, blocks.shape[1:])), blocks[0].nonzero()
+    expected = (a[:, None] - b).abs().amax(dim=-1).amin(dim=-1).clamp(max=FARTHEST)
+    assert torch.equal(leaps_over(blocks).flatten().long(), expected)
+    nested = leaps_over(blocks.expand(2, -1, -1, -1))
+    assert torch.equal(nested, 1 - blocks.expand(2, -1, -1, -1))
 
 
 def _of_rays(samples, chosen):
@@ -76,7 +94,7 @@ def test_a_march_ends_behind_what_is_opaque_by_a_wide_margin():
     fast, _ = march(rays, state, lattice, grid)
     slow, _ = march_torch(rays, state, lattice, grid, None, None)
     assert torch.equal(fast.bounds, slow.bounds)
-    everything, _ = march(rays, state, lattice, OccupancyCells(AABB, grid.cells, grid.blocks, 0 * grid.floor))
+    everything, _ = march(rays, state, lattice, OccupancyCells(AABB, grid.cells, grid.leaps, 0 * grid.floor))
     assert fast.starts.numel() < 0.5 * everything.starts.numel()
     optical = torch.zeros(200).index_add(0, fast.ray_index, density_at(rays, fast, grid) * fast.deltas)
     cut = fast.bounds.diff() < everything.bounds.diff()

@@ -35,7 +35,7 @@ def forward(
     """Return the features."""
     lanes = (0,) * table.shape[1]
     out = torch.empty(points.shape[0], len(layout.resolutions) * len(lanes))
-    over_rows(_forward, points.shape[0], table.numpy(), points.numpy(), *_arrays(layout), lanes, out.numpy())
+    over_rows(encode, points.shape[0], table.numpy(), points.numpy(), *level_arrays(layout), lanes, out.numpy())
     return out
 
 
@@ -46,7 +46,7 @@ def add_table_gradient(
     layout: "HashGridLayout",
 ) -> None:
     """Add the gradient with respect to the table to `into`."""
-    given = (into.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), (0,) * into.shape[1])
+    given = (into.numpy(), points.numpy(), grad.numpy(), *level_arrays(layout), (0,) * into.shape[1])
     # Fine levels take longest: they come first.
     in_parallel(lambda level: _add_table_gradient(level, *given), range(len(layout.resolutions))[::-1])
 
@@ -60,7 +60,7 @@ def point_gradient(
     """Return the gradient with respect to the points."""
     out = torch.empty_like(points)
     lanes = (0,) * table.shape[1]
-    arrays = (table.numpy(), points.numpy(), grad.numpy(), *_arrays(layout), lanes, out.numpy())
+    arrays = (table.numpy(), points.numpy(), grad.numpy(), *level_arrays(layout), lanes, out.numpy())
     over_rows(_point_gradient, points.shape[0], *arrays)
     return out
 
@@ -77,7 +77,8 @@ def trial() -> None:
         point_gradient(table, points, grad, layout)
 
 
-def _arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
+def level_arrays(layout: "HashGridLayout") -> tuple[Any, ...]:
+    """Return what the kernels take of a layout."""
     resolutions = np.array(layout.resolutions, np.int32)
     hashed = np.array([layout.is_hashed(level) for level in range(len(resolutions))])
     return resolutions, np.array(layout.offsets, np.int64), hashed, np.uint32(layout.table_size - 1)
@@ -205,7 +206,8 @@ def _ask_for(address, entry_bytes, e):
 # Each loop below finds a point's cell in the same four lines: a function that returned all of it took twice the time.
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _forward(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
+def encode(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
+    """Write the features of the points from first to last."""
     width = len(lanes)
     address, entry_bytes = np.int64(table.ctypes.data), np.int64(4 * width)
     for chunk in range(first, last, CHUNK):

@@ -1,4 +1,4 @@
-"""The march for the CPU: whole blocks and cells that are empty are stepped over."""
+"""The march for the CPU: cells that are empty, and whole blocks of them with what is empty around, are stepped over."""
 
 from typing import no_type_check
 
@@ -9,11 +9,11 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, OccupancyCells, blocks_of
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
-COMPILED_WITH = "f49dabea"
+COMPILED_WITH = "a901015c"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -26,13 +26,10 @@ def march(
     """Return the occupied intervals and where each ray would go on."""
     count, edges = rays.near.shape[0], lattice.shape[0]
     most = min(edges, limit if limit is not None else edges)
-    # In coordinates of the box, which is the cube from -1 to 1.
-    center, half = center_and_half(grid.aabb)
-    origins = (rays.origins - center) / half
-    ray = (origins, rays.directions / half, state.enter, state.leave, state.jitter)
+    ray = (*in_box(rays, grid), state.enter, state.leave, state.jitter)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
-    arrays = (*ray, lattice, grid.cells, grid.blocks, grid.floor, state.next, numbers, bounds, following)
+    arrays = (*ray, lattice, grid.cells, grid.leaps, grid.floor, state.next, numbers, bounds, following)
     over_rows(_find, count, *(x.contiguous().numpy() for x in arrays))
     torch.cumsum(bounds, 0, out=bounds)
     total = int(bounds[-1])
@@ -41,35 +38,43 @@ def march(
     return PackedSamples(*out, bounds, bounds[-1]), following
 
 
+def in_box(rays: RayBundle, grid: OccupancyCells) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+    """Return origins and directions in coordinates of the grid's box, which is the cube from -1 to 1."""
+    center, half = center_and_half(grid.aabb)
+    return (rays.origins - center) / half, rays.directions / half
+
+
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
-    grid = OccupancyCells(aabb, cells, blocks_of(cells), cells.float())
+    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)), cells.float())
     march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
 
 
 @njit(fastmath=True)
 @no_type_check
-def _edge(lattice, jitter, k):
+def edge(lattice, jitter, k):
+    """Return where interval k of a ray begins."""
     return lattice[k] + jitter * (lattice[k + 1] - lattice[k])
 
 
 @njit(fastmath=True)
 @no_type_check
-def _middle(lattice, jitter, k):
-    return HALF * (_edge(lattice, jitter, k) + _edge(lattice, jitter, k + 1))
+def middle(lattice, jitter, k):
+    """Return the middle of interval k of a ray."""
+    return HALF * (edge(lattice, jitter, k) + edge(lattice, jitter, k + 1))
 
 
 @njit(fastmath=True)
 @no_type_check
-def _first_from(lattice, jitter, k, t):
-    # The first interval, not before k, whose middle is not before t.
+def first_from(lattice, jitter, k, t):
+    """Return the first interval, not before k, whose middle is not before t."""
     low, high = k, lattice.shape[0] - 2
     while low < high:
         between = (low + high) // 2
-        if _middle(lattice, jitter, between) < t:
+        if middle(lattice, jitter, between) < t:
             low = between + 1
         else:
             high = between
@@ -78,12 +83,12 @@ def _first_from(lattice, jitter, k, t):
 
 @njit(fastmath=True)
 @no_type_check
-def _ahead(unit, speed):
-    # Distance to the end of the cell, of side 1, that `unit` lies in, along one axis.
+def _ahead(unit, speed, around):
+    # Distance to the end of the cell, of side 1, that `unit` lies in and of so many around it, along one axis.
     if speed > 0:
-        return (np.floor(unit) + ONE - unit) / speed
+        return (np.floor(unit) + ONE + around - unit) / speed
     if speed < 0:
-        return (np.floor(unit) - unit) / speed
+        return (np.floor(unit) - around - unit) / speed
     return FAR_AWAY
 
 
@@ -101,12 +106,14 @@ def _cascade(x, y, z, cascades):
 
 @njit(fastmath=True)
 @no_type_check
-def _end_of_empty(x, y, z, dx, dy, dz, block_is_empty, scale):
-    # Distance to the end of the empty cell or block that a point, in units of cells, lies in; a hair short.
-    if block_is_empty:
-        shrink = ONE / np.float32(BLOCK)
+def _end_of_empty(x, y, z, dx, dy, dz, leap, scale):
+    # Distance to the end of what is empty around a point, in units of cells: its cell, or blocks; a hair short.
+    around = np.float32(0.0)
+    if leap > 0:
+        shrink, around = ONE / np.float32(BLOCK), np.float32(leap) - ONE
         x, y, z, scale = x * shrink, y * shrink, z * shrink, scale * shrink
-    return min(_ahead(x, dx * scale), _ahead(y, dy * scale), _ahead(z, dz * scale)) * np.float32(0.9999)
+    ahead = min(_ahead(x, dx * scale, around), _ahead(y, dy * scale, around), _ahead(z, dz * scale, around))
+    return ahead * np.float32(0.9999)
 
 
 @njit(fastmath=True)
@@ -116,23 +123,23 @@ def _skip(lattice, jitter, k, t, ahead):
     end = lattice.shape[0] - 2
     longest = lattice[end + 1] - lattice[end]
     k += max(1, int(ahead / longest))
-    while k < end and _middle(lattice, jitter, k) < t + ahead:
+    while k < end and middle(lattice, jitter, k) < t + ahead:
         k += 1
     return k
 
 
 @njit(fastmath=True)
 @no_type_check
-def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, blocks, floor, k, numbers):
-    # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
+def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k):
+    """Return the first interval from k on that is occupied, and its cell; the lattice's end where there is none."""
     end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[1])
-    last, found, optical = resolution - np.int32(1), 0, np.float32(0.0)
-    while k < end and found < numbers.shape[0]:
-        t = _middle(lattice, jitter, k)
+    last = resolution - np.int32(1)
+    while k < end:
+        t = middle(lattice, jitter, k)
+        if t > leave:
+            break
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         cascade, size, inside = _cascade(x, y, z, cells.shape[0])
-        if t > leave or optical > OPAQUE:
-            return found, end
         if not inside:
             k += 1
             continue
@@ -140,28 +147,40 @@ def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, blocks, floor, 
         x, y, z = (x + size) * scale, (y + size) * scale, (z + size) * scale
         a, b, c = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
         if cells[cascade, a, b, c]:
-            optical += floor[cascade, a, b, c] * (_edge(lattice, jitter, k + 1) - _edge(lattice, jitter, k))
-            numbers[found] = k
-            found += 1
-            k += 1
-        else:
-            empty = not blocks[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
-            k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, empty, scale))
+            return k, cascade, a, b, c
+        leap = leaps[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
+        k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, leap, scale))
+    return end, 0, np.int32(0), np.int32(0), np.int32(0)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, floor, k, numbers):
+    # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
+    end, found, optical = lattice.shape[0] - 2, 0, np.float32(0.0)
+    while found < numbers.shape[0]:
+        k, cascade, a, b, c = next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k)
+        if k >= end or optical > OPAQUE:
+            return found, end
+        optical += floor[cascade, a, b, c] * (edge(lattice, jitter, k + 1) - edge(lattice, jitter, k))
+        numbers[found] = k
+        found += 1
+        k += 1
     return found, min(k, end)
 
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def _find(
-    first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, blocks, floor, first, numbers, bounds, following
+    first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, leaps, floor, first, numbers, bounds, following
 ):
     for r in range(first_ray, last_ray):
         found, k = 0, lattice.shape[0] - 2
         if enter[r] < leave[r]:
-            k = _first_from(lattice, jitters[r], first[r], enter[r])
+            k = first_from(lattice, jitters[r], first[r], enter[r])
             found, k = _walk(
                 *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]),
-                *(leave[r], lattice, jitters[r], cells, blocks, floor, k, numbers[r]),
+                *(leave[r], lattice, jitters[r], cells, leaps, floor, k, numbers[r]),
             )
         bounds[r + 1] = found
         following[r] = k
@@ -174,5 +193,5 @@ def _pack(first_ray, last_ray, jitters, lattice, numbers, bounds, index, starts,
         for place in range(bounds[r], bounds[r + 1]):
             k = numbers[r, place - bounds[r]]
             index[place] = r
-            starts[place] = _edge(lattice, jitters[r], k)
-            ends[place] = _edge(lattice, jitters[r], k + 1)
+            starts[place] = edge(lattice, jitters[r], k)
+            ends[place] = edge(lattice, jitters[r], k + 1)

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 BLOCK = 4
 """Side of the blocks of cells that are skipped at once where all are empty."""
-
+FARTHEST = 8
+"""So many blocks on are skipped at once, at most."""
 
 OPAQUE = 12.0
 """Optical depth, by the floor of the cells' densities, behind which nothing is kept."""
@@ -24,8 +26,8 @@ class OccupancyCells(TensorStruct):
     """The box of cascade 0."""
     cells: UInt8[Tensor, "cascades x y z"]
     """1 where occupied."""
-    blocks: UInt8[Tensor, "cascades a b c"]
-    """1 where any cell of a block is."""
+    leaps: UInt8[Tensor, "cascades a b c"]
+    """What `leaps_over` says of each block of cells: how much around it is empty."""
     floor: Float[Tensor, "cascades x y z"]
     """About the smallest density in each cell: a march ends where so much matter lies before it that nothing behind
     can be seen, even by this cautious guess."""
@@ -33,7 +35,21 @@ class OccupancyCells(TensorStruct):
 
 def blocks_of(cells: UInt8[Tensor, "cascades x y z"]) -> UInt8[Tensor, "cascades a b c"]:
     """Return which blocks of cells hold an occupied one; the grid's side is a multiple of 4."""
-    return torch.nn.functional.max_pool3d(cells.float(), BLOCK).to(torch.uint8)
+    return functional.max_pool3d(cells.float(), BLOCK).to(torch.uint8)
+
+
+def leaps_over(blocks: UInt8[Tensor, "cascades a b c"]) -> UInt8[Tensor, "cascades a b c"]:
+    """Return how far from each block the next occupied one is, in blocks along the axis where it is farthest.
+
+    0 for a block that is occupied, 1 for a neighbour, `FARTHEST` at most. Where boxes lie in each other 1 at most: what
+    lies around a block may be another box's to say.
+    """
+    reached = blocks.float()
+    leaps = torch.zeros_like(reached)
+    for _ in range(FARTHEST if blocks.shape[0] == 1 else 1):
+        leaps += 1.0 - reached
+        reached = functional.max_pool3d(reached, 3, stride=1, padding=1)
+    return leaps.to(torch.uint8)
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
         weights: float32.
         keep: whether a backward pass follows.
     """
-    points, widths = points.float().contiguous(), _widths(weights)
+    points, widths = points.float().contiguous(), padded_widths(weights)
     rows, words = points.shape[0], sum(widths[:-1]) // 2
-    packed, dims = _packed(weights, widths, transposed=False), np.array(widths)
+    packed, dims = packed_words(weights, widths, transposed=False), np.array(widths)
     padded = -(-rows // ROWS) * ROWS
     out = points.new_empty(padded, weights[-1].shape[0])
     kept = torch.empty(padded if keep else 0, words, dtype=torch.int32)
@@ -63,8 +63,8 @@ def backward(
     grad: Tensor, weights: Sequence[Tensor], kept: Tensor, wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:
     """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
-    widths = _widths(weights)
-    packed, dims = _packed(weights, widths, transposed=True), np.array(widths)
+    widths = padded_widths(weights)
+    packed, dims = packed_words(weights, widths, transposed=True), np.array(widths)
     rows = grad.shape[0]
     grad_points = grad.new_empty(kept.shape[0] if wants_points else 0, weights[0].shape[1])
     tiles = tiles_of_rows(rows)
@@ -90,19 +90,29 @@ def trial() -> None:
     Raises:
         RuntimeError: numba compiles for a CPU without these instructions, which LLVM would end the program for.
     """
-    if numba.config.CPU_NAME or not llvm.get_host_cpu_features().get("avx512bf16"):  # type: ignore[attr-defined]
-        raise RuntimeError("numba does not know that this CPU multiplies bfloat16 (AVX512-BF16)")
+    require_bfloat16()
     points, weights = torch.ones(3, 16), [torch.ones(16, 16), torch.ones(3, 16)]
     out, kept = forward(points, weights, keep=True)
     backward(out, weights, kept, wants_points=True)
 
 
-def _widths(weights: Sequence[Tensor]) -> list[int]:
+def require_bfloat16() -> None:
+    """Look whether LLVM, too, knows of this CPU's instructions.
+
+    Raises:
+        RuntimeError: numba compiles for a CPU without them, which LLVM would end the program for.
+    """
+    if numba.config.CPU_NAME or not llvm.get_host_cpu_features().get("avx512bf16"):  # type: ignore[attr-defined]
+        raise RuntimeError("numba does not know that this CPU multiplies bfloat16 (AVX512-BF16)")
+
+
+def padded_widths(weights: Sequence[Tensor]) -> list[int]:
+    """Return the widths of all layers' inputs and of what comes out, in whole vectors."""
     widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
     return [-(-width // LANES) * LANES for width in widths]
 
 
-def _packed(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
+def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
     """Return the words of all layers: pairs of rows of W^T, or of W, one after the other."""
     out = np.empty(sum(a * b for a, b in pairwise(widths)) // 2, np.int32)
     place = 0
@@ -115,7 +125,8 @@ def _packed(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) 
 
 @njit
 @no_type_check
-def _address(array):
+def address(array):
+    """Return where an array lies. It lives only as long as its name is used: ask for this in the loop that needs it."""
     return np.int64(array.ctypes.data)
 
 
@@ -146,14 +157,13 @@ def _multiply(x, next_row, next_pair, w, y, width, rows, pairs, adds):
 def _pack(weight, inner, outer, transposed, out):
     numbers, words = np.zeros((outer, inner), np.float32), np.empty((outer, inner // 2), np.int32)
     numbers[: weight.shape[0], : weight.shape[1]] = weight
-    source, target = _address(numbers), _address(words)
     for at in range(0, outer * inner, 16):
-        round_vector(source + 4 * at, target + 2 * at)
+        round_vector(address(numbers) + 4 * at, address(words) + 2 * at)
     if transposed:
         for o in range(0, outer, 2):
             for i in range(0, inner, 16):
-                at = target + 2 * (o * inner + i)
-                pair_rows(at, at + 2 * inner, _address(out) + 4 * (o // 2 * inner + i))
+                at = address(words) + 2 * (o * inner + i)
+                pair_rows(at, at + 2 * inner, address(out) + 4 * (o // 2 * inner + i))
     else:
         for o in range(outer):
             for pair in range(inner // 2):
@@ -162,7 +172,8 @@ def _pack(weight, inner, outer, transposed, out):
 
 @njit
 @no_type_check
-def _round_rows(source, next_source, target, next_target, rows, width):
+def round_rows(source, next_source, target, next_target, rows, width):
+    """Round rows of float32 to words."""
     for r in range(rows):
         for c in range(0, width, 16):
             round_vector(source + r * next_source + 4 * c, target + r * next_target + 2 * c)
@@ -194,6 +205,19 @@ def _pair_rows(source, next_row, width, target):
             pair_rows(at, at + next_row, target + 4 * (r // 2 * width + c))
 
 
+@njit
+@no_type_check
+def through(x, stride, w, dims, y, into):
+    """Send ROWS rows through all layers: words at x, with room for all layers' inputs; the end goes to `into`."""
+    layers = len(dims) - 1
+    for layer in range(layers):
+        inner, outer = dims[layer], dims[layer + 1]
+        _multiply(x, stride, 4, w, into if layer == layers - 1 else y, outer, ROWS, inner // 2, 0)
+        x, w = x + 2 * inner, w + 2 * inner * outer
+        if layer < layers - 1:
+            _activate(y, outer, x, stride)
+
+
 @njit(nogil=True, cache=True)
 @no_type_check
 def _forward(first, last, keep, points, packed, dims, out, kept):
@@ -201,21 +225,16 @@ def _forward(first, last, keep, points, packed, dims, out, kept):
     stride, whole = 4 * words, out.shape[1] == dims[layers]
     own = np.zeros((1 if keep else ROWS, words), np.int32)
     sums = np.empty((ROWS, dims.max()), np.float32)
-    y, flat = _address(sums), sums.reshape(-1)
+    flat = sums.reshape(-1)
     for start in range(first, last, ROWS):
         count = min(ROWS, last - start)
-        x = _address(kept) + start * stride if keep else _address(own)
-        _round_rows(_address(points) + 4 * start * dims[0], 4 * dims[0], x, stride, count, dims[0])
+        x = address(kept) + start * stride if keep else address(own)
+        round_rows(address(points) + 4 * start * dims[0], 4 * dims[0], x, stride, count, dims[0])
         if keep:
             kept[start + count : start + ROWS] = 0  # the sums of the way back go over whole blocks
-        w = _address(packed)
-        for layer in range(layers):
-            inner, outer = dims[layer], dims[layer + 1]
-            into = _address(out) + 4 * start * outer if whole and layer == layers - 1 else y
-            _multiply(x, stride, 4, w, into, outer, ROWS, inner // 2, 0)
-            x, w = x + 2 * inner, w + 2 * inner * outer
-            if layer < layers - 1:
-                _activate(y, outer, x, stride)
+        y = address(sums)
+        into = address(out) + 4 * start * dims[layers] if whole else y
+        through(x, stride, address(packed), dims, y, into)
         for r in range(0 if whole else count):
             for c in range(out.shape[1]):
                 out[start + r, c] = flat[r * dims[layers] + c]
@@ -225,14 +244,14 @@ def _forward(first, last, keep, points, packed, dims, out, kept):
 @no_type_check
 def _round_gradient(grad, start, count, width, flat, target):
     if grad.shape[1] == width and count == ROWS:
-        source = _address(grad) + 4 * start * width
+        source = address(grad) + 4 * start * width
     else:
-        source = _address(flat)
+        source = address(flat)
         flat[: ROWS * width] = 0.0
         for r in range(count):
             for c in range(grad.shape[1]):
                 flat[r * width + c] = grad[start + r, c]
-    _round_rows(source, 4 * width, target, 2 * width, ROWS, width)
+    round_rows(source, 4 * width, target, 2 * width, ROWS, width)
 
 
 @njit(nogil=True, cache=True)
@@ -241,14 +260,14 @@ def _backward(first, last, wants_points, grad, packed, dims, kept, grad_points, 
     layers, stride, widest = len(dims) - 1, 2 * dims[:-1].sum(), dims.max()
     sums, flowing = np.empty((ROWS, widest), np.float32), np.empty((ROWS, widest // 2), np.int32)
     left, right = np.empty((ROWS // 2, widest), np.int32), np.empty((ROWS // 2, widest), np.int32)
-    y, dy, upper, lower = _address(sums), _address(flowing), _address(left), _address(right)
     flat, numbers = sums.reshape(-1), (dims[:-1] * dims[1:]).sum()
     for start in range(first, last, ROWS):
+        y, dy, upper, lower = address(sums), address(flowing), address(left), address(right)
         _round_gradient(grad, start, min(ROWS, last - start), dims[layers], flat, dy)
         x, w, total = (
-            _address(kept) + (start + 1) * stride,
-            _address(packed) + 2 * numbers,
-            _address(grads) + 4 * numbers,
+            address(kept) + (start + 1) * stride,
+            address(packed) + 2 * numbers,
+            address(grads) + 4 * numbers,
         )
         for layer in range(layers - 1, -1, -1):
             inner, outer = dims[layer], dims[layer + 1]
@@ -261,4 +280,4 @@ def _backward(first, last, wants_points, grad, packed, dims, kept, grad_points, 
                 _multiply(dy, 2 * outer, 4, w, y, inner, ROWS, outer // 2, 0)
                 _pass_back(y, inner, x, stride, dy)
             elif wants_points:
-                _multiply(dy, 2 * outer, 4, w, _address(grad_points) + 4 * start * inner, inner, ROWS, outer // 2, 0)
+                _multiply(dy, 2 * outer, 4, w, address(grad_points) + 4 * start * inner, inner, ROWS, outer // 2, 0)

@@ -1,0 +1,222 @@
+"""Whole rays in one kernel, for CPUs with AVX512-BF16: march, hash grid, perceptrons and quadrature, without gradients.
+
+ROWS rays are under way at a time, each with one sample: where a ray ends, the next one takes its place. So nothing is
+asked about what lies behind the sample that makes a ray opaque, and of a sample nothing but its light leaves the cache.
+What comes out for a ray does not depend on the others.
+"""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.mlp.bfloat16 import (
+    ROWS,
+    address,
+    packed_words,
+    padded_widths,
+    require_bfloat16,
+    round_rows,
+    through,
+)
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.threads import over_rows
+from nerf_lightning.nerf.types.rays import RayBundle
+
+COMPILED_WITH = "dc6c2978"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
+
+HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+LARGEST_RAW = np.float32(30.0)
+"""The field's own bound on what its exponential is asked for."""
+
+
+def render(
+    rays: RayBundle,
+    field: FieldParts,
+    state: March,
+    lattice: Float[Tensor, "edges"],
+    grid: OccupancyCells,
+    least_alpha: float,
+    opaque_below: float,
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Return foreground, opacity, and the sum of w t; the arguments are those of `render_whole`."""
+    count = rays.near.shape[0]
+    out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
+    march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
+    world = (rays.origins, rays.directions, field.aabb)
+    table, directions = _numpy((field.table, field.encode_directions(rays.view_directions).float()))
+    levels = (*level_arrays(field.layout), (0,) * table.shape[1])
+    limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
+    networks = (*_network(field.density_weights), *_network(field.color_weights))
+    arrays = _numpy(march), _numpy(world), directions, table, levels, networks, limits
+    over_rows(_render, count, *arrays, _numpy(out))
+    return out
+
+
+def trial() -> None:
+    """Run the kernel once on next to nothing; it raises whatever its compiler raises.
+
+    Raises:
+        RuntimeError: numba compiles for a CPU without these instructions.
+    """
+    require_bfloat16()
+    one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
+    rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
+    cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
+    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)), cells.float())
+    state, lattice = March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
+    for features in (2, 4):
+        layout = hash_grid_layout(16 // features, 4, 2, 8)
+        weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
+        table = torch.zeros(layout.offsets[-1], features)
+        field = FieldParts(aabb, table, layout, 0.0, *weights, encode_directions=lambda x: torch.ones(len(x), 16))
+        render(rays, field, state, lattice, grid, 1e-3, 1e-3)
+
+
+def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+    return tuple(each.detach().contiguous().numpy() for each in tensors)
+
+
+def _network(weights: list[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    widths = padded_widths(weights)
+    return packed_words([weight.detach() for weight in weights], widths, transposed=False), np.array(widths)
+
+
+@njit
+@no_type_check
+def _next(march, r, k):
+    # The first interval of a ray from k on that may hold something; the lattice's end if none.
+    o, d, _, leave, jitters, lattice, cells, leaps = march
+    found, _, _, _, _ = next_occupied(
+        *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
+    )
+    return found
+
+
+@njit
+@no_type_check
+def _interval(march, r, k):
+    lattice, jitter = march[5], march[4][r]
+    return edge(lattice, jitter, k), edge(lattice, jitter, k + 1)
+
+
+@njit
+@no_type_check
+def _go_on(march, live, ray, place, light, begin, stop, opaque_below):
+    # Ends the rays that are opaque or have no samples left, and takes the others to their next; returns how many go on.
+    end, s = march[5].shape[0] - 2, 0
+    while s < live:
+        k = _next(march, ray[s], place[s] + 1) if light[s] > opaque_below else end
+        if k < end:
+            place[s] = k
+            begin[s], stop[s] = _interval(march, ray[s], k)
+            s += 1
+        else:
+            live -= 1
+            ray[s], place[s], light[s] = ray[live], place[live], light[live]
+    return live
+
+
+@njit
+@no_type_check
+def _start(march, live, waiting, last, ray, place, light, begin, stop):
+    # Fills the free places with rays that meet something; returns how many are under way, and which ray comes next.
+    enter, leave, jitters, lattice = march[2:6]
+    while live < ROWS and waiting < last:
+        r = waiting
+        waiting += 1
+        if enter[r] < leave[r]:
+            k = _next(march, r, first_from(lattice, jitters[r], 0, enter[r]))
+            if k < lattice.shape[0] - 2:
+                ray[live], place[live], light[live] = r, k, ONE
+                begin[live], stop[live] = _interval(march, r, k)
+                live += 1
+    return live, waiting
+
+
+@njit
+@no_type_check
+def _locate(world, live, ray, begin, stop, points):
+    # Where the samples lie in the field's box, as the unit cube.
+    origins, directions, aabb = world
+    for s in range(live):
+        r, t = ray[s], HALF * (begin[s] + stop[s])
+        for axis in range(3):
+            at = origins[r, axis] + t * directions[r, axis]
+            points[s, axis] = (at - aabb[0, axis]) / (aabb[1, axis] - aabb[0, axis])
+
+
+@njit
+@no_type_check
+def _inside(points, s):
+    x, y, z = points[s, 0], points[s, 1], points[s, 2]
+    return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
+
+
+@njit
+@no_type_check
+def _add_colors(count, inputs, words, packed, dims, sums, owner, weight, foreground):
+    stride, x, y = 4 * words.shape[1], address(words), address(sums)
+    round_rows(address(inputs), 4 * dims[0], x, stride, ROWS, dims[0])
+    through(x, stride, address(packed), dims, y, y)
+    flat, outer = sums.reshape(-1), dims[-1]
+    for i in range(count):
+        for c in range(3):
+            foreground[owner[i], c] += weight[i] / (ONE + math.exp(-flat[i * outer + c]))
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _render(first, last, march, world, directions, table, levels, networks, limits, out):
+    resolutions, offsets, hashed, mask, lanes = levels
+    density_words, dims, color_words, color_dims = networks
+    bias, least_alpha, opaque_below = limits
+    foreground, opacity, depth = out
+    # Of the rays under way: which, how much light comes through to where they stand, and at which interval that is.
+    ray, place, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
+    begin, stop = light.copy(), light.copy()
+    points, features = np.zeros((ROWS, 3), np.float32), np.zeros((ROWS, dims[0]), np.float32)
+    words, sums = np.zeros((ROWS, dims[:-1].sum() // 2), np.int32), np.zeros((ROWS, dims.max()), np.float32)
+    flat, outer = sums.reshape(-1), dims[-1]
+    # Of the samples whose colours are asked for together.
+    inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
+    between = np.zeros((ROWS, color_dims[:-1].sum() // 2), np.int32)
+    colors, hidden = np.zeros((ROWS, color_dims.max()), np.float32), color_dims[0] - directions.shape[1]
+    live, waiting, asked = 0, first, 0
+    while True:
+        live = _go_on(march, live, ray, place, light, begin, stop, opaque_below)
+        live, waiting = _start(march, live, waiting, last, ray, place, light, begin, stop)
+        if live == 0:
+            break
+        _locate(world, live, ray, begin, stop, points)
+        encode(0, live, table, points, resolutions, offsets, hashed, mask, lanes, features)
+        x, stride, y = address(words), 4 * words.shape[1], address(sums)
+        round_rows(address(features), 4 * dims[0], x, stride, ROWS, dims[0])
+        through(x, stride, address(density_words), dims, y, y)
+        for s in range(live):
+            if not _inside(points, s):
+                continue
+            r, density = ray[s], math.exp(min(flat[s * outer] + bias, LARGEST_RAW))
+            alpha = -math.expm1(-density * (stop[s] - begin[s]))
+            w = light[s] * alpha
+            light[s] -= w
+            opacity[r] += w
+            depth[r] += w * HALF * (begin[s] + stop[s])
+            if alpha > least_alpha:
+                inputs[asked, :hidden] = flat[s * outer : s * outer + hidden]
+                inputs[asked, hidden:] = directions[r]
+                owner[asked], weight[asked] = r, w
+                asked += 1
+            if asked == ROWS:
+                _add_colors(asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)
+                asked = 0
+    _add_colors(asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)
