@@ -5,12 +5,14 @@ import torch
 import yaml
 from support.planted import in_config, write_checkpoint
 from support.running import refused, said
-from support.scenes import some_rays
+from support.scenes import some_rays, tiny_model
 
 from nerf_lightning.checkpoints.reading import read_checkpoint, read_content
 from nerf_lightning.commands.fine_tuning import fine_tuning
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.config.narrower_model import widths_of
+from nerf_lightning.training.packed_weights import packed_weights
 
 
 @pytest.fixture
@@ -104,10 +106,7 @@ def test_bad_input_is_one_paragraph_and_leaves_nothing(nerf, tiny, tmp_path):
         (("keep=half",), "keep=half does not fit: it must be a number"),
         (("keep=0.01",), "keep=0.01 leaves 0.32 of the 32 neurons", "nothing. Give keep=0.5 or more"),
         (("by=luck",), "by=luck does not fit: it must be importance, coreset, random, activation"),
-        (("tables=int4",), "tables=int4 does not fit: it must be float32, float16, int8"),
         (("tables=int8",), "tables=int8: this model has no hash tables"),
-        (("drop_empty=true",), "this model has no occupancy grid"),
-        (("finetune_steps=-1",), "finetune_steps=-1: give a whole number"),
         (("finetune_steps=5",), "has no .hydra/overrides.yaml", "init_from=CHECKPOINT"),
     ):
         said(nerf("prune", f"ckpt={tiny}", *settings), *words)
@@ -123,11 +122,15 @@ def test_a_model_without_hidden_layers_is_said(nerf, tmp_path, monkeypatch):
     said(nerf("prune", f"ckpt={path}"), "no field of the model in", "bare.ckpt has hidden layers", "Give keep=1")
 
 
-def test_a_config_that_does_not_say_the_width_is_said(nerf, tmp_path):
+def test_a_config_that_does_not_say_the_width_is_said(tmp_path):
     def forget(config):
         del config["model"]["levels"]["fine"]["field"]["width"]
 
-    path = write_checkpoint(tmp_path / "unsaid.ckpt", in_config(forget))
-    result = nerf("prune", f"ckpt={path}")
-    assert result.code == 2
-    assert "Traceback" not in result.err
+    checkpoint = read_checkpoint(write_checkpoint(tmp_path / "unsaid.ckpt", in_config(forget)))
+    assert widths_of(checkpoint, ["levels.coarse.field"]) == {"levels.coarse.field": 32}
+    refused(widths_of, checkpoint, ["levels.fine.field"], parts=("unsaid.ckpt has no model.levels.fine.field.width",))
+
+
+def test_a_model_without_tables_or_without_a_grid_is_said():
+    refused(packed_weights, tiny_model(), "float32", True, parts=("drop_empty=true: this model has no occupancy grid",))
+    refused(packed_weights, tiny_model(), "int8", False, parts=("tables=int8: this model has no hash tables",))
