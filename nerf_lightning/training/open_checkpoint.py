@@ -60,13 +60,18 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     """Open several; the tiles are those of the first."""
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    trusted = _modules(config.trust)
+    trusted = trusted_modules(config.trust)
     checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in paths]
     settings.keep_tile(checkpoints[0].tile_points)
     return [Opened(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
 
 
-def _modules(trust: Any) -> list[str]:
+def trusted_modules(trust: Any) -> list[str]:
+    """Return the modules that `trust` names.
+
+    Raises:
+        InputError: no name of a module.
+    """
     named = [] if trust is None else [trust] if isinstance(trust, str) else list(trust)
     for name in named:
         if not isinstance(name, str) or not all(word.isidentifier() for word in name.split(".")):

@@ -6,14 +6,16 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
-from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.products import linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -116,12 +118,23 @@ class HashField(Field):
         encoder = self.position_encoder
         encoded = encoder(unit) if features is None else encoder.attach_gradients(unit, features)
         hidden = self._through(self.density_mlp, encoded)
-        direction = self.direction_encoder(points.directions).to(hidden.dtype)
-        seen = [direction] if not self.appearance else [direction, self._code(points).to(hidden.dtype)]
-        seen = [each.expand(*hidden.shape[:-1], each.shape[-1]) for each in seen]
-        raw_rgb = self._through(self.color_mlp, torch.cat([hidden, *seen], dim=-1))
+        raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
         return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
+
+    def hidden_layers(self) -> list[HiddenLayer]:
+        """Return the one layer of the density's MLP, and the two of the colour's."""
+        sizes = {"density_mlp": len(self.density_mlp), "color_mlp": len(self.color_mlp)}
+        return [
+            HiddenLayer((f"{name}.{number}",), (f"{name}.{number + 1}",))
+            for name, count in sizes.items()
+            for number in range(count - 1)
+        ]
+
+    def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
+        """Return what the neurons of `hidden_layers` come to, layer by layer."""
+        *density, features = _layer_by_layer(self.density_mlp, self.position_encoder(self._unit(points.positions)))
+        return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
         """Return table and weights, of a field over a box whose colours are the same for all photographs."""
@@ -139,6 +152,12 @@ class HashField(Field):
             nn.init.kaiming_uniform_(weight, a=5**0.5)
         if self.appearance:
             nn.init.zeros_(self.codes)
+
+    def _with_direction(self, features: Tensor, points: Points) -> Tensor:
+        """Return what the colour is made of: what the density's MLP hands over, the direction, and the code."""
+        direction = self.direction_encoder(points.directions).to(features.dtype)
+        seen = [direction] if not self.appearance else [direction, self._code(points).to(features.dtype)]
+        return torch.cat([features, *(each.expand(*features.shape[:-1], each.shape[-1]) for each in seen)], dim=-1)
 
     def _code(self, points: Points) -> Tensor:
         return self.codes[self.trained].mean(dim=0) if points.photograph is None else self.codes[points.photograph]
@@ -171,6 +190,15 @@ class HashField(Field):
 
 def _weights(*sizes: int) -> nn.ParameterList:
     return nn.ParameterList(torch.empty(after, before) for before, after in pairwise(sizes))
+
+
+def _layer_by_layer(weights: nn.ParameterList, features: Tensor) -> list[Tensor]:
+    """Return what `kernels.mlp` computes, with all that lies between its ends."""
+    layers = []
+    for number, weight in enumerate(weights):
+        features = linear(features if not number else functional.relu(features), weight, None, "float32")
+        layers.append(features)
+    return [*(functional.relu(layer) for layer in layers[:-1]), layers[-1]]
 
 
 class _TruncatedExponential(torch.autograd.Function):
