@@ -24,6 +24,9 @@ class RayBundle(TensorStruct):
     photograph: Int[Tensor, "*rays"] | None = None
     """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
     films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen."""
+    pixel_side: Float[Tensor, "*rays 2"] | None = None
+    """Side of the ray's pixel (root of its area) at distance 0, and by how much it grows per unit of distance; None for
+    rays that are no pixel's."""
 
 
 @dataclass(frozen=True)
