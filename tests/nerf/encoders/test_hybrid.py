@@ -12,6 +12,7 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.hybrid import CONE_OCTAVES, HybridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.geometry.cones import to_matrix
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
@@ -175,18 +176,24 @@ def test_packed_and_masked_samples_have_the_same_cones():
 
 
 @pytest.mark.parametrize("contraction", [False, True])
-def test_a_box_is_only_a_change_of_units_for_cones_too(contraction):
-    torch.manual_seed(2)
-    encoder = an_encoder(cones=True)
-    field = HashField(encoder, SphericalHarmonicsEncoder(2), width=16, contraction=contraction)
-    points = 3 * torch.rand(40, 3) - 1.5 if contraction else 2 * torch.rand(40, 3) - 1
-    before = field.density(Points(points, covariance=CONE.expand(40, 6)))[1]
-    scale = torch.tensor([2.0, 0.5, 4.0])
-    field.aabb.copy_(torch.stack([-scale, scale]))
-    rows = scale[[0, 1, 2, 0, 0, 1]] * scale[[0, 1, 2, 1, 2, 2]]
-    again = field.density(Points(points * scale, covariance=CONE * rows.expand(40, 6)))[1]
-    torch.testing.assert_close(again, before, rtol=0, atol=1e-4)
-    assert not torch.allclose(field.density(Points(points * scale))[1], before, rtol=0, atol=1e-2)
+def test_cones_follow_points_into_the_unit_cube_by_the_jacobian(monkeypatch, contraction):
+    field = HashField(an_encoder(cones=True), SphericalHarmonicsEncoder(2), width=16, contraction=contraction)
+    field.aabb.copy_(torch.tensor([[-1.0, 0.0, -3.0], [1.0, 0.5, 4.0]]))
+    given, forward = {}, field.position_encoder.forward
+
+    def noted(points, covariance=None):
+        given["unit"], given["covariance"] = points, covariance
+        return forward(points, covariance)
+
+    def unit(position):
+        field.density(Points(position[None]))
+        return given["unit"][0]
+
+    monkeypatch.setattr(field.position_encoder, "forward", noted)
+    points = torch.tensor([[0.1, 0.2, -0.3], [-0.6, 0.4, 2.0], [-4.0, 0.7, 3.0]])
+    jacobian = torch.stack([torch.autograd.functional.jacobian(unit, point) for point in points])
+    field.density(Points(points, covariance=CONE.expand(3, 6)))
+    torch.testing.assert_close(to_matrix(given["covariance"]), jacobian @ to_matrix(CONE) @ jacobian.mT)
 
 
 def test_the_factors_products_have_the_precision_of_the_fields():
