@@ -48,7 +48,7 @@ WRITERS = {"evaluation.evaluator", "evaluation.kept_views", "evaluation.metrics_
 """Of what was measured: they compute nothing themselves."""
 PRODUCTS = {"matmul", "mm", "bmm", "mv", "dot", "einsum", "linear", "addmm", "baddbmm", "conv2d", "tensordot", "inner"}
 RAYS = 40
-CONTRACTS = {"Encoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
+CONTRACTS = {"Encoder", "ConeEncoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
 """Classes that are tried through those that follow them."""
 FORWARD_AGAIN = {"attach_gradients"}
 """Methods that do what `forward` does, with what it returned before."""
@@ -149,6 +149,8 @@ def known() -> dict[str, Any]:
         "angles": torch.rand(RAYS, 2, generator=drawn), "vector": 0.3 * points, "light": background,
         "gain": background + 0.5, "tile_points": 500, "fitted": picture[..., 0] > 0.3, "whole_from": 3.0,
         "views": (0, 2, 3),
+        "cones": True, "covariance": torch.rand(RAYS, 6, generator=drawn), "along": depth, "across": 0.1 * depth,
+        "matrices": torch.rand(RAYS, 3, 3, generator=drawn),
     }  # fmt: skip
 
 
@@ -167,6 +169,8 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "video.paths.base.PathFrame.direction": {"given": (0.31, 0.17, -0.93)},
     "video.paths.base.PathFrame.size": {"width": 24, "height": None},
     "nerf.geometry.panoramas.panorama_cameras": {"width": 24, "height": 12},
+    "nerf.geometry.cones.pixel_side": {"view": torch.ones(RAYS, dtype=torch.int64)},
+    "nerf.geometry.cones.scaled_covariance": {"scale": torch.tensor([0.31, 1.7, 2.3])},
     "nerf.rendering.near_gradients.soften_near_gradients": {"distance": torch.rand(40, 8)},
     "evaluation.nearest_view.baselines": {"views": [0, 3], "background": "white", "count": 2},
     "evaluation.camera_fit.fitted_camera": {"model": tiny_model().eval(), "background": "white"},
@@ -271,7 +275,7 @@ def instances(tmp_path_factory) -> list[Any]:
     crop = CropBox.from_user((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8), known()["to_user"])
     others = [grid, crop, Clip(3.1, crop), Contracted(), RayErrors(), LPIPS(), known()["around"]]
     others.append(NearestViews(known()["scene"], "white", 2))
-    encoders = [instantiate(loaded("encoder", option)) for option in options("encoder")]
+    encoders = [instantiate(composed("train", f"encoder={option}").encoder) for option in options("encoder")]
     passed = [
         Keyframe(place, look_at=(0.1, 0.2, 0.1)) for place in ((2.0, 0.3, 0.4), (0.2, 2.1, 0.5), (-1.9, 0.1, 0.6))
     ]
