@@ -164,6 +164,7 @@ def _measured(config: DictConfig, case: Case, folder: Path) -> Point:
             "_target_": "nerf_lightning.data.readers.transforms.TransformsReader",
             "root": str(capture),
             "space": "bounded",
+            "cache_dir": str(folder / "decoded"),
         }
     return measure_point(chosen, case.processes)
 

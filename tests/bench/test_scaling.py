@@ -110,6 +110,7 @@ def test_a_generated_capture_replaces_the_scene(config, tmp_path, monkeypatch):
     scaling._measured(config, Case(5, {}, photographs=(5, 16)), tmp_path)
     scaling._measured(config, Case(2, {"trainer.num_threads": 1}, processes=2), tmp_path)
     assert asked[0][0].scene.root == str(tmp_path / "5x16")
+    assert asked[0][0].scene.cache_dir.startswith(str(tmp_path))  # nothing of it stays in the user's cache
     assert asked[1][0].trainer.num_threads == 1
     assert asked[1][1] == 2
     assert asked[1][0].scene._target_ == config.scene._target_
