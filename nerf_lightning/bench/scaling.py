@@ -5,6 +5,7 @@ its own, and has the shortest of several windows of steps: other work on the mac
 exponent k of t = a n^k is fitted to the logarithms.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -148,7 +149,7 @@ AXES: dict[str, Callable[[DictConfig], list[Case]]] = {
 
 
 def _measured(config: DictConfig, case: Case, folder: Path) -> Point:
-    chosen = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    chosen = copy.deepcopy(config)
     # One size of batches, so that a step's rays are those of the axis; and one of tiles, which takes seconds to choose.
     fixed: dict[str, Any] = {"data.sample_budget": None, "data.crop_steps": 0}
     if chosen.trainer.tile_points == "auto":

@@ -5,7 +5,7 @@ import os
 import socket
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psutil
 import torch
@@ -14,6 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import peak_memory, seconds_of
+
+if TYPE_CHECKING:
+    from nerf_lightning.bench.benchmark import Bench
 
 WARMUP_STEPS, WINDOWS, LEAST_SECONDS = 3, 5, 0.15
 
@@ -93,7 +96,12 @@ def _numbers(config: DictConfig) -> tuple[float, float, float, float]:
     steps = torch.tensor(max(1, round(LEAST_SECONDS / seconds_of(bench.take_step))))
     if torch.distributed.is_initialized():
         torch.distributed.broadcast(steps, src=0)
-    windows = [seconds_of(lambda: [bench.take_step() for _ in range(int(steps))]) for _ in range(WINDOWS)]
+    windows = [seconds_of(lambda: _take(bench, int(steps))) for _ in range(WINDOWS)]
     progress = bench.batches.progress
     batches = [seconds_of(lambda: bench.batches.at(progress.attempt, progress.rays_seen)) for _ in range(WINDOWS)]
     return min(windows) / int(steps), min(batches), peak_memory() - before, reading
+
+
+def _take(bench: "Bench", steps: int) -> None:
+    for _ in range(steps):
+        bench.take_step()

@@ -54,12 +54,15 @@ def scene() -> Record:
             "far": Numbers(("views",), low=0.0, high=FARTHEST),
             "aabb": Numbers((2, 3), low=-FARTHEST, high=FARTHEST),
             "splits": Record(
-                {"train": Many(Whole(0, views), views, tuple, least=1)}, {"val": numbers, "test": numbers}
+                {"train": Many(Whole(0, views), views, tuple, least=1)},
+                {"val": numbers, "test": numbers, "sources": numbers},
             ),
             "background": Choice(get_args(Background)),
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),
-        }
+        },
+        # Of several captures that were joined; earlier versions wrote neither.
+        {"capture_of": Maybe(numbers), "captures": Many(name, views, tuple)},
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
@@ -29,6 +30,9 @@ class Field(nn.Module, ABC):
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
 
+    sees_cones: bool = False
+    """True where the result depends on the pixels' cones (`Points.covariance`)."""
+
     compiles: bool = True
     """False where kernels of our own do most of the work, which torch.compile cannot see into."""
 
@@ -39,7 +43,7 @@ class Field(nn.Module, ABC):
     def multiply_in(self, products: Products) -> None:
         """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""
         for module in self.modules():
-            if isinstance(module, Linear | Field):
+            if isinstance(module, Linear | Field | Encoder):
                 module.products = products
 
     def fit_to(self, scene: Scene) -> None:

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.errors import ANOTHER, InputError
-from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
+from nerf_lightning.nerf.encoders.base import ConeEncoder, Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
+from nerf_lightning.nerf.geometry.cones import contracted_covariance, scaled_covariance
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
@@ -66,6 +67,7 @@ class HashField(Field):
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
+        self.sees_cones = isinstance(position_encoder, ConeEncoder) and position_encoder.sees_cones
         self.density_bias = density_bias
         self.contracted = Contracted(contraction)
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
@@ -109,15 +111,12 @@ class HashField(Field):
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density per unit length, and the encoder's features."""
-        encoded = self.position_encoder(self._unit(points.positions))
+        encoded = self._encoded(points, None)
         return self._density(self._through(self.density_mlp, encoded), points.positions), encoded
 
     def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
-        unit = self._unit(points.positions)
-        encoder = self.position_encoder
-        encoded = encoder(unit) if features is None else encoder.attach_gradients(unit, features)
-        hidden = self._through(self.density_mlp, encoded)
+        hidden = self._through(self.density_mlp, self._encoded(points, features))
         raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
         return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
@@ -133,7 +132,7 @@ class HashField(Field):
 
     def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
         """Return what the neurons of `hidden_layers` come to, layer by layer."""
-        *density, features = _layer_by_layer(self.density_mlp, self.position_encoder(self._unit(points.positions)))
+        *density, features = _layer_by_layer(self.density_mlp, self._encoded(points, None))
         return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
@@ -174,11 +173,27 @@ class HashField(Field):
         out = mlp(features.flatten(0, -2), list(weights), self.products)
         return out.view(*features.shape[:-1], out.shape[-1])
 
+    def _encoded(self, points: Points, known: Tensor | None) -> Tensor:
+        encoder, unit = self.position_encoder, self._unit(points.positions)
+        if isinstance(encoder, ConeEncoder) and encoder.sees_cones and points.covariance is not None:
+            covariance = self._unit_covariance(points.covariance, points.positions)
+            return encoder(unit, covariance) if known is None else encoder.attach_gradients(unit, known, covariance)
+        return encoder(unit) if known is None else encoder.attach_gradients(unit, known)
+
     def _unit(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
             # The ball of radius 2 fills the unit cube.
             return contract(in_unit_ball(positions, self.aabb)) / 4.0 + 0.5
         return to_unit_cube(positions, self.aabb)
+
+    @torch.no_grad()
+    def _unit_covariance(self, covariance: Tensor, positions: Tensor) -> Tensor:
+        to_cube = 1.0 / (self.aabb[1] - self.aabb[0])
+        if self.contracted.is_on():
+            covariance = scaled_covariance(covariance, 2.0 / 3**0.5 * to_cube)
+            covariance = contracted_covariance(covariance, in_unit_ball(positions, self.aabb))
+            to_cube = torch.full_like(to_cube, 0.25)
+        return scaled_covariance(covariance, to_cube)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
