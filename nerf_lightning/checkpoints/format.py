@@ -6,7 +6,20 @@ import torch
 
 from nerf_lightning.budgets import allowed
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
-from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Plain, Record, Text, Whole
+from nerf_lightning.files.schema import (
+    Choice,
+    Description,
+    Many,
+    Maybe,
+    Named,
+    Number,
+    Numbers,
+    Plain,
+    Record,
+    Text,
+    Whole,
+)
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 
 FORMAT = 4
@@ -58,7 +71,9 @@ def scene() -> Record:
             "background": Choice(get_args(Background)),
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),
-        }
+        },
+        # Checkpoints from before it was asked have none.
+        {"metres_per_unit": Maybe(Number(LEAST_UNIT, LARGEST_UNIT))},
     )
 
 

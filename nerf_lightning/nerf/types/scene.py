@@ -105,6 +105,8 @@ class SceneRecord:
     to_user: Float[Tensor, "4 4"]
     """Similarity that takes scene coordinates to the user's own frame."""
     space: Space = "bounded"
+    metres_per_unit: float | None = None
+    """How long a unit of the user's frame is; None: nobody has said."""
 
 
 @dataclass(frozen=True, kw_only=True)
