@@ -28,6 +28,8 @@ DEEPEST = 4.0
 LEAST_OPTICAL = 0.01
 # The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
 BYTES_PER_VOXEL = 20
+# Without bounds the light that is stopped, too: of each half of the rays, together, and in order.
+MORE_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
 
     def bytes_of(count: int) -> int:
         x, y, z = sides_of(count)[1]
-        return BYTES_PER_VOXEL * x * y * z
+        return (BYTES_PER_VOXEL + MORE_BYTES * (contraction is not None)) * x * y * z
 
     spacing, shape = sides_of(resolution)
     require_memory(
