@@ -7,7 +7,20 @@ import torch
 from nerf_lightning.budgets import allowed
 from nerf_lightning.checkpoints.packing import packed_format
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
-from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Plain, Record, Text, Whole
+from nerf_lightning.files.schema import (
+    Choice,
+    Description,
+    Many,
+    Maybe,
+    Named,
+    Number,
+    Numbers,
+    Plain,
+    Record,
+    Text,
+    Whole,
+)
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.types.scene import Background, LensModel, Space
 
 FORMAT = 4
@@ -61,8 +74,12 @@ def scene() -> Record:
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),
         },
-        # Of several captures that were joined; earlier versions wrote neither.
-        {"capture_of": Maybe(numbers), "captures": Many(name, views, tuple)},
+        # Of several captures that were joined, and of units that are known; earlier versions wrote none of these.
+        {
+            "capture_of": Maybe(numbers),
+            "captures": Many(name, views, tuple),
+            "metres_per_unit": Maybe(Number(LEAST_UNIT, LARGEST_UNIT)),
+        },
     )
 
 

@@ -22,7 +22,7 @@ from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_
 from nerf_lightning.evaluation.nearest_view import baselines
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
@@ -156,7 +156,7 @@ class Scoring:
         render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
         row: dict[str, Any] = {"name": scene.view_names[view], **image_metrics(render, true, counts)}
         row["lpips"] = None if self.lpips is None else self.lpips.score(masked_out(render, true, counts), true)
-        depth = unit_of(scene.to_user) * picture.depth
+        depth = told_length(scene)[0] * picture.depth
         return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
 
 

@@ -11,7 +11,7 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.console import StageProgress
+from nerf_lightning.console import StageProgress, say
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_file_name
@@ -20,7 +20,7 @@ from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
-from nerf_lightning.nerf.geometry.frames import directions_to_user, unit_of
+from nerf_lightning.nerf.geometry.frames import directions_to_user, told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -31,10 +31,14 @@ Split = Literal["train", "val", "test", "all"]
 # Pixels that stop less light have no depth.
 OPAQUE = 0.5
 LARGEST = 65_535
+MILLIMETRE = 1e-3
 
 
 class ImagesExport(Export):
     """Write folders of pictures: `depth` (16-bit PNG, and float32 .npy), `opacity`, `normals`, and `images.json`.
+
+    Where the capture's unit is known, depth is in metres, and the PNG in millimetres as depth cameras write it, unless
+    something lies further away than these reach.
 
     Args:
         split: whose views are shown.
@@ -65,12 +69,14 @@ class ImagesExport(Export):
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
                 save_png(folder / "normals" / f"{names[view]}.png", to_bytes(normals))
                 report("pictures", (number + 1) / len(views))
-            scale = farthest / LARGEST or 1.0
+            scale = _scale(record, farthest)
             for number, view in enumerate(views):
                 _save_depth(folder / "depth", names[view], scale)
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
         write_json(about, self._described(record, names, scale))
+        said = "millimetres" if scale == MILLIMETRE and record.metres_per_unit is not None else f"{scale:.4g} of these"
+        say(f"depth        in {told_length(record)[1]}; a step of the 16-bit PNG is {said}")
         return [*(folder / name for name in ("depth", "opacity", "normals")), about]
 
     def _views(self, record: SceneRecord) -> list[int]:
@@ -85,19 +91,27 @@ class ImagesExport(Export):
         if self.depth == "z":
             depth = -camera_coordinates(record.cameras, view, seen.points)[..., 2]
         opaque = (seen.opacity > OPAQUE) & depth.isfinite()
-        return torch.where(opaque, unit_of(record.to_user.double()) * depth.double(), torch.nan).float().numpy()
+        return torch.where(opaque, told_length(record)[0] * depth.double(), torch.nan).float().numpy()
 
     def _described(self, record: SceneRecord, names: dict[int, str], scale: float) -> dict[str, Any]:
         along = "along the pixel's ray" if self.depth == "distance" else "along the camera's axis"
         return {
             "scene": record.name,
-            "depth": f"{along}, from the camera, in the capture's units; .npy: NaN where nothing is; .png: times "
+            "depth": f"{along}, from the camera, in {told_length(record)[1]}; .npy: NaN where nothing is; .png: times "
             "depth_scale, 0 where nothing is",
+            "metres_per_unit": record.metres_per_unit,
             "depth_scale": scale,
             "opacity": "8 bits, 255 is opaque",
             "normals": "8 bits, (n + 1) / 2, in the capture's axes, facing the camera",
             "views": {record.view_names[view]: name for view, name in names.items()},
         }
+
+
+def _scale(record: SceneRecord, farthest: float) -> float:
+    """Return what a step of a depth's PNG is, given what is farthest in metres or the capture's units."""
+    if record.metres_per_unit is not None and farthest <= MILLIMETRE * LARGEST:
+        return MILLIMETRE
+    return farthest / LARGEST or 1.0
 
 
 def _plain(name: str) -> str:

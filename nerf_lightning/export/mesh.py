@@ -61,7 +61,8 @@ class MeshExport(Export):
             Needs `pip install 'nerf-lightning[texture]'`.
         texture_size: texels along each side of the picture.
         format: of the file; PLY and OBJ open everywhere, in the capture's frame; GLB is one file for browsers, and its
-            root node turns it so that y is up, as glTF has it. None: PLY, or GLB where there is a texture, which PLY
+            root node turns it so that y is up, and gives it its size in metres where the capture's unit is known, as
+            glTF has it. None: PLY, or GLB where there is a texture, which PLY
             does not know; OBJ then has an MTL and a PNG beside it.
     """
 
@@ -144,7 +145,7 @@ class MeshExport(Export):
         points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
         colors = surface_colors(model, record, points, normals, REACH * spacing, self.colors, tile_points, report)
         path, (placed, turned, up) = folder / f"mesh.{self.format}", _for_the_user(points, normals, record)
-        save_mesh(path, placed, faces, turned, colors.numpy(), up)
+        save_mesh(path, placed, faces, turned, colors.numpy(), up, record.metres_per_unit or 1.0)
         return [path]
 
     def _textured(
@@ -165,7 +166,8 @@ class MeshExport(Export):
         picture = maker(find_texels(atlas, self.texture_size), self.texture_size, report)
         placed, turned, up = _for_the_user(points, normals, record)
         mesh = (placed[atlas.source], atlas.faces, turned[atlas.source])
-        return save_textured_mesh(folder / f"mesh.{self.format}", *mesh, atlas.uv, picture, up)
+        path = folder / f"mesh.{self.format}"
+        return save_textured_mesh(path, *mesh, atlas.uv, picture, up, record.metres_per_unit or 1.0)
 
     def _surface(
         self, model: Model, record: SceneRecord, lattice: Lattice, tile_points: int, report: Report

@@ -27,11 +27,12 @@ def save_mesh(
     normals: Float[ndarray, "vertices 3"],
     colors: UInt8[ndarray, "vertices 3"],
     up: Float[ndarray, "3"],
+    metres: float,
 ) -> None:
     """Write a mesh, whole or not at all; the ending says in which format.
 
-    PLY and OBJ say nothing of up, and keep the frame. In glTF, y is up: there the vertices keep the frame too, and the
-    root node turns it.
+    PLY and OBJ say nothing of up and of units, and keep the frame. In glTF, y is up and a unit is a metre: there the
+    vertices keep the frame too, and the root node turns and scales it.
 
     Args:
         path: of the file.
@@ -40,6 +41,7 @@ def save_mesh(
         normals: of the corners.
         colors: of the corners, sRGB.
         up: the unit vector that points up, in the frame of the vertices.
+        metres: how long a unit of that frame is; where nobody knows, 1.
     """
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
@@ -48,7 +50,7 @@ def save_mesh(
     settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},
-        "glb": {"include_normals": True, "tree_postprocessor": partial(_as_gltf, up)},
+        "glb": {"include_normals": True, "tree_postprocessor": partial(_as_gltf, up, metres)},
     }
     content = mesh.export(file_type=form, **settings[form])
     with whole_file(path) as part:
@@ -63,6 +65,7 @@ def save_textured_mesh(
     uv: Float[ndarray, "vertices 2"],
     picture: UInt8[ndarray, "height width 3"],
     up: Float[ndarray, "3"],
+    metres: float,
 ) -> list[Path]:
     """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
 
@@ -76,6 +79,7 @@ def save_textured_mesh(
         uv: where each corner lies in the picture, from 0 to 1, to the right and up.
         picture: sRGB.
         up: the unit vector that points up, in the frame of the vertices.
+        metres: how long a unit of that frame is; where nobody knows, 1.
     """
     trimesh = require_library("trimesh")
     image, visual = Image.fromarray(picture), trimesh.visual
@@ -89,7 +93,9 @@ def save_textured_mesh(
     textured = visual.TextureVisuals(uv=uv, material=material)
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=textured, process=False)
     if form == "glb":
-        contents = {path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=partial(_as_gltf, up))}
+        contents = {
+            path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=partial(_as_gltf, up, metres))
+        }
     else:
         exchange = require_library("trimesh.exchange.obj")
         mtl = path.with_suffix(".mtl")
@@ -120,9 +126,10 @@ def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
     return turned
 
 
-def _as_gltf(up: Float[ndarray, "3"], tree: dict[str, Any]) -> None:
+def _as_gltf(up: Float[ndarray, "3"], metres: float, tree: dict[str, Any]) -> None:
     (root,) = tree["scenes"][tree["scene"]]["nodes"]
-    tree["nodes"][root]["matrix"] = y_up(up).T.flatten().tolist()  # column by column
+    placed = np.diag([metres, metres, metres, 1.0]) @ y_up(up)
+    tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
     _unlit(tree)
 
 

@@ -1,7 +1,7 @@
 """The scene as one page that anyone can open and walk around in: no server, no network, no program."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from nerf_lightning.console import StageProgress, say
 from nerf_lightning.errors import InputError
@@ -11,19 +11,26 @@ from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.types.scene import SceneRecord
+from nerf_lightning.nerf.types.scene import SceneRecord, Space
 
 Quality = Literal["small", "medium", "large"]
-# Voxels along the longest side of what there is, and spherical harmonics of its colours.
-QUALITIES: dict[Quality, tuple[int, int]] = {"small": (128, 4), "medium": (216, 4), "large": (320, 9)}
-COSTS = {"box": 1.0, "coarse": 1.0, "density": 4.0, "seen": 10.0, "colours": 15.0, "measured": 8.0}
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+# Voxels along the longest side of what there is,
+RESOLUTIONS: dict[Space, dict[Quality, int]] = {
+    "bounded": {"small": 128, "medium": 216, "large": 320},
+    "ndc": {"small": 128, "medium": 216, "large": 320},
+    "contracted": {"small": 128, "medium": 192, "large": 240},
+}
+# and spherical harmonics of its colours.
+HARMONICS: dict[Quality, int] = {"small": 4, "medium": 4, "large": 9}
+COSTS = {"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0, "measured": 8.0}
 
 
 class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
     Args:
-        quality: about 3, 10 or 30 MB; of scenes without bounds three times as much.
+        quality: about 3, 10 or 30 MB.
         resolution: voxels along the longest side of what there is; in scenes without bounds three quarters of them lie
             along the side of the box, and as many around it. None: as the quality has it.
         photographs: most photographs that are places to jump to, spread over all; 0: none.
@@ -45,15 +52,15 @@ class PageExport(Export):
             if value < 0:
                 raise InputError(f"what.{name}={value}: give 0 or more.")
         self.quality, self.photographs, self.max_views = quality, photographs, max_views
-        usual, self.num_harmonics = QUALITIES[quality]
-        self.resolution = resolution or usual
+        self.resolution, self.num_harmonics = resolution, HARMONICS[quality]
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the page, and say what it costs."""
         target = folder / "page.html"
         require_no_other(target)
         with StageProgress(COSTS) as report:
-            baked = bake(model, record, self.resolution, self.num_harmonics, tile_points, report)
+            resolution = self.resolution or RESOLUTIONS[record.space][self.quality]
+            baked = bake(model, record, resolution, self.num_harmonics, tile_points, report)
             marcher = Marcher(baked)
             cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
         page = page_of(marcher, record, self.beside, self.photographs, cost.facts())

@@ -168,7 +168,7 @@ def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]
     contraction = baked.contraction
     if contraction is not None:
         return list(contraction.center), 3**0.5 * contraction.half
-    half = 0.5 * 8 * baked.spacing * np.array(baked.shape)
+    half = 0.5 * 8 * np.array(baked.spacing) * np.array(baked.shape)
     return (np.array(baked.lower) + half).tolist(), float(np.linalg.norm(half))
 
 

@@ -1,6 +1,7 @@
 """Frames for compositing as EXR, by OpenEXR: colours in linear light, and depth, as floats."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,17 @@ from nerf_lightning.nerf.models.render_image import Picture
 
 NOTHING = 1e10
 """The depth of a pixel that stops less than half of the light, as Blender writes it."""
-COMMENTS = "R, G, B: linear light. Z: distance from the camera in the capture's units, 1e10 where nothing is."
+COMMENTS = "R, G, B: linear light. Z: distance from the camera in {unit}, 1e10 where nothing is."
 
-Channels = Mapping[str, Float[Tensor, "height width"]]
+
+@dataclass(frozen=True)
+class Channels:
+    """What a frame holds."""
+
+    values: Mapping[str, Float[Tensor, "height width"]]
+    """By the names that compositors know."""
+    unit: str
+    """Of the depth."""
 
 
 def exr_channels(
@@ -27,7 +36,7 @@ def exr_channels(
 
     Args:
         picture: the view; where alpha is wanted, rendered over black.
-        depth: of what stops the light, in the user's units, for channel Z; None: without it.
+        depth: of what stops the light, for channel Z; None: without it.
         colors: whether to hold R, G and B.
         alpha: whether to hold A too; then colours are associated, that is multiplied with it, as EXR has them.
     """
@@ -61,8 +70,12 @@ def save_exr(path: Path, channels: Channels) -> None:
         OSError: the disk is full, or cannot be written.
     """
     openexr = require_openexr()
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, "comments": COMMENTS}
-    content = {name: values.float().contiguous().numpy() for name, values in channels.items()}
+    header = {
+        "compression": openexr.ZIP_COMPRESSION,
+        "type": openexr.scanlineimage,
+        "comments": COMMENTS.format(unit=channels.unit),
+    }
+    content = {name: values.float().contiguous().numpy() for name, values in channels.values.items()}
     with whole_file(path) as part:
         try:
             openexr.File(header, content).write(str(part))

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from collections.abc import Generator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from nerf_lightning import ranks
 from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
+from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 from nerf_lightning.ranks import processes_here
 from nerf_lightning.video.encoding import CODECS, require_encoder
@@ -25,6 +27,8 @@ from nerf_lightning.video.settings import ENDINGS, FilmSettings
 from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
 from nerf_lightning.visualization.pictures import straight_colors
 
+log = logging.getLogger(__name__)
+
 FilmSteps = Generator[tuple[int, int], None, list[Path]]
 """A film in the making: how many frames of how many are there, again and again, and at the end the films."""
 
@@ -34,8 +38,8 @@ def film(
 ) -> list[Path]:
     """Write the films (`video.mp4`, `depth.mp4`; or folders of frames of these names) and return where they are.
 
-    A film that was stopped goes on with its missing frames. Depth is in the user's units along the ray, coloured over
-    the range of what is seen on the whole path, with its scale beside it.
+    A film that was stopped goes on with its missing frames. Depth is along the ray, in metres where the capture's unit
+    is known and else in its own, coloured over the range of what is seen on the whole path, with its scale beside it.
 
     Args:
         subjects: models of one capture; where there are several, they are shown side by side.
@@ -98,6 +102,7 @@ def film_steps(
         subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
     )
     require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
+    first = shots[0].subject.scene
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
     if settings.form == "exr":
         films = ["exr"]  # all in one file
@@ -107,6 +112,8 @@ def film_steps(
     try:
         # The first process alone looks, before any of them writes.
         missing, seen = ranks.from_first(lambda: frames.open(_fingerprint(shots, settings), lambda: depth_range(shots)))
+        if "depth" in settings.outputs and ranks.is_first():
+            log.info("depth is in %s, and most of it lies from %.3g to %.3g", told_length(first)[1], *seen)
         mine = ranks.every_other(missing)
         yield 0, len(mine)
         for done, number in enumerate(mine, start=1):
@@ -127,7 +134,8 @@ def film_steps(
 def _channels(shot: Shot, settings: FilmSettings, number: int) -> Channels:
     picture = shot.picture(number)
     depth = shot.z_depth(number, picture) if "depth" in settings.outputs else None
-    return exr_channels(picture, depth, "rgb" in settings.outputs, settings.alpha)
+    values = exr_channels(picture, depth, "rgb" in settings.outputs, settings.alpha)
+    return Channels(values, told_length(shot.subject.scene)[1])
 
 
 def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ _"]]:
@@ -169,7 +177,7 @@ def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
     """Return what tells films apart: the weights, the cameras, and all settings that decide what is seen."""
     digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
     for shot in shots:
-        digest.update(f"{shot.subject.label} {shot.subject.background}".encode())
+        digest.update(f"{shot.subject.label} {shot.subject.background} {shot.unit}".encode())
         cameras, seen_from = shot.cameras, shot.seen_from
         tensors = [cameras.c2w, cameras.focal, cameras.width, cameras.height, shot.near, shot.far]
         tensors += [] if seen_from is None else [seen_from.c2w]

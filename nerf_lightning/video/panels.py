@@ -36,7 +36,7 @@ def panel(
         output: a key of `FILMS`. `levels` is the absolute difference of the first level that makes pictures and the
             last; `normals` are the surface's, as colours: 0.5 + 0.5 n along the axes of the capture's own frame.
         picture: the view.
-        depth_range: near and far of the depth's colours, in the user's units.
+        depth_range: near and far of the depth's colours, in metres or the user's units.
         unit: how many of these make one of the scene's.
         normals: in the user's axes, where they are wanted.
     """

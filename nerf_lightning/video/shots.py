@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
-from nerf_lightning.nerf.geometry.frames import poses_from_user, unit_of
+from nerf_lightning.nerf.geometry.frames import poses_from_user, told_length, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.near_far import near_and_far_from
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
@@ -54,8 +54,8 @@ class Shot:
 
     @property
     def unit(self) -> float:
-        """How many of the user's units make one of the scene's."""
-        return unit_of(self.subject.scene.to_user)
+        """How many metres, or where nobody knows units of the user's, make a unit of the scene's."""
+        return told_length(self.subject.scene)[0]
 
     @property
     def rays(self) -> RayGenerator:
@@ -77,10 +77,11 @@ class Shot:
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the unit normals of what the picture shows, in the user's axes."""
         normals = normals_from_depth(self._surface(frame, picture))
-        return normals @ (self.subject.scene.to_user[:3, :3] / self.unit).mT
+        to_user = self.subject.scene.to_user
+        return normals @ (to_user[:3, :3] / unit_of(to_user)).mT
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
-        """Return how far what the picture shows lies from the camera, in the user's units.
+        """Return how far what the picture shows lies from the camera, in metres or the user's units (`unit`).
 
         Along the camera's axis; of a panorama, which has none, along the ray.
         """
@@ -132,7 +133,7 @@ def make_shots(
         cameras = _panoramas(cameras, path, first)
     shots = []
     for subject in subjects:
-        scene = subject.scene
+        scene = replace(subject.scene, metres_per_unit=first.metres_per_unit)
         moved = _in_frame_of(cameras, first, scene)
         held = replace(moved, c2w=moved.c2w[:1].expand_as(moved.c2w)) if hold_camera else moved
         clip = None
@@ -140,7 +141,7 @@ def make_shots(
             box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
             clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
         _check_outside(held, clip)
-        shot = shot_of(subject, held, tile_points)
+        shot = shot_of(replace(subject, scene=scene), held, tile_points)
         _check_near(scene, clip, shot.far)
         shots.append(replace(shot, seen_from=moved if hold_camera else None, clip=clip))
     return shots
@@ -162,7 +163,7 @@ def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:
 
 
 def depth_range(shots: list[Shot]) -> tuple[float, float]:
-    """Return near and far of what is seen on the whole path, in the user's units, from a few small frames.
+    """Return near and far of what is seen on the whole path, in the shots' units, from a few small frames.
 
     The outer 1 % at each end are left out. Where nothing is seen they are the scene's own.
     """

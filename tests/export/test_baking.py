@@ -13,8 +13,10 @@ from support.running import refused
 from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.baked_field import EXPONENT_STEP, LEAST_EXPONENT, tiles_of, to_bytes_of_density
 from nerf_lightning.export.baking.cost import measured_cost
+from nerf_lightning.export.baking.density import depths_of_voxels
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.baking.payload import described, packed, unpacked
+from nerf_lightning.export.baking.seen_colors import sharpened
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.geometry.ndc import ndc_points
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -139,6 +141,33 @@ def test_normalised_device_coordinates_are_baked_as_they_are():
     assert (center - middle).norm() < 0.8
     baked = baked_ball(48, 4, model, record_of(scene))
     assert cost_of(baked, model, scene).page_to_model > 32
+
+
+def test_a_voxel_is_as_deep_as_the_outermost_cameras_are_off_by_one_pixel():
+    scene, x, a = all_around(), 0.3, 3.2
+    c2w = torch.eye(4)[:3].repeat(6, 1, 1)
+    c2w[:, 0, 3] = torch.tensor([-x, 0.0, 0.0, 0.0, 0.0, x])
+    cameras = replace(scene.cameras, c2w=c2w, ndc=torch.full((6, 2), a))
+    right, up, deep = depths_of_voxels(record_of(replace(scene, cameras=cameras, space="ndc"))).tolist()
+    assert right == up == 1.0
+    # Two places that are so far apart in depth, seen from the middle at the same place, as the outer camera sees them.
+    z = torch.tensor([-2.0, 2.0 / (2.0 / -2.0 - 0.01 * deep)])
+    assert (2.0 / z).diff().item() == pytest.approx(-0.01 * deep, rel=1e-4)
+    seen = -a * (torch.zeros(2) - x) / z
+    assert seen.diff().abs().item() == pytest.approx(0.01, rel=1e-4)
+
+
+def test_colours_differ_more_from_their_neighbours():
+    voxels = np.argwhere(np.ones((3, 3, 3), bool)).astype(np.int32)
+    fitted = torch.full((27, 4, 3), 0.25)
+    torch.testing.assert_close(sharpened(fitted, voxels, (3, 3, 3)), fitted)
+    fitted[13] = 0.75  # in the middle
+    found = sharpened(fitted, voxels, (3, 3, 3))
+    torch.testing.assert_close(found[13], torch.full((4, 3), 1.0))
+    torch.testing.assert_close(found[0], fitted[0])
+    torch.testing.assert_close(found[12], torch.full((4, 3), 0.25 - 0.5 * 0.5 / 5))  # beside it, with five neighbours
+    alone = sharpened(fitted[:1], voxels[:1], (3, 3, 3))
+    torch.testing.assert_close(alone, fitted[:1])
 
 
 def test_refusals(monkeypatch):

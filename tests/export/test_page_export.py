@@ -10,7 +10,7 @@ import torch
 from support.baked_ball import all_around, beside, record_of, shiny_model
 from support.running import refused
 
-from nerf_lightning.export.page import QUALITIES, PageExport
+from nerf_lightning.export.page import HARMONICS, PageExport
 from nerf_lightning.export.page_file import is_page, read_baked
 
 NAME = '</script><script>alert(1)</script><img src=x onerror="alert(2)">'
@@ -46,7 +46,7 @@ class Elements(HTMLParser):
 
 def test_the_page_holds_the_field_the_cameras_and_the_photographs(page):
     about, baked = read_baked(page)
-    assert baked.num_harmonics == QUALITIES["medium"][1] == about["harmonics"]
+    assert baked.num_harmonics == HARMONICS["medium"] == about["harmonics"]
     assert max(baked.shape) <= 4
     assert len(about["cameras"]) == 4
     eye = np.array(about["cameras"][0]["eye"])

@@ -13,6 +13,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
 from nerf_lightning.files.links import is_there
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Background
 
@@ -48,6 +49,19 @@ def check_step(name: str, value: object) -> None:
     """
     if type(value) is not int or value < 1:
         raise InputError(f"scene.{name} is {value}, but it must be 1 (take everything as it is) or more.")
+
+
+def check_metres(metres_per_unit: float | None) -> None:
+    """Refuse a unit of no length, or beyond all digits.
+
+    Raises:
+        InputError: it is one.
+    """
+    if metres_per_unit is not None and not LEAST_UNIT <= metres_per_unit <= LARGEST_UNIT:
+        raise InputError(
+            f"scene.metres_per_unit={metres_per_unit}: give how many metres one unit of the capture is long, such as "
+            "0.01 for centimetres, or null where that is unknown."
+        )
 
 
 def check_bounds(near: float, far: float) -> None:

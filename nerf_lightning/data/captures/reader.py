@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from nerf_lightning.data.captures.capture import Capture, cameras_of, check_capture, filtered
-from nerf_lightning.data.captures.checks import check_step, known_background
+from nerf_lightning.data.captures.checks import check_metres, check_step, known_background
 from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
@@ -44,6 +44,8 @@ class CaptureReader(Reader):
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content may begin, in the user's units; null: from the capture.
         far: distance at which content ends; null: from the capture.
+        metres_per_unit: how many metres a unit of the capture's frame is long, where it is known: then depths are told
+            in metres, and GLB files have their true size. No format of captures says it. null: unknown.
         background: what lies behind transparent pixels or the end of the scene: white, black, random or none.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
@@ -60,6 +62,7 @@ class CaptureReader(Reader):
     space: Spaces = "auto"
     near: float | None = None
     far: float | None = None
+    metres_per_unit: float | None = None
     background: str = "black"
     cache_dir: str | None = None
     allow_outside: bool = False
@@ -123,6 +126,7 @@ class CaptureReader(Reader):
             space=space,
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
+            metres_per_unit=self.metres_per_unit,
             protocol=self._protocol(),
             truth=None,
             left_out=capture.left_out,
@@ -178,6 +182,7 @@ class CaptureReader(Reader):
         if self.space not in get_args(Spaces):
             raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
+        check_metres(self.metres_per_unit)
         near, far = self.near, self.far
         if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
             raise InputError(

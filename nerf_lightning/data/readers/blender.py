@@ -17,6 +17,7 @@ from nerf_lightning.data.captures.checks import (
     box_around_origin,
     check_bounds,
     check_divisible,
+    check_metres,
     check_present,
     check_step,
     contents,
@@ -110,6 +111,7 @@ class BlenderReader(Reader):
         downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
         skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; splits not named are
             taken whole.
+        metres_per_unit: how many metres a scene unit is long, where it is known; null: unknown.
         aabb_half: half the side of the box around the origin that holds the content, scene units.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         name: what the scene is called in reports.
@@ -123,6 +125,7 @@ class BlenderReader(Reader):
         background: str = "white",
         downscale: int = 1,
         skip: Mapping[str, int] | None = None,
+        metres_per_unit: float | None = None,
         aabb_half: float = 1.5,
         allow_outside: bool = False,
         name: str = "blender",
@@ -133,6 +136,7 @@ class BlenderReader(Reader):
         self.background = background
         self.downscale = downscale
         self.skip = dict(skip or {})
+        self.metres_per_unit = metres_per_unit
         self.aabb_half = aabb_half
         self.allow_outside = allow_outside
         self.name = name
@@ -163,6 +167,7 @@ class BlenderReader(Reader):
             view_names=_names(frames),
             background=known_background(self.background),
             to_user=torch.eye(4),
+            metres_per_unit=self.metres_per_unit,
             protocol=self._protocol(frames),
             truth=None,
         )
@@ -170,6 +175,7 @@ class BlenderReader(Reader):
     def _check_settings(self) -> None:
         """Refuse settings that make no sense before any file is read."""
         check_step("downscale", self.downscale)
+        check_metres(self.metres_per_unit)
         for split, step in self.skip.items():
             if split not in SPLITS:
                 raise InputError(f"scene.skip names the split {split!r}; the splits are {listed(SPLITS)}.")

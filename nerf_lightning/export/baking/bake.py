@@ -12,6 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
 from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, density_grid, dilated
+from nerf_lightning.export.baking.lit_voxels import lit
 from nerf_lightning.export.baking.seen_colors import (
     LOOKS,
     RANGES,
@@ -20,6 +21,7 @@ from nerf_lightning.export.baking.seen_colors import (
     camera_views,
     fitted_colors,
     in_world,
+    sharpened,
     to_bytes_of_colors,
 )
 from nerf_lightning.export.density_grid import Report
@@ -59,9 +61,16 @@ def bake(
         InputError: nothing is, or it does not fit into memory.
     """
     grid = density_grid(model, record, resolution, tile_points, report)
-    around = _who_sees(grid, record, LOOKS[num_harmonics], report)
-    kept = _stopping(grid, around)
-    if not kept.any():
+    closed = False
+    if grid.contraction is None:
+        voxels = np.argwhere(dilated(grid.optical > LEAST_OPTICAL)).astype(np.int32)
+        around = _who_sees(grid, voxels, record, LOOKS[num_harmonics], report)
+        kept = _stopping(grid, around)
+    else:
+        kept, closed = lit(grid, record)
+        report("lit", 1.0)
+        around = _who_sees(grid, np.argwhere(kept).astype(np.int32), record, LOOKS[num_harmonics], report)
+    if not (kept.any() and (around.cameras[:, 0] >= 0).any()):
         raise InputError(
             f"Nothing of {for_terminal(record.name)} is seen: no training camera looks at what has density. Correct "
             "the box (scene.aabb_half) or the cameras' poses, and train again."
@@ -71,12 +80,14 @@ def bake(
     centers = record.cameras.c2w[list(record.splits["train"]), :, 3]
     seen = (colored.world, colored.cameras, colored.light)
     fitted = fitted_colors(model, grid.places(colored.voxels), *seen, centers, num_harmonics, tile_points, report)
-    return _in_bricks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T)
+    fitted = sharpened(fitted, colored.voxels, grid.optical.shape)
+    return _in_bricks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T, closed)
 
 
-def _who_sees(grid: DensityGrid, record: SceneRecord, looks: int, report: Report) -> SeenVoxels:
+def _who_sees(
+    grid: DensityGrid, voxels: Int[ndarray, "voxels 3"], record: SceneRecord, looks: int, report: Report
+) -> SeenVoxels:
     """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
-    voxels = np.argwhere(dilated(grid.optical > LEAST_OPTICAL)).astype(np.int32)
     world = in_world(grid.places(voxels), record)
     eyes, views = camera_views(record)
     contraction = grid.contraction
@@ -86,8 +97,9 @@ def _who_sees(grid: DensityGrid, record: SceneRecord, looks: int, report: Report
         cameras, light = kernels("bricks.contracted").seeing_cameras(grid.optical, *given, looks, TRIES_AROUND)
         report("seen", 1.0)
         return SeenVoxels(voxels, world, cameras, light)
-    in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / grid.spacing, eyes[:, 3:]], axis=1)
-    asked = (voxels, world.numpy(), in_grid.astype(np.float32), views)
+    spacing = grid.spacing.numpy()
+    in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / spacing, eyes[:, 3:]], axis=1)
+    asked = (voxels, world.numpy(), in_grid.astype(np.float32), views, (spacing / spacing.max()).astype(np.float32))
     cameras, light = kernels().seeing_cameras(grid.optical, *asked, looks, TRIES)
     report("seen", 1.0)
     return SeenVoxels(voxels, world, cameras, light)
@@ -104,7 +116,7 @@ def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:
 
 
 def _in_bricks(
-    grid: DensityGrid, voxels: Int[ndarray, "colored 3"], colors: UInt8[ndarray, "channels colored"]
+    grid: DensityGrid, voxels: Int[ndarray, "colored 3"], colors: UInt8[ndarray, "channels colored"], closed: bool
 ) -> BakedField:
     bricks = _bricks_of(grid.optical > LEAST_OPTICAL)
     place = np.full(bricks.shape, -1, np.int64)
@@ -118,10 +130,10 @@ def _in_bricks(
     colored.reshape(-1)[value] = True
     (nx, ny, nz), side = bricks.shape, SIDE
     blocks = grid.optical.reshape(nx, side, ny, side, nz, side).transpose(0, 2, 4, 1, 3, 5)
-    x, y, z = (float(number) for number in grid.lower)
+    (x, y, z), (a, b, c) = grid.lower.tolist(), grid.spacing.tolist()
     return BakedField(
         lower=(x, y, z),
-        spacing=grid.spacing,
+        spacing=(a, b, c),
         shape=(nx, ny, nz),
         bricks=np.flatnonzero(bricks).astype(np.int32),
         density=to_bytes_of_density(blocks[bricks]),
@@ -129,6 +141,7 @@ def _in_bricks(
         colors=np.ascontiguousarray(colors[:, there][:, order]),
         ranges=RANGES,
         contraction=grid.contraction,
+        closed=closed,
     )
 
 

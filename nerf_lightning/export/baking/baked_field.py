@@ -14,6 +14,9 @@ LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
 """Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""
 EXPONENT_STEP = (MOST_EXPONENT - LEAST_EXPONENT) / 255.0
 
+LEAST_MET = 0.3
+"""Where no light comes from behind: rays that meet less than this do not end in the scene."""
+
 NO_CHANGE = 128
 """The byte of a coefficient that is nothing."""
 
@@ -22,15 +25,16 @@ NO_CHANGE = 128
 class BakedField:
     """Density and colour at the corners of a lattice, in bricks of 8 x 8 x 8 values.
 
-    A byte q of density is an optical depth per voxel of 2^(a + b q) - 2^a: a step of any length has its own opacity.
+    A byte q of density is an optical depth of 2^(a + b q) - 2^a along a way as long as a voxel (its longest side): a
+    step of any length has its own opacity.
     Colour is a sum of real spherical harmonics of the viewing direction; bytes of the first are its colour, bytes of
     the others go from -range to range, with nothing at 128.
     """
 
     lower: tuple[float, float, float]
     """Where the first value stands, scene units."""
-    spacing: float
-    """Scene units between values."""
+    spacing: tuple[float, float, float]
+    """Scene units between values, along each axis."""
     shape: tuple[int, int, int]
     """Bricks along each axis."""
     bricks: Int[ndarray, "bricks"]
@@ -44,11 +48,18 @@ class BakedField:
     """Half range of the coefficients of degree 1 and 2."""
     contraction: Contraction | None = None
     """Of a scene without bounds: lower and spacing are in its contracted cube."""
+    closed: bool = False
+    """Whether no light comes from behind all this: what rays miss, since it was left out, is as what they meet."""
 
     @property
     def num_harmonics(self) -> int:
         """How many spherical harmonics a colour has: 1, 4 or 9."""
         return len(self.colors) // 3
+
+    @property
+    def length(self) -> float:
+        """The longest side of a voxel, scene units."""
+        return max(self.spacing)
 
     @property
     def index(self) -> Int[ndarray, "x y z"]:

@@ -22,19 +22,24 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 FIRST = 96
 # The second look is at every fourth voxel.
 STRIDE = 4
+# Of voxels in normalised device coordinates, in sides of a pixel.
+DEEPEST = 4.0
 # A voxel that stops less of the light holds nothing.
 LEAST_OPTICAL = 0.01
 # The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
 BYTES_PER_VOXEL = 20
+# Without bounds the light that is stopped, too: of each half of the rays, together, and in order.
+MORE_BYTES = 16
 
 
 @dataclass(frozen=True)
 class DensityGrid:
-    """Optical depths per voxel, at lower + spacing (i, j, k); each side is a multiple of a brick's."""
+    """Optical depths, at lower + spacing (i, j, k); each side is a multiple of a brick's."""
 
     lower: Float[Tensor, "3"]
-    spacing: float
+    spacing: Float[Tensor, "3"]
     optical: Float[ndarray, "x y z"]
+    """Along a way as long as the longest side of a voxel."""
     contraction: Contraction | None = None
     """Of a scene without bounds, whose contracted cube is what the grid lies in."""
 
@@ -45,10 +50,11 @@ class DensityGrid:
 
     def lengths(self, voxels: Int[ndarray, "voxels 3"]) -> Float[ndarray, "voxels"]:
         """Return how long voxels are, scene units; 0 where the grid holds no place of the scene."""
+        longest = float(self.spacing.max())
         if self.contraction is None:
-            return np.full(len(voxels), self.spacing, np.float32)
+            return np.full(len(voxels), longest, np.float32)
         places = self._in_grid(voxels)
-        length = self.contraction.half * self.spacing * self.contraction.radius(places).square()
+        length = self.contraction.half * longest * self.contraction.radius(places).square()
         return (length * is_place(places)).numpy()
 
     def _in_grid(self, voxels: Int[ndarray, "voxels 3"]) -> Float[Tensor, "voxels 3"]:
@@ -64,17 +70,18 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
     contraction = Contraction.of(record) if record.space == "contracted" else None
     box = None if contraction is not None else _box_of_content(model, record, tile_points, report)
 
-    def sides_of(count: int) -> tuple[float, tuple[int, int, int]]:
+    def sides_of(count: int) -> tuple[Float[Tensor, "3"], tuple[int, int, int]]:
         if box is None:
-            return 4.0 / num_values(count), (num_values(count),) * 3
+            return torch.full((3,), 4.0 / num_values(count), dtype=torch.float64), (num_values(count),) * 3
         sides = (box[1] - box[0]).double()
-        spacing = float(sides.max()) / count
-        x, y, z = (SIDE * int(-(-float(side) // (SIDE * spacing)) or 1) for side in sides)
+        spacing = depths_of_voxels(record) * sides[:2].max() / count if record.space == "ndc" else sides.max() / count
+        spacing = spacing.expand(3)
+        x, y, z = (SIDE * int(-(-float(a) // (SIDE * float(b))) or 1) for a, b in zip(sides, spacing, strict=True))
         return spacing, (x, y, z)
 
     def bytes_of(count: int) -> int:
         x, y, z = sides_of(count)[1]
-        return BYTES_PER_VOXEL * x * y * z
+        return (BYTES_PER_VOXEL + MORE_BYTES * (contraction is not None)) * x * y * z
 
     spacing, shape = sides_of(resolution)
     require_memory(
@@ -90,6 +97,20 @@ def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points
     if not (grid.optical > LEAST_OPTICAL).any():
         raise InputError(_nothing(record))
     return grid
+
+
+def depths_of_voxels(record: SceneRecord) -> Float[Tensor, "3"]:
+    """Return the sides of a voxel in normalised device coordinates, those of a pixel being 1.
+
+    One is as deep as it takes for the photographs from either end to show it at a place that is off by one pixel from
+    where those from the middle do. In these coordinates a place z moves by (1 - z) / 2 times the camera's way times a,
+    the focal length in halves of the image.
+    """
+    assert record.cameras.ndc is not None
+    centers = record.cameras.c2w[:, :, 3]
+    ways = (centers - centers.mean(dim=0)).norm(dim=-1).max().clamp(min=1e-6)
+    deep = 2.0 / float(ways * record.cameras.ndc[0].max())
+    return torch.tensor([1.0, 1.0, min(max(deep, 1.0), DEEPEST)], dtype=torch.float64)
 
 
 def _box_of_content(model: Model, record: SceneRecord, tile_points: int, report: Report) -> Float[Tensor, "2 3"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.export.baking.baked_field import NO_CHANGE, BakedField, tiles_of
+from nerf_lightning.export.baking.baked_field import LEAST_MET, NO_CHANGE, BakedField, tiles_of
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.kernels.bricks.layout import kernels
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -45,13 +45,17 @@ class Marcher:
     def render(self, rays: RayBundle) -> MarchedRays:
         """Return what rays meet in the box, or in all of space."""
         shape, contraction = rays.near.shape, self.baked.contraction
-        module, unit, begin = "bricks.cpu", self.baked.spacing, tuple[float, ...]()
+        module, unit = "bricks.cpu", torch.tensor(self.baked.spacing)
         apart = rays.origins - torch.tensor(self.baked.lower)
         if contraction is not None:
-            module, unit, begin = "bricks.contracted", contraction.half, (contraction.near / contraction.half,)
+            module, unit = "bricks.contracted", torch.full((3,), contraction.half)
             apart = rays.origins - torch.tensor(contraction.center)
         origins = (apart / unit).float().reshape(-1, 3).contiguous()
-        directions, looks = rays.directions.float().reshape(-1, 3), rays.view_directions.float().reshape(-1, 3)
+        along = rays.directions.float().reshape(-1, 3) / unit
+        # How far a ray goes in the scene while it goes one in the grid.
+        way = 1.0 / along.norm(dim=-1)
+        directions, looks = along * way[:, None], rays.view_directions.float().reshape(-1, 3)
+        more = (way / self.baked.length).numpy() if contraction is None else contraction.near / contraction.half
         basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
         found = kernels(module).march_tiles(
             origins.numpy(),
@@ -62,10 +66,12 @@ class Marcher:
             self.colors,
             self.baked.scale,
             STEP,
-            *begin,
+            more,
         )
         columns = torch.from_numpy(found)
-        depth = unit * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
+        depth = way * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
+        met = columns[:, 3:4].clamp(min=LEAST_MET) if self.baked.closed else torch.ones(1)
+        columns[:, :4] /= met
         mean: Float[ndarray, "columns"] = found[:, 5:].mean(axis=0)
         return MarchedRays(
             columns[:, :3].view(*shape, 3),

@@ -20,13 +20,15 @@ def described(baked: BakedField) -> dict[str, Any]:
     """Return what must be known to read the bytes, as JSON has it."""
     return {
         "lower": list(baked.lower),
-        "spacing": baked.spacing,
+        "spacing": list(baked.spacing),
+        "length": baked.length,
         "shape": list(baked.shape),
         "bricks": len(baked.bricks),
         "colored": int(baked.colors.shape[1]),
         "harmonics": baked.num_harmonics,
         "exponents": [LEAST_EXPONENT, EXPONENT_STEP],
         "ranges": list(baked.ranges),
+        "closed": baked.closed,
         "contraction": None if baked.contraction is None else asdict(baked.contraction),
     }
 
@@ -64,6 +66,7 @@ def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
             for part in (raw[sum(sizes[:i]) : sum(sizes[: i + 1])] for i in range(len(sizes)))
         )
         x, y, z = about["lower"]
+        along_x, along_y, along_z = about["spacing"]
         nx, ny, nz = about["shape"]
         low, high = about["ranges"]
         outside = about["contraction"]
@@ -72,7 +75,7 @@ def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
             outside = Contraction((cx, cy, cz), float(outside["half"]), float(outside["near"]))
         return BakedField(
             (x, y, z),
-            about["spacing"],
+            (along_x, along_y, along_z),
             (nx, ny, nz),
             numbers.view("<i4").astype(np.int32),
             density.reshape(bricks, SIDE, SIDE, SIDE),
@@ -80,6 +83,7 @@ def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
             colors.reshape(channels, colored),
             (low, high),
             outside,
+            bool(about["closed"]),
         )
     except (OSError, EOFError, zlib.error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"The field in the page is damaged or cut off: {error}. Export it again.") from error

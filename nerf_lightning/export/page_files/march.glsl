@@ -6,7 +6,7 @@ precision highp sampler3D;
 precision highp isampler3D;
 
 const float SIDE = 8.0;
-const float LEAST_ALPHA = 0.002, LEAST_TRANSMITTANCE = 0.004;
+const float LEAST_ALPHA = 0.002, LEAST_TRANSMITTANCE = 0.004, LEAST_MET = 0.3;
 
 uniform isampler3D index;
 uniform sampler3D base;
@@ -18,8 +18,8 @@ uniform sampler3D more3, more4, more5;
 #endif
 uniform ivec3 shape;
 uniform ivec3 atlas;
-uniform vec3 lower, eye, behind;
-uniform float spacing, step_length, height;
+uniform vec3 lower, spacing, eye, behind;
+uniform float voxel, step_length, height;
 uniform mat3 turn;
 uniform vec2 focal, center, exponents, ranges, depths;
 uniform int shown;
@@ -142,6 +142,10 @@ void march(vec3 origin, vec3 look) {
   origin = start_point;
 #endif
   origin = (origin - lower) / spacing;
+  along /= spacing;
+  // How far one goes in the scene while going one in the grid.
+  float far = 1.0 / length(along);
+  along *= far;
   vec3 speed = mix(vec3(1e-9), along, greaterThan(abs(along), vec3(1e-9)));
   vec3 a = -origin / speed, b = (vec3(shape) * SIDE - origin) / speed;
   vec3 first = min(a, b), last = max(a, b);
@@ -159,7 +163,7 @@ void march(vec3 origin, vec3 look) {
       continue;
     }
     number += 1.0;
-    stop(tile, clamp(at - SIDE * vec3(brick), 0.0, SIDE), step_length, t * spacing, look);
+    stop(tile, clamp(at - SIDE * vec3(brick), 0.0, SIDE), step_length * far / voxel, t * far, look);
   }
 }
 #endif
@@ -169,11 +173,16 @@ void main() {
   vec3 look = normalize(turn * vec3(plane.x, -plane.y, -1.0));
   march(eye, look);
   float opacity = 1.0 - through;
+#ifdef CLOSED
+  float met = max(opacity, LEAST_MET);
+  color /= met;
+  opacity /= met;
+#endif
   if (shown == 1) {
-    float near = 1.0 - clamp((depth / max(opacity, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0);
+    float near = 1.0 - clamp((depth / max(1.0 - through, 1e-6) - depths.x) / (depths.y - depths.x), 0.0, 1.0);
     color = opacity * vec3(near);
   } else if (shown == 2) {
     color = opacity * (0.5 + 0.5 * normal / max(length(normal), 1e-6));
   }
-  pixel = vec4(color + through * behind, 1.0);
+  pixel = vec4(color + (1.0 - opacity) * behind, 1.0);
 }

@@ -139,7 +139,7 @@ class Picture {
 
   linked() {
     const gl = this.gl, program = gl.createProgram();
-    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}${this.about.contraction ? "#define CONTRACTED\n" : ""}`;
+    const head = `#version 300 es\n#define HARMONICS ${this.about.harmonics}\n${this.about.ndc ? "#define NDC\n" : ""}${this.about.contraction ? "#define CONTRACTED\n" : ""}${this.about.closed ? "#define CLOSED\n" : ""}`;
     const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
     for (const [kind, text] of [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, head + byId("shader").textContent]]) {
       const shader = gl.createShader(kind);
@@ -189,7 +189,8 @@ class Picture {
     gl.uniform3iv(this.at("shape"), about.shape);
     gl.uniform3iv(this.at("atlas"), this.atlas);
     gl.uniform3fv(this.at("lower"), about.lower);
-    gl.uniform1f(this.at("spacing"), about.spacing);
+    gl.uniform3fv(this.at("spacing"), about.spacing);
+    gl.uniform1f(this.at("voxel"), about.length);
     gl.uniform1f(this.at("step_length"), about.step);
     gl.uniform2fv(this.at("exponents"), about.exponents);
     gl.uniform2fv(this.at("ranges"), about.ranges);

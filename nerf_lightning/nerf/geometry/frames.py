@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.nerf.products import own_precision
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 FORWARD_FACING = 0.82
 """Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees)."""
@@ -160,3 +160,14 @@ def directions_to_user(
 def unit_of(to_user: Float[Tensor, "4 4"]) -> float:
     """Return how many of the user's units make one of the scene's."""
     return float(torch.linalg.det(to_user[:3, :3]).abs()) ** (1 / 3)
+
+
+def told_length(record: SceneRecord) -> tuple[float, str]:
+    """Return what makes a length of the scene's frame one that people are told, and its unit.
+
+    Metres, where the capture's unit is known to be some of them; else the capture's own units.
+    """
+    unit = unit_of(record.to_user.double())
+    if record.metres_per_unit is None:
+        return unit, "the capture's units"
+    return unit * record.metres_per_unit, "metres"

@@ -106,6 +106,8 @@ class SceneRecord:
     to_user: Float[Tensor, "4 4"]
     """Similarity that takes scene coordinates to the user's own frame."""
     space: Space = "bounded"
+    metres_per_unit: float | None = None
+    """How long a unit of the user's frame is; None: nobody has said."""
     capture_of: tuple[int, ...] | None = None
     """Number of the capture that each view belongs to, where several were joined; None: one capture."""
     captures: tuple[str, ...] = ()

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.nerf.geometry.frames import unit_of
+from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
 from nerf_lightning.training.loggers import show_picture
@@ -34,7 +34,7 @@ class ValidationPictures(Watcher):
         view, picture = render_validation_view(trainer, system, self.view)
         scene = trainer.datamodule.scene
         truth = photograph(scene, view, scene.background)
-        panel = mosaic(truth, picture.rgb, unit_of(scene.to_user) * picture.depth, picture.opacity)
+        panel = mosaic(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity)
         folder = Path(trainer.default_root_dir) / "images"
         save_png(folder / "validation" / f"step_{step:07d}.png", panel)
         save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))

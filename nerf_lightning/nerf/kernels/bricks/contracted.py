@@ -10,7 +10,7 @@ straight out, where a voxel is spacing r^2 long.
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 from numpy import ndarray
 
@@ -27,9 +27,9 @@ from nerf_lightning.nerf.kernels.bricks.cpu import (
     _way_out,
 )
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
-from nerf_lightning.nerf.kernels.threads import over_rows
+from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
-COMPILED_WITH = "c1261bf3"
+COMPILED_WITH = "00763081"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 MOST_STEPS = 4096
@@ -37,6 +37,8 @@ FARTHEST = np.float32(1e4)
 """Halves of the inner cube: beyond, places in the grid are no longer told apart."""
 INTO_NEXT = np.float32(0.01)
 """Voxels beyond the end of an empty brick, so that the next one is found."""
+LEAST_STOPPED = np.float32(1e-4)
+"""Less of a ray's light is not worth noting."""
 TWO, NEVER = np.float32(2.0), np.float32(-1.0)
 
 
@@ -118,6 +120,85 @@ def _light(optical, filled, at, eye, near):
             break
         t += step
     return np.exp(-depth)
+
+
+def stopped_light(
+    optical: Float[ndarray, "x y z"],
+    origins: Float[ndarray, "rays 3"],
+    directions: Float[ndarray, "rays 3"],
+    near: float,
+    step: float,
+) -> Float[ndarray, "x y z"]:
+    """Return how much of the light of rays is stopped at each value, shared out among the eight around a sample.
+
+    Args:
+        optical: optical depth of each voxel.
+        origins: in u.
+        directions: unit.
+        near: distance at which rays begin, in u.
+        step: voxels between samples.
+    """
+    filled = any_in_blocks(_with_border(optical > 0), SIDE)
+    given = (np.float32(near), np.float32(step))
+
+    def part(rays: slice) -> Float[ndarray, "x y z"]:
+        stopped = np.zeros(optical.shape, np.float32)
+        _stop(origins[rays], directions[rays], optical, filled, *given, stopped)
+        return stopped
+
+    # Always two, however many threads there are: sums of other parts would be others in their last digits.
+    middle = len(origins) // 2
+    one, other = in_parallel(part, [slice(0, middle), slice(middle, None)])
+    return one + other
+
+
+def _with_border(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
+    # A place whose upper neighbours hold something does so too.
+    grown = mask.copy()
+    for axis in range(3):
+        np.moveaxis(grown, axis, 0)[:-1] |= np.moveaxis(grown.copy(), axis, 0)[1:]
+    return grown
+
+
+@njit(nogil=True, fastmath=True, cache=True)
+@no_type_check
+def _stop(origins, directions, optical, filled, near, step, stopped):
+    size = optical.shape[0]
+    spacing = np.float32(4.0 / size)
+    for ray in range(len(origins)):
+        (ox, oy, oz), (dx, dy, dz) = origins[ray], directions[ray]
+        t, through = near, ONE
+        for _ in range(MOST_STEPS):
+            if through <= LEAST_TRANSMITTANCE:
+                break
+            x, y, z, gx, gy, gz, r, v = _contracted(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz)
+            if r > FARTHEST:
+                break
+            speed = np.sqrt(gx * gx + gy * gy + gz * gz)
+            x, y, z = (x + TWO) / spacing, (y + TWO) / spacing, (z + TWO) / spacing
+            i, j, k = min(int(x), size - 2), min(int(y), size - 2), min(int(z), size - 2)
+            full = filled[i // SIDE, j // SIDE, k // SIDE]
+            out = np.float32(0.0) if full else _way_out(x, y, z, gx / speed, gy / speed, gz / speed)
+            way = _ahead((step if full else max(out, np.float32(0.0)) + INTO_NEXT) * spacing, speed, r, v)
+            if way < 0:
+                break
+            t += way
+            if not full:
+                continue
+            u, w, q = min(x - i, ONE), min(y - j, ONE), min(z - k, ONE)
+            depth = np.float32(0.0)
+            for corner in range(8):
+                a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+                share = (u if a else ONE - u) * (w if b else ONE - w) * (q if c else ONE - q)
+                depth += share * optical[i + a, j + b, k + c]
+            weight = through * (ONE - np.exp(-depth * way / (spacing * r * r)))
+            if weight < LEAST_STOPPED:
+                continue
+            through -= weight
+            for corner in range(8):
+                a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+                share = (u if a else ONE - u) * (w if b else ONE - w) * (q if c else ONE - q)
+                stopped[i + a, j + b, k + c] += share * weight
 
 
 @njit
@@ -239,6 +320,7 @@ def trial() -> None:
     one = np.ones((1, 3), np.float32)
     optical = np.ones((SIDE,) * 3, np.float32)
     seeing_cameras(optical, one.astype(np.int32), one, one, 2 * one, np.ones((1, 7), np.float32), 0.1, 1, 1)
+    stopped_light(optical, one, one, 0.1, 1.0)
     tile = np.ones((1, TILE, TILE, TILE), np.uint8)
     looks, index = np.ones((1, 1), np.float32), np.zeros((1, 1, 1), np.int32)
     march_tiles(one, one, looks, index, tile, tile[..., None].repeat(3, -1), np.ones(4, np.float32), 1.0, 0.1)

@@ -30,6 +30,7 @@ def seeing_cameras(
     places: Float[ndarray, "voxels 3"],
     eyes: Float[ndarray, "cameras 4"],
     views: Float[ndarray, "cameras 7"],
+    sides: Float[ndarray, "3"],
     most: int,
     tries: int,
 ) -> tuple[Int[ndarray, "voxels most"], Float[ndarray, "voxels most"]]:
@@ -41,19 +42,20 @@ def seeing_cameras(
         places: where they lie in the world.
         eyes: where the cameras are in the grid, homogeneous: the way there from p is xyz - w p.
         views: a camera's centre and unit axis in the world, and the cosine of the widest angle that it sees.
+        sides: of a voxel; optical depths are those of a way of 1.
         most: cameras for each voxel.
         tries: so many are asked, other ones for each voxel.
     """
     cameras = np.full((len(voxels), most), -1, np.int32)
     light = np.zeros((len(voxels), most), np.float32)
     filled = any_in_blocks(optical > 0, SIDE)
-    over_rows(_seeing, len(voxels), optical, filled, voxels, places, eyes, views, tries, cameras, light)
+    over_rows(_seeing, len(voxels), optical, filled, voxels, places, eyes, views, sides, tries, cameras, light)
     return cameras, light
 
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _seeing(first, last, optical, filled, voxels, places, eyes, views, tries, cameras, light):
+def _seeing(first, last, optical, filled, voxels, places, eyes, views, sides, tries, cameras, light):
     count, most = eyes.shape[0], cameras.shape[1]
     for voxel in range(first, last):
         found = 0
@@ -63,7 +65,7 @@ def _seeing(first, last, optical, filled, voxels, places, eyes, views, tries, ca
             camera = (start + turn * 7919) % count
             if not _in_view(places[voxel], views[camera]):
                 continue
-            arrives = _light(optical, filled, voxels[voxel], eyes[camera])
+            arrives = _light(optical, filled, voxels[voxel], eyes[camera], sides)
             if arrives > LEAST_LIGHT:
                 cameras[voxel, found], light[voxel, found] = camera, arrives
                 found += 1
@@ -81,19 +83,20 @@ def _in_view(place, view):
 
 @njit(fastmath=True)
 @no_type_check
-def _light(optical, filled, voxel, eye):
+def _light(optical, filled, voxel, eye, sides):
     x, y, z = np.float32(voxel[0]), np.float32(voxel[1]), np.float32(voxel[2])
     dx, dy, dz = eye[0] - eye[3] * x, eye[1] - eye[3] * y, eye[2] - eye[3] * z
     length = np.sqrt(dx * dx + dy * dy + dz * dz) + TINY
     dx, dy, dz = dx / length, dy / length, dz / length
     way = length / eye[3] if eye[3] > 0 else np.float32(1e9)
     depth, t = np.float32(0.0), ONE
+    long = np.sqrt((dx * sides[0]) ** 2 + (dy * sides[1]) ** 2 + (dz * sides[2]) ** 2)
     while t < way and depth < OPAQUE_DEPTH:
         i, j, k = x + t * dx + HALF, y + t * dy + HALF, z + t * dz + HALF
         if not (0 <= i < optical.shape[0] and 0 <= j < optical.shape[1] and 0 <= k < optical.shape[2]):
             break
         if filled[int(i) // SIDE, int(j) // SIDE, int(k) // SIDE]:
-            depth += optical[int(i), int(j), int(k)]
+            depth += long * optical[int(i), int(j), int(k)]
             t += ONE
         else:
             t += max(ONE, _way_out(i, j, k, dx, dy, dz))
@@ -128,6 +131,7 @@ def march_tiles(
     colors: UInt8[ndarray, "bricks 9 9 9 channels"],
     scale: Float[ndarray, "numbers"],
     step: float,
+    lengths: Float[ndarray, "rays"],
 ) -> Float[ndarray, "rays 7"]:
     """Return colour (3), opacity, and expected distance of the stopped light times it; samples of density, of colour.
 
@@ -140,16 +144,17 @@ def march_tiles(
         colors: bytes, three for each harmonic.
         scale: the exponents of density 0 and of one more, and the half range of each degree's coefficients.
         step: voxels between samples.
+        lengths: how long a way of one voxel is along each ray; densities are optical depths of a way of 1.
     """
     out = np.zeros((len(origins), 7), np.float32)
-    arrays = (origins, directions, looks, index, density, colors, scale, np.float32(step), out)
+    arrays = (origins, directions, looks, index, density, colors, scale, np.float32(step), lengths, out)
     over_rows(_march, len(origins), *arrays)
     return out
 
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _march(first, last, origins, directions, looks, index, density, colors, scale, step, out):
+def _march(first, last, origins, directions, looks, index, density, colors, scale, step, lengths, out):
     basis = looks.shape[1]
     size = np.array([index.shape[0] * SIDE, index.shape[1] * SIDE, index.shape[2] * SIDE], np.float32)
     nothing = np.exp2(scale[0])
@@ -177,7 +182,7 @@ def _march(first, last, origins, directions, looks, index, density, colors, scal
             x, y, z = x - i * SIDE, y - j * SIDE, z - k * SIDE
             value = _between(density[tile], x, y, z)
             result[5] += ONE
-            alpha = ONE - np.exp(-(np.exp2(scale[0] + scale[1] * value) - nothing) * step)
+            alpha = ONE - np.exp(-(np.exp2(scale[0] + scale[1] * value) - nothing) * step * lengths[ray])
             if alpha < LEAST_ALPHA:
                 continue
             result[6] += ONE
@@ -231,7 +236,7 @@ def trial() -> None:
     one = np.ones((1, 3), np.float32)
     optical = np.ones((SIDE,) * 3, np.float32)
     eyes, views = np.ones((1, 4), np.float32), np.ones((1, 7), np.float32)
-    seeing_cameras(optical, one.astype(np.int32), one, eyes, views, 1, 1)
+    seeing_cameras(optical, one.astype(np.int32), one, eyes, views, one[0], 1, 1)
     tile = np.ones((1, TILE, TILE, TILE), np.uint8)
     looks, index = np.ones((1, 1), np.float32), np.zeros((1, 1, 1), np.int32)
-    march_tiles(one, one, looks, index, tile, tile[..., None].repeat(3, -1), np.ones(4, np.float32), 1.0)
+    march_tiles(one, one, looks, index, tile, tile[..., None].repeat(3, -1), np.ones(4, np.float32), 1.0, one[0, :1])
