@@ -212,7 +212,7 @@ def _print(found: dict[str, list[tuple[int | float, Point]]]) -> None:
     for name, points in found.items():
         columns = [quantity.of(points) for quantity in QUANTITIES]
         for row in zip(*columns, strict=True):
-            table.add_row(name, f"{row[0][0]:,.4g}", *(f"{value:,.3g}" for _, value in row))
+            table.add_row(name, f"{row[0][0]:,}", *(f"{value:,.3g}" for _, value in row))
         table.add_row(
             "", "grows with power", *(f"{exponent(column):.2f}" for column in columns), style="bold", end_section=True
         )
@@ -226,7 +226,7 @@ def _draw(found: dict[str, list[tuple[int | float, Point]]], path: Path) -> None
 
     columns = min(4, len(found))
     rows = -(-len(found) // columns)
-    figure = new_figure(340 * columns, 340 * rows)
+    figure = new_figure(360 * columns, 360 * rows)
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes, (name, points) in zip(panels, found.items(), strict=False):
         _draw_axis(axes, name, points)
@@ -242,8 +242,13 @@ def _draw_axis(axes: "Axes", name: str, points: list[tuple[int | float, Point]])
         axes.plot(*zip(*drawn, strict=True), marker="o", markersize=3, linewidth=1.2, color=each.colour, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    sizes = [size for size, _ in points]
+    axes.set_xticks(sizes, [f"{size:,}" for size in sizes], minor=False)
+    axes.set_xticks([], minor=True)  # within a decade their labels would lie on each other
     axes.set_title(name, fontsize=10)
     # Below the panel: within, it would lie on lines.
-    axes.legend(fontsize=7, frameon=False, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.08))
+    axes.legend(
+        fontsize=6.5, frameon=False, ncols=2, columnspacing=0.8, loc="upper center", bbox_to_anchor=(0.45, -0.08)
+    )
     axes.tick_params(which="both", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
