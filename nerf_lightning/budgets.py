@@ -46,6 +46,8 @@ class Budgets:
     """Of that part of a PyTorch file that is not numbers."""
     tensor_bytes: int = 1 << 36
     """Of a PyTorch file."""
+    unpacked_bytes: int = 1 << 32
+    """Of the weights that a checkpoint keeps in fewer bytes (nerf prune), as they are in memory."""
     event_bytes: int = 1 << 29
     """Of a run's TensorBoard files."""
     film_frames: int = 100_000

@@ -5,6 +5,7 @@ its own, and has the shortest of several windows of steps: other work on the mac
 exponent k of t = a n^k is fitted to the logarithms.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -157,7 +158,7 @@ AXES: dict[str, Callable[[DictConfig], list[Case]]] = {
 
 
 def _measured(config: DictConfig, case: Case, folder: Path) -> Point:
-    chosen = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    chosen = copy.deepcopy(config)
     # One size of batches, so that a step's rays are those of the axis; and one of tiles, which takes seconds to choose.
     fixed: dict[str, Any] = {"data.sample_budget": None, "data.crop_steps": 0}
     if chosen.trainer.tile_points == "auto":
@@ -172,7 +173,7 @@ def _measured(config: DictConfig, case: Case, folder: Path) -> Point:
             "_target_": "nerf_lightning.data.readers.transforms.TransformsReader",
             "root": str(capture),
             "space": "bounded",
-            "cache_dir": str(folder / "kept"),  # goes with the photographs
+            "cache_dir": str(folder / "decoded"),  # goes with the photographs
         }
     return measure_point(chosen, case.processes)
 

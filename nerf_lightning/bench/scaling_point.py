@@ -115,6 +115,11 @@ def _numbers(config: DictConfig) -> tuple[float, ...]:
 
 def _window(take_step: Callable[[], None], steps: int) -> tuple[float, float]:
     """Return seconds, and seconds of this process on all cores, per step."""
+
+    def take() -> None:
+        for _ in range(steps):
+            take_step()
+
     before = time.process_time()
-    seconds = seconds_of(lambda: [take_step() for _ in range(steps)])
+    seconds = seconds_of(take)
     return seconds / steps, (time.process_time() - before) / steps

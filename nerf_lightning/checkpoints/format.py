@@ -5,6 +5,7 @@ from typing import get_args
 import torch
 
 from nerf_lightning.budgets import allowed
+from nerf_lightning.checkpoints.packing import packed_format
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
 from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Plain, Record, Text, Whole
 from nerf_lightning.nerf.types.scene import Background, LensModel, Space
@@ -53,12 +54,15 @@ def scene() -> Record:
             "far": Numbers(("views",), low=0.0, high=FARTHEST),
             "aabb": Numbers((2, 3), low=-FARTHEST, high=FARTHEST),
             "splits": Record(
-                {"train": Many(Whole(0, views), views, tuple, least=1)}, {"val": numbers, "test": numbers}
+                {"train": Many(Whole(0, views), views, tuple, least=1)},
+                {"val": numbers, "test": numbers, "sources": numbers},
             ),
             "background": Choice(get_args(Background)),
             "to_user": Numbers((4, 4)),
             "space": Choice(get_args(Space)),
-        }
+        },
+        # Of several captures that were joined; earlier versions wrote neither.
+        {"capture_of": Maybe(numbers), "captures": Many(name, views, tuple)},
     )
 
 
@@ -87,7 +91,9 @@ def record(resumable: bool) -> Record:
         "world_size": Whole(1, 1 << 16),
     }
     learnt: dict[str, Description] = {"refined": cameras()}
-    return Record(use | run, learnt) if resumable else Record(use, run | learnt)
+    # Nothing goes on from a file that was made smaller but its weights (`init_from`).
+    smaller: dict[str, Description] = {"packed": packed_format()}
+    return Record(use | run, learnt) if resumable else Record(use, run | learnt | smaller)
 
 
 def checkpoint(resumable: bool) -> Record:

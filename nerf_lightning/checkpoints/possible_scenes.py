@@ -43,6 +43,18 @@ def require_possible_scene(scene: Mapping[str, Any], where: str) -> None:
         raise Unfit("scene.view_names", "names two views alike")
     for name in (scene["name"], *scene["view_names"]):
         require_printable(name, f"{where}: scene.view_names")
+    _require_captures(scene.get("capture_of"), scene.get("captures", ()), views)
+    for name in scene.get("captures", ()):
+        require_printable(name, f"{where}: scene.captures")
+
+
+def _require_captures(capture_of: tuple[int, ...] | None, captures: tuple[str, ...], views: int) -> None:
+    if capture_of is None:
+        return
+    if len(capture_of) != views:
+        raise Unfit("scene.capture_of", f"has not a number for each of the {views} views")
+    if any(number >= len(captures) for number in capture_of):
+        raise Unfit("scene.capture_of", f"names captures that are not among the {len(captures)}")
 
 
 def require_possible_refinement(refined: Mapping[str, Any], given: Mapping[str, Any]) -> None:

@@ -2,8 +2,8 @@
 
 A checkpoint is tensors and plain containers only, so it loads with `weights_only=True`; nothing in it is executed.
 Under the key `nerf_lightning`: format, version, config (resolved, as yaml text), choices (the names picked from each
-config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learnt, where they were), and
-the run's state that the system adds.
+config group), scene (cameras, bounds, splits, frame), refined (those cameras as they were learnt, where they were),
+packed (weights in fewer bytes, where it was made smaller), and the run's state that the system adds.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from torch import Tensor
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
 from nerf_lightning.checkpoints.format import scene as scene_format
+from nerf_lightning.checkpoints.packing import unpacked
 from nerf_lightning.checkpoints.possible_scenes import require_possible_refinement, require_possible_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
@@ -92,6 +93,7 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         return _newest_of_run(path)
     content = read_content(path, resumable=False)
     record, prefix = content[KEY], "model."
+    state = content["state_dict"] | _unpacked(record, path)
     scene = record["scene"]
     given = Cameras(**scene["cameras"])
     refined = Cameras(**record["refined"]) if "refined" in record else None
@@ -101,13 +103,20 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         choices=record["choices"],
         scene=SceneRecord(**scene | {"cameras": refined or given}),
         given_cameras=None if refined is None else given,
-        weights={k[len(prefix) :]: value for k, value in content["state_dict"].items() if k.startswith(prefix)},
+        weights={k[len(prefix) :]: value for k, value in state.items() if k.startswith(prefix)},
         step=content["global_step"],
         precision=record["precision"],
         tile_points=record["tile_points"],
         good=record.get("bad_steps", [0, 0])[1] == 0,
         record=record,
     )
+
+
+def _unpacked(record: dict[str, Any], path: Path) -> dict[str, Tensor]:
+    try:
+        return unpacked(record["packed"], str(path)) if "packed" in record else {}
+    except Unfit as problem:
+        raise _damaged(path, problem) from problem
 
 
 def read_content(path: Path, resumable: bool) -> dict[str, Any]:
@@ -149,7 +158,11 @@ def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
         if "refined" in record:
             require_possible_refinement(record["refined"], record["scene"]["cameras"])
     except Unfit as problem:
-        raise InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}") from problem
+        raise _damaged(path, problem) from problem
+
+
+def _damaged(path: Path, problem: Unfit) -> InputError:
+    return InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}")
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:

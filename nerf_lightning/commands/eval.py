@@ -3,14 +3,13 @@
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.evaluation.protocol import measured_of
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.evaluate_and_film import metric_lines
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import open_checkpoint
+from nerf_lightning.training.open_checkpoint import as_known, open_checkpoint
 
 
 def run(config: DictConfig) -> float:
@@ -27,10 +26,12 @@ def evaluate(config: DictConfig) -> float:
     opened = open_checkpoint(config)
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
     with filled_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation")) as folder:
-        scene = as_trained(build(config.scene).read(), checkpoint)
+        scene = as_known(build(config.scene).read(), opened)
         origin = measured_of(
             model, checkpoint.config, checkpoint.choices, settings.device, settings.precision, checkpoint.step
         )
+        if model.needs_photographs:
+            origin["trained_on"] = list(checkpoint.scene.trained_captures)
         scoring = build(config.evaluation)
         with torch.no_grad():
             metrics = scoring.score(model, scene, scene.background, opened.tile_points, folder, origin)

@@ -7,7 +7,7 @@ import torch
 from omegaconf import DictConfig, ListConfig
 
 from nerf_lightning import ranks
-from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.commands.gallery_pages import page_maker
 from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.config.instantiate import build, required_path
@@ -20,7 +20,7 @@ from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.results import find_runs
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
+from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.video.paths.base import CameraPath
 
 
@@ -44,13 +44,18 @@ def export_one(config: DictConfig) -> list[Path]:
     path = build(config.path) if what.shows_photographs else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
+    if what.needs_density and opened.model.needs_photographs:
+        opened.model.density(torch.zeros(1, 3, device=opened.settings.device))  # or says by name that there is none
     if path is not None:
         asked = config.what.photographs or config.what.max_views
-        photographs = read_photographs(config, opened.checkpoint) if asked else None
+        photographs = read_photographs(config, opened) if asked else None
         what.beside = beside_page(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
-        written = what.export(opened.model, opened.checkpoint.scene, folder, opened.tile_points)
+        record = opened.checkpoint.scene
+        if opened.model.needs_photographs:
+            record = scene_record(scene_to_look_at(opened, None))
+        written = what.export(opened.model, record, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are those that training refined (refinement=...), not those that were read")
     return written

@@ -7,14 +7,15 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import open_checkpoints
+from nerf_lightning.training.open_checkpoint import Opened, open_checkpoints, scene_to_look_at
 from nerf_lightning.video.film import film
 from nerf_lightning.video.settings import as_list, film_settings
 from nerf_lightning.video.shots import Subject
@@ -26,20 +27,16 @@ def run(config: DictConfig) -> None:
 
 
 def render(config: DictConfig) -> None:
-    """Film one checkpoint, or several side by side; they are all that is needed."""
+    """Film one checkpoint, or several side by side; they are all that is needed, but by models of many scenes."""
     plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     shown = film_settings(plain)
     path = build(config.path)
     opened = open_checkpoints(config, as_list(plain["ckpt"]))
     labels = labels_of([each.checkpoint for each in opened], plain["labels"])
+    scenes = [_scene(each, config.get("scene")) for each in opened]
     subjects = [
-        Subject(
-            each.model,
-            each.checkpoint.scene,
-            known_background(config.background or each.checkpoint.scene.background),
-            label,
-        )
-        for each, label in zip(opened, labels, strict=True)
+        Subject(each.model, scene, known_background(config.background or scene.background), label)
+        for each, scene, label in zip(opened, scenes, labels, strict=True)
     ]
     first = opened[0]
     shown = replace(shown, precision=first.settings.precision)
@@ -47,6 +44,18 @@ def render(config: DictConfig) -> None:
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         written = film(subjects, path, first.tile_points, folder, shown)
     say(*map(str, written))
+
+
+def _scene(opened: Opened, scene: DictConfig | None) -> SceneRecord:
+    """Return the scene that a model renders: its own, or for models that look at photographs the one that is named."""
+    if opened.model.needs_photographs:
+        return scene_record(scene_to_look_at(opened, scene))
+    if scene is not None:
+        raise InputError(
+            f"{opened.checkpoint.path} knows the scene {opened.checkpoint.scene.name} alone. Leave scene=... out; "
+            "models that look at photographs (model=view_transformer) render other scenes, too."
+        )
+    return opened.checkpoint.scene
 
 
 def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:

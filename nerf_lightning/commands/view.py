@@ -2,10 +2,11 @@
 
 from omegaconf import DictConfig
 
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs
+from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
@@ -18,9 +19,13 @@ def run(config: DictConfig) -> None:
     require_viser()
     named_places(config.viewer.hosts)
     opened = open_checkpoint(config)
-    record = opened.checkpoint.scene
+    record, scene = opened.checkpoint.scene, None
+    if opened.model.needs_photographs:
+        scene = scene_to_look_at(opened, config.scene if config.photographs else None)
+        record = scene_record(scene)
+    elif config.photographs:
+        scene = read_photographs(config, opened)
     background = known_background(config.background or record.background)
-    scene = read_photographs(config, opened.checkpoint) if config.photographs else None
     # Made when somebody saves something: a checkpoint may lie where nothing can be written.
     folder = chosen_folder(config.paths.output_dir, beside_checkpoint(opened.checkpoint.path, "viewer"))
     renderer = SlicedRenderer(opened.model, record, background, opened.tile_points)

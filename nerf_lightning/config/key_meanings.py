@@ -115,10 +115,11 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         budget.seconds trainer.clip_norm
         data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
-        data.device_budget data.prefetch data.overfit_views
-        scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
+        data.device_budget data.prefetch data.overfit_views data.views_per_step
+        scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution scene.variant
         scene.images scene.masks scene.masks_keep scene.file scene.frames scene.hold_every scene.train_fraction
         scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
+        scene.variants scene.unseen scene.gain scene.gamma
         callbacks.collapse_guard.every_steps callbacks.collapse_guard.until_step callbacks.collapse_guard.patience
         callbacks.collapse_guard.ratio callbacks.collapse_guard.max_restarts
         """,
@@ -154,7 +155,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         scene.verify doctor final.evaluate final.video final.page final.report path.file path.view path.views
         evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
-        evaluation.lpips_weights evaluation.lpips_net evaluation.colors
+        evaluation.lpips_weights evaluation.lpips_net evaluation.colors evaluation.nearest_views
         """,
     ),
     (CURVE, "path.**"),
@@ -167,6 +168,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         ckpt trust what.** labels outputs mosaic format alpha background crop near hold_camera projection
         host port open_browser photographs max_height
+        keep by weights round_to tables drop_empty finetune_steps
         run measured max_megabytes runs scenes models sort published force curves out
         rounds steps warmup_steps target_psnr kernels render_rays
         images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads

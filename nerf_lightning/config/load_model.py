@@ -42,9 +42,9 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     require_trusted(config, str(checkpoint.path), trusted)
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
-        shapes = _built(config, checkpoint)
+        shapes = build_model(config, checkpoint)
     _require_fitting(shapes, checkpoint)
-    model = _built(config, checkpoint)
+    model = build_model(config, checkpoint)
     load_weights(model, checkpoint)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
     require_within("layer_width", _widest(model), f"The model of {checkpoint.path}", "features of one point in a layer")
@@ -76,7 +76,12 @@ def _widest(model: Model) -> int:
     return max([*sides, *encoded], default=0)
 
 
-def _built(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
+def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
+    """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`).
+
+    Raises:
+        InputError: it cannot be built, or is no model.
+    """
     try:
         require_fitting_values(config, "model")
         model = instantiate(config, _convert_="all")

@@ -45,6 +45,8 @@ class RayDataModule(LightningDataModule):
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
         overfit_views: train on so many of the photographs, spread over all, without jitter, and validate on the same,
             to see whether a model can learn anything at all; None: as always.
+        views_per_step: the rays of a step are those of so many photographs, as many of each, for models that look at
+            other photographs for each that they explain; None: of all.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class RayDataModule(LightningDataModule):
         prefetch: bool | Literal["auto"] = "auto",
         patch: int = 1,
         overfit_views: int | None = None,
+        views_per_step: int | None = None,
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
@@ -91,8 +94,9 @@ class RayDataModule(LightningDataModule):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
         if overfit_views is not None:
             scene = _few_views(scene, overfit_views)
+        _check_views_per_step(views_per_step, batch_rays, sample_budget, patch)
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays, patch)
+        self.batches = RayBatches(scene, progress, seed, batch_rays, patch, views_per_step)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
         self.device_budget, self.prefetch = device_budget, prefetch
@@ -142,6 +146,22 @@ def _few_views(scene: Scene, count: int) -> Scene:
         raise InputError(f"data.overfit_views={count}: give at least one photograph, or null for a training on all.")
     few = tuple(evenly_spaced_subset(scene.splits["train"], count))
     return replace(scene, splits=scene.splits | {"train": few, "val": few})
+
+
+def _check_views_per_step(views: int | None, batch_rays: int, sample_budget: int | None, patch: int) -> None:
+    if views is None:
+        return
+    if not 1 <= views <= batch_rays or batch_rays % views:
+        raise InputError(
+            f"data.views_per_step={views} with data.batch_rays={batch_rays}: each photograph of a step gets as many "
+            "rays as the others. Give a number of photographs that divides the number of rays, or null."
+        )
+    if sample_budget is not None or patch > 1:
+        raise InputError(
+            f"data.views_per_step={views} goes neither with data.sample_budget, whose steps have no fixed number of "
+            "rays, nor with losses that look at squares of pixels (loss.patch). Give data.sample_budget=null and "
+            "another loss, or data.views_per_step=null."
+        )
 
 
 def _require_room(name: str, rays: int) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerf_lightning import ranks
 from nerf_lightning.data.pixels.placement import sent
+from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.randomness import fold, permute
@@ -66,7 +67,8 @@ class PixelDomain:
         self.top = (height - self.height) // 2
         # One more than fit, for what a shift uncovers on the other side.
         self.columns, self.rows = ((size + 2 * (patch - 1)) // patch for size in (self.width, self.height))
-        self.ends = (self.columns * self.rows).cumsum(0)
+        self.sizes = self.columns * self.rows
+        self.ends = self.sizes.cumsum(0)
         self.count = int(self.ends[-1])
 
     def __len__(self) -> int:
@@ -85,7 +87,7 @@ class PixelDomain:
             shift: of the grid of squares, in pixels, below `patch`.
         """
         slot = torch.searchsorted(self.ends, number, right=True)
-        within = number - (self.ends[slot] - self.columns[slot] * self.rows[slot])
+        within = number - (self.ends[slot] - self.sizes[slot])
         row = torch.div(within, self.columns[slot], rounding_mode="floor")
         column = within - row * self.columns[slot]
         view, left, top = self.views[slot], self.left[slot], self.top[slot]
@@ -126,10 +128,13 @@ class RayBatches:
         seed: the run's seed.
         batch_rays: rays per step.
         patch: side in pixels of the squares that rays come in; a batch is made of whole ones.
+        views: of how many photographs the rays of a batch are; None: of all.
     """
 
-    def __init__(self, scene: Scene, progress: Progress, seed: int, batch_rays: int, patch: int = 1):
-        self.progress, self.seed, self.batch_rays, self.patch = progress, seed, batch_rays, patch
+    def __init__(
+        self, scene: Scene, progress: Progress, seed: int, batch_rays: int, patch: int = 1, views: int | None = None
+    ):
+        self.progress, self.seed, self.batch_rays, self.patch, self.views = progress, seed, batch_rays, patch, views
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device that a background thread makes batches for; None: there is no such thread.
@@ -196,7 +201,13 @@ class RayBatches:
         count = self.progress.batch_rays if batch_rays is None else batch_rays
         together = self.patch**2
         count, position = count // together, position // together
-        place = position + torch.arange(count)[ranks.share(count)]
+        slots = torch.arange(count)[ranks.share(count)]
+        if self.views is not None:
+            key = fold(self.seed, attempt, purpose)
+            starts, sizes = domain.ends.cpu() - domain.sizes.cpu(), domain.sizes.cpu()
+            numbers = rays_of_few_views(starts, sizes, position // count, slots, count, self.views, key)
+            return domain.locate(sent(numbers, domain.ends.device))
+        place = position + slots
         epochs, epoch = torch.unique_consecutive(place // len(domain), return_inverse=True)
         keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
         numbers = permute(place % len(domain), len(domain), keys if len(keys) == 1 else keys[epoch])

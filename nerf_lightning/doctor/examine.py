@@ -12,6 +12,7 @@ from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
 from nerf_lightning.doctor.matches import find_matches
 from nerf_lightning.doctor.view_statistics import look_at_view, stacked
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
 CHECKS: tuple[CheckFn, ...] = (
@@ -25,7 +26,16 @@ CHECKS: tuple[CheckFn, ...] = (
 
 
 def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
-    """Return the outcome of every check, and what they looked at; takes seconds."""
+    """Return the outcome of every check, and what they looked at; takes seconds.
+
+    Raises:
+        InputError: several captures were joined, of which each has a frame of its own.
+    """
+    if scene.capture_of is not None:
+        raise InputError(
+            f"{scene.name} joins {len(scene.captures)} captures, and the doctor examines one at a time: give "
+            "scene=auto scene.root=DIR; or doctor=off to train all the same."
+        )
     with _one_thread_each():
         evidence = gather_evidence(scene)
         return evidence, [check(evidence) for check in CHECKS]

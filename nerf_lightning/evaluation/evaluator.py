@@ -1,5 +1,6 @@
 """Measure a model on the views of a split: numbers per picture, what they come to, and the protocol of all of them."""
 
+import logging
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,17 +18,21 @@ from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
 from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
-from nerf_lightning.evaluation.metrics_files import summary, write_metrics
+from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
+from nerf_lightning.evaluation.nearest_view import baselines
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
+
+log = logging.getLogger(__name__)
 
 
 class Scoring:
@@ -43,6 +48,8 @@ class Scoring:
         lpips_net: the backbone, alex or vgg.
         colors: raw compares renders as they are; half_fit gives each the exposure and white balance that suit the left
             half of its photograph, and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
+        nearest_views: also measure what so many photographs give without a model, each view shown as the nearest of
+            them and as their blend; null: no.
     """
 
     def __init__(
@@ -55,7 +62,10 @@ class Scoring:
         lpips_weights: str | None = None,
         lpips_net: Literal["alex", "vgg"] = "alex",
         colors: Colors = "raw",
+        nearest_views: int | None = None,
     ):
+        if nearest_views is not None and nearest_views < 1:
+            raise InputError(f"evaluation.nearest_views={nearest_views}: give at least one photograph, or null.")
         if max_views is not None and max_views < 1:
             raise InputError(f"evaluation.max_views={max_views}: give at least one view, or null for all.")
         for name, count in (("num_pictures", num_pictures), ("num_worst", num_worst)):
@@ -64,6 +74,7 @@ class Scoring:
         self.split, self.max_views, self.quantize = split, max_views, quantize
         self.colors: Colors = colors
         self.num_pictures, self.num_worst = num_pictures, num_worst
+        self.nearest_views = nearest_views
         self.lpips = load_lpips(lpips_weights, lpips_net)
 
     def score(
@@ -83,7 +94,8 @@ class Scoring:
         views = self._views(scene)
         shown_views = evenly_spaced_subset(views, self.num_pictures)
         kept = KeptViews(folder, self.split, self.num_worst)
-        rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+        show_photographs(model, scene)
+        rays_of = RayGenerator.of_views(scene, model)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
         for view in tracked(mine, f"evaluating {self.split}"):
@@ -94,6 +106,8 @@ class Scoring:
             picture = render_picture(model, rays_of, view, background, tile_points)
             seconds = time.perf_counter() - started
             row, shown = self._compare(picture, scene, view, background)
+            if model.needs_photographs:
+                row["unseen"] = float((picture.opacity == 0).float().mean())
             rows.append(row | {"seconds": seconds})
             kept.watch(row["name"], row["psnr"], shown)
             if view in shown_views:
@@ -106,6 +120,12 @@ class Scoring:
             "origin": origin or {},
             "environment": environment(),
         }
+        _warn_of_unseen(rows)
+        if self.nearest_views is not None and ranks.is_first():
+            result["nearest_views"] = baselines(scene, views, background, self.nearest_views)
+        if scene.capture_of is not None:
+            names = {scene.view_names[view]: scene.captures[scene.capture_of[view]] for view in views}
+            result["captures"] = of_captures(rows, names, scene.trained_captures)
         if ranks.is_first():
             write_metrics(folder, result)
         return result
@@ -138,6 +158,21 @@ class Scoring:
         row["lpips"] = None if self.lpips is None else self.lpips.score(masked_out(render, true, counts), true)
         depth = unit_of(scene.to_user) * picture.depth
         return row | _geometry_errors(picture, scene, view), ScoredView(truth, picture.rgb, depth, picture.opacity)
+
+
+def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:
+    """Say which views show what no photograph sees, where a model renders from photographs."""
+    unseen = [(row["unseen"], row["name"]) for row in rows if row.get("unseen")]
+    if unseen:
+        share, name = max(unseen)
+        log.warning(
+            "%d of %d views have pixels whose rays no photograph sees, up to %.1f %% of a view (%s): they show the "
+            "background, which is no guess of what is there.",
+            len(unseen),
+            len(rows),
+            100.0 * share,
+            name,
+        )
 
 
 def _fitted_on_the_left(

@@ -2,6 +2,7 @@
 
 import csv
 import statistics
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,27 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return result if result["lpips"] is not None else result | {"lpips_hint": LPIPS_HINT}
 
 
+def of_captures(rows: list[dict[str, Any]], capture_of: Mapping[str, str], trained: Collection[str]) -> dict[str, Any]:
+    """Return the means of each capture's views, by its name, and whether it was trained on.
+
+    Args:
+        rows: of all scored views.
+        capture_of: the capture's name by the view's.
+        trained: names of the captures that were trained on.
+    """
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_name.setdefault(capture_of[row["name"]], []).append({metric: row[metric] for metric in METRICS})
+    return {
+        name: mean_over_images(own) | {"num_images": len(own), "trained_on": name in trained}
+        for name, own in by_name.items()
+    }
+
+
 def write_metrics(folder: Path, result: dict[str, Any]) -> None:
     """Write `metrics.json`, and `metrics.csv` with a row per picture."""
     write_json(folder / "metrics.json", result)
     with whole_file(folder / "metrics.csv") as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({key: for_csv(value) for key, value in row.items()} for row in result["per_image"])

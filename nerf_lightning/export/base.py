@@ -28,6 +28,8 @@ class Export(ABC):
 
     shows_photographs: bool = False
     """Whether the photographs are read again for it."""
+    needs_density: bool = True
+    """Whether it says where matter is, and not only what is seen."""
     beside: Beside = Beside()
     """What the command has found beside the checkpoint, for those that show photographs."""
 

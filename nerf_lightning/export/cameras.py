@@ -47,6 +47,8 @@ class CamerasExport(Export):
         InputError: fewer than one photograph per second.
     """
 
+    needs_density = False
+
     def __init__(self, images: str | None = None, format: CamerasFormat = "transforms", fps: int = 24):
         if fps < 1:
             raise InputError(f"what.fps={fps}: give 1 or more photographs per second.")

@@ -42,6 +42,8 @@ class ImagesExport(Export):
         depth: `distance` along the pixel's ray, or `z` along the camera's axis.
     """
 
+    needs_density = False
+
     def __init__(self, split: Split = "test", max_views: int | None = None, depth: DepthKind = "distance"):
         if max_views is not None and max_views < 1:
             raise InputError(f"what.max_views={max_views}: give at least one view, or null for all.")

@@ -65,7 +65,7 @@ def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -
 
 def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_points: int) -> SeenView:
     """Render one view; `cameras` are the record's, at whatever size."""
-    rays_of = RayGenerator(cameras, record.near, record.far)
+    rays_of = RayGenerator(cameras, record.near, record.far, names_photographs=model.needs_photographs)
     picture = render_picture(model, rays_of, view, record.background, tile_points)
     depth = picture.depth
     if cameras.ndc is None:

@@ -1,4 +1,4 @@
-"""The contract of what learns in a training step beside the model, such as cameras or the colours of photographs."""
+"""The contract of what learns at a rate of its own: cameras, the colours of photographs, or a part of a model."""
 
 from jaxtyping import Float
 from torch import Tensor, nn

@@ -1,21 +1,23 @@
 """A trained model, opened from its run or its checkpoint, and rendered from any camera."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from nerf_lightning.budgets import Budgets, allow
-from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.data.captures.checks import known_background
+from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
@@ -60,7 +62,7 @@ class TrainedModel:
                 subject = Subject(self.module, self.scene, behind)
                 return shot_of(subject, _one(camera), self.tile_points).picture(0)
             scene, view = self.scene, self._view(camera)
-            rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
+            rays_of = RayGenerator.of_views(scene, self.module)
             return render_picture(self.module, rays_of, view, behind, self.tile_points)
 
     def path(self, name: str = "orbit", **settings: Any) -> Cameras:
@@ -78,6 +80,21 @@ class TrainedModel:
         with in_words("render"):
             config, _ = compose_config("render", overrides)
             return lay_path(build(config.path), self.scene)
+
+    def of_scene(self, scene: Scene) -> "TrainedModel":
+        """Return the same network for another scene, which it renders from the photographs of that scene from now on.
+
+        For models that look at photographs (model=view_transformer), which have to be shown some before they render; of
+        several captures that were joined, the first that was never trained on is taken.
+
+        Raises:
+            InputError: the model knows its own scene alone, or cannot look at these photographs.
+        """
+        if not self.module.needs_photographs:
+            raise InputError(f"This model knows the scene {self.scene.name} alone, and no other can be shown to it.")
+        shown = shown_capture(scene)
+        show_photographs(self.module, shown)
+        return replace(self, checkpoint=replace(self.checkpoint, scene=scene_record(shown), given_cameras=None))
 
     def in_frame(self, scene: Scene) -> Scene:
         """Return a scene in the frame of this model, with its refined cameras where it has some.

@@ -22,6 +22,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress
@@ -231,6 +232,11 @@ def build_step(
     model = build(config.model) if model is None else model
     refinement: Refinement = build(config.refinement)
     refinement.fit_to(scene)
+    if model.needs_photographs and refinement.moves():
+        raise InputError(
+            "A model that looks at photographs takes their cameras as they are, so nothing is learnt of them: leave "
+            "refinement out. Refine the cameras of a capture with a model of its own (model=fast)."
+        )
     scene = replace(scene, refined=refinement.moves())
     optimizer = build(config.optimizer)
     if settings.device_type == "xla":
@@ -238,13 +244,14 @@ def build_step(
         optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
     hold_to_budgets(model, "The model")
     model.fit_to(scene)
+    show_photographs(model, scene)
     correction: Correction = build(config.correction)
     correction.fit_to(scene)
     if start is not None:
         load_weights(model, start)
     return TrainStep(
         model=model,
-        rays=RayGenerator(scene.cameras, scene.near, scene.far, refinement),
+        rays=RayGenerator.of_views(scene, model, refinement),
         loss=build(config.loss) if loss is None else loss,
         correction=correction,
         optimizer=optimizer,

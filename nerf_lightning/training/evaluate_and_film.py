@@ -12,12 +12,14 @@ from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
+from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
 from nerf_lightning.export.page import QUALITIES, PageExport
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.refinements.carry import motions, moved_far
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
@@ -61,7 +63,7 @@ class Finish:
             InputError: why not.
         """
         if self.path is not None:
-            record = scene_record(scene)
+            record = scene_record(shown_capture(scene))
             require_room(lay_path(self.path, record), FilmSettings(), [record])
 
     def __call__(
@@ -80,7 +82,9 @@ class Finish:
                 _log_metrics(trainer, metrics)
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
-                subject = Subject(model, scene_record(scene), scene.background)
+                shown_scene = shown_capture(scene)
+                show_photographs(model, shown_scene)
+                subject = Subject(model, scene_record(shown_scene), scene.background)
                 shown = FilmSettings(precision=settings.precision)
                 video, depth = film([subject], self.path, tile_points, folder, shown)
                 lines += [f"video        {video}", f"depth        {depth}"]
@@ -143,6 +147,13 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         f"               median {metrics['median']['psnr']:.2f} dB, worst {metrics['worst']['psnr']['value']:.2f} dB "
         f"({metrics['worst']['psnr']['name']}){fitted}{halves}",
     ]
+    if metrics.get("nearest_views") is not None:
+        without = metrics["nearest_views"]
+        lines.append(
+            f"no model     nearest photograph {without['nearest']:.2f} dB, blend of {without['photographs']} "
+            f"{without['blend']:.2f} dB; through a plane {without['nearest_on_plane']:.2f} and "
+            f"{without['blend_on_plane']:.2f} dB"
+        )
     if metrics["depth_error"] is not None:
         normal = metrics["normal_error"]
         angle = "" if normal is None else f"   normal error {normal:.1f} degrees"

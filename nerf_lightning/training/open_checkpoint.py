@@ -9,11 +9,16 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint, read_checkpoint
 from nerf_lightning.checkpoints.recorded_frame import as_trained
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.config.overrides import quoted
+from nerf_lightning.config.scene_overrides import scene_overrides
+from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
@@ -55,13 +60,18 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     """Open several; the tiles are those of the first."""
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
-    trusted = _modules(config.trust)
+    trusted = trusted_modules(config.trust)
     checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in paths]
     settings.keep_tile(checkpoints[0].tile_points)
     return [Opened(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
 
 
-def _modules(trust: Any) -> list[str]:
+def trusted_modules(trust: Any) -> list[str]:
+    """Return the modules that `trust` names.
+
+    Raises:
+        InputError: no name of a module.
+    """
     named = [] if trust is None else [trust] if isinstance(trust, str) else list(trust)
     for name in named:
         if not isinstance(name, str) or not all(word.isidentifier() for word in name.split(".")):
@@ -74,13 +84,40 @@ def _model(settings: TrainerSettings, checkpoint: Checkpoint, trusted: Sequence[
     return model.to(settings.device) if float32 else settings.prepare(model)
 
 
-def read_photographs(config: DictConfig, checkpoint: Checkpoint) -> Scene | None:
+def scene_to_look_at(opened: Opened, scene: DictConfig | None) -> Scene:
+    """Show an opened model that looks at photographs those of a scene, and return the scene.
+
+    Args:
+        opened: the checkpoint.
+        scene: the config of the scene to be rendered; None: that of the run is read again.
+
+    Raises:
+        InputError: the scene cannot be read, or not be looked at.
+    """
+    if scene is None:
+        path = str(opened.checkpoint.path)
+        scene = compose_config("eval", [f"ckpt={quoted(path)}", *scene_overrides(path)])[0].scene
+    shown = shown_capture(build(scene).read())
+    show_photographs(opened.model, shown)
+    return shown
+
+
+def as_known(scene: Scene, opened: Opened) -> Scene:
+    """Return a scene as an opened model knows it: in the frame of its training, if it was trained in a frame.
+
+    Raises:
+        InputError: the model was trained in another kind of space.
+    """
+    return scene if opened.model.needs_photographs else as_trained(scene, opened.checkpoint)
+
+
+def read_photographs(config: DictConfig, opened: Opened) -> Scene | None:
     """Return the capture that `scene` names, as the checkpoint's model knows it.
 
     None, and a warning, where it cannot be read.
     """
     try:
-        return as_trained(build(config.scene).read(), checkpoint)
+        return as_known(build(config.scene).read(), opened)
     except InputError as error:
         log.warning("The cameras are shown without their photographs: %s", error)
     except OSError as error:
@@ -105,7 +142,7 @@ def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Train
     settings.keep_tile(checkpoint.tile_points)
     return TrainStep(
         model=model,
-        rays=RayGenerator(scene.cameras, scene.near, scene.far),
+        rays=RayGenerator.of_views(scene, model),
         loss=MeanSquaredError(),
         optimizer=no_optimizer,
         schedule=ExponentialDecay(),

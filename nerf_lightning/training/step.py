@@ -32,6 +32,7 @@ from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, Target
+from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
@@ -44,6 +45,12 @@ log = logging.getLogger(__name__)
 
 def _backward(loss: Tensor) -> None:
     loss.backward()
+
+
+def _penalties(renderings: list[Rendering]) -> Tensor | float:
+    # A number per level; no tensor where there is none, so that nothing is added.
+    means = [torch.zeros_like(each.depth[0]) if each.penalty is None else each.penalty.mean() for each in renderings]
+    return torch.stack(means) if any(each.penalty is not None for each in renderings) else 0.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,8 @@ class TrainStep:
         """
         tables = tables_of(self.model)
         groups: list[dict[str, Any]] = [{"params": tables, "weight_decay": 0.0}] if tables else []
-        for part in self._beside_the_model():
+        within = [part for part in self.model.modules() if isinstance(part, LearntPart)]
+        for part in (*within, *self._beside_the_model()):
             own = list(part.parameters())
             if own and part.learning_rate is not None:
                 groups.append({"params": own, "weight_decay": 0.0, "lr": part.learning_rate})
@@ -314,7 +322,7 @@ class TrainStep:
             numbers = None if random is None else random[tile]
             renderings = self.model(rays, None if behind is None else behind[tile], numbers)
             shown = [self.correction.photographed(each, pixels) for each in renderings]
-            levels = torch.stack(list(self.loss(shown, target[tile])))
+            levels = torch.stack(list(self.loss(shown, target[tile]))) + _penalties(renderings)
             part = (tile.stop - tile.start) / share.num_rays
             with torch.no_grad():
                 errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])

@@ -27,6 +27,7 @@ import nerf_lightning
 from nerf_lightning.evaluation import camera_fit
 from nerf_lightning.evaluation.lpips import LPIPS
 from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.evaluation.nearest_view import NearestViews
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.contraction import Contracted
@@ -47,7 +48,7 @@ WRITERS = {"evaluation.evaluator", "evaluation.kept_views", "evaluation.metrics_
 """Of what was measured: they compute nothing themselves."""
 PRODUCTS = {"matmul", "mm", "bmm", "mv", "dot", "einsum", "linear", "addmm", "baddbmm", "conv2d", "tensordot", "inner"}
 RAYS = 40
-CONTRACTS = {"Encoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
+CONTRACTS = {"Encoder", "ConeEncoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
 """Classes that are tried through those that follow them."""
 FORWARD_AGAIN = {"attach_gradients"}
 """Methods that do what `forward` does, with what it returned before."""
@@ -147,6 +148,9 @@ def known() -> dict[str, Any]:
         "one": scene.cameras.c2w, "other": 1.3 * scene.cameras.c2w.flip(0), "by": to_user.double(),
         "angles": torch.rand(RAYS, 2, generator=drawn), "vector": 0.3 * points, "light": background,
         "gain": background + 0.5, "tile_points": 500, "fitted": picture[..., 0] > 0.3, "whole_from": 3.0,
+        "views": (0, 2, 3),
+        "cones": True, "covariance": torch.rand(RAYS, 6, generator=drawn), "along": depth, "across": 0.1 * depth,
+        "matrices": torch.rand(RAYS, 3, 3, generator=drawn),
     }  # fmt: skip
 
 
@@ -165,7 +169,10 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "video.paths.base.PathFrame.direction": {"given": (0.31, 0.17, -0.93)},
     "video.paths.base.PathFrame.size": {"width": 24, "height": None},
     "nerf.geometry.panoramas.panorama_cameras": {"width": 24, "height": 12},
+    "nerf.geometry.cones.pixel_side": {"view": torch.ones(RAYS, dtype=torch.int64)},
+    "nerf.geometry.cones.scaled_covariance": {"scale": torch.tensor([0.31, 1.7, 2.3])},
     "nerf.rendering.near_gradients.soften_near_gradients": {"distance": torch.rand(40, 8)},
+    "evaluation.nearest_view.baselines": {"views": [0, 3], "background": "white", "count": 2},
     "evaluation.camera_fit.fitted_camera": {"model": tiny_model().eval(), "background": "white"},
     "evaluation.color_fit.exposure_fitted": {"opacity": torch.ones(48, 48), "background": torch.ones(1, 3)},
     "nerf.rendering.blending.in_other_light": {"change": torch.square, "foreground": torch.rand(40, 3)},
@@ -267,7 +274,8 @@ def instances(tmp_path_factory) -> list[Any]:
     grid.allocate(8, 1)
     crop = CropBox.from_user((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8), known()["to_user"])
     others = [grid, crop, Clip(3.1, crop), Contracted(), RayErrors(), LPIPS(), known()["around"]]
-    encoders = [instantiate(loaded("encoder", option)) for option in options("encoder")]
+    others.append(NearestViews(known()["scene"], "white", 2))
+    encoders = [instantiate(composed("train", f"encoder={option}").encoder) for option in options("encoder")]
     passed = [
         Keyframe(place, look_at=(0.1, 0.2, 0.1)) for place in ((2.0, 0.3, 0.4), (0.2, 2.1, 0.5), (-1.9, 0.1, 0.6))
     ]

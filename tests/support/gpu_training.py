@@ -44,7 +44,8 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
     """Prepare a model of conf/model on a device, its pixels there too."""
     config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
-    scene, progress = ball_scene(), Progress()
+    looks = model.startswith("view_transformer")  # at up to ten photographs for each view
+    scene, progress = ball_scene(24) if looks else ball_scene(), Progress()
     training = build_step(config, settings, scene, progress).to(device)
     training.num_steps = 1000
     for level in training.model.modules():

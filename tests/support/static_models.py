@@ -4,6 +4,7 @@ import torch
 from support.scenes import tiny_model
 from support.steps import rays_of
 
+from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
@@ -17,10 +18,11 @@ from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 
-def fast_model(level=MaskedLevel, **sampler) -> RadianceModel:
-    """A hash grid behind an occupancy grid."""
+def fast_model(level=MaskedLevel, encoder: Encoder | None = None, **sampler) -> RadianceModel:
+    """A hash grid, or another encoder, behind an occupancy grid."""
     torch.manual_seed(1)
-    encoder = HashGridEncoder(num_levels=4, features_per_level=2, log2_table_size=10, min_resolution=4)
+    if encoder is None:
+        encoder = HashGridEncoder(num_levels=4, features_per_level=2, log2_table_size=10, min_resolution=4)
     field = HashField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
     settings = {"resolution": 16, "num_steps": 48, "update_every": 4, "warmup_steps": 4} | sampler
     return RadianceModel({"fine": level(OccupancySampler(**settings), field)})

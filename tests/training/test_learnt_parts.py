@@ -1,15 +1,18 @@
 """What learns in a step beside the model: its own rate, its penalty, its beginning."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
 from support.learnt_cameras import LearntShifts
+from support.looking import looking_model
 from support.scenes import ball_scene, tiny_model
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.training.step import Share
 
 
@@ -77,3 +80,44 @@ def test_gradients_and_weights_of_a_part_that_are_not_finite_are_seen():
     step(batch_of(step), step.new_optimizer())
     assert step.guard.skipped == 1
     assert step.broken_weights() == "rays"
+
+
+@pytest.mark.parametrize("tile_points", [None, 60, 200])
+def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_is_cut(tile_points):
+    plain, scene = tiny_model(density_bias=0.5), ball_scene()
+
+    class Frowning(type(plain)):
+        def forward(self, rays, background, random):
+            first, last = super().forward(rays, background, random)
+            return [first, replace(last, penalty=rays.photograph * last.depth)]
+
+    frowning = copy.deepcopy(plain)
+    frowning.__class__ = Frowning
+    losses, gradients = [], []
+    for model in (plain, frowning):
+        step = make_step(tile_points, model)
+        batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
+        seen = step.gradients(batch)
+        losses.append(seen["losses"])
+        gradients.append(torch.cat([each.grad.flatten() for each in model.parameters()]))
+    random = batch_random(fold(0, 0, 0), 64)
+    rays = replace(step.rays(batch.pixels), photograph=batch.pixels.view)
+    last = plain(rays, torch.ones(64, 3), random)[-1]
+    penalty = (rays.photograph * last.depth).mean()
+    torch.testing.assert_close(losses[1] - losses[0], torch.stack([torch.zeros(()), penalty.detach()]))
+    plain.zero_grad()
+    penalty.backward()
+    alone = torch.cat(
+        [torch.zeros_like(each).flatten() if each.grad is None else each.grad.flatten() for each in plain.parameters()]
+    )
+    torch.testing.assert_close(gradients[1] - gradients[0], alone, atol=1e-4, rtol=1e-3)
+
+
+def test_a_part_of_a_model_may_learn_at_its_own_rate():
+    step = make_step(None, looking_model(image_rate=0.5))
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    others, image = step.new_optimizer().param_groups
+    own = {id(each) for each in step.model.image_network.parameters()}
+    assert (image["lr"], others["lr"]) == (0.5, 1e-3)
+    assert {id(each) for each in image["params"]} == own
+    assert len(others["params"]) + len(own) == len(list(step.model.parameters()))

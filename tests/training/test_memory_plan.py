@@ -162,7 +162,8 @@ def test_views_and_what_was_there_before_take_nothing():
 def built_for(name, threads, tile):
     torch.set_num_threads(threads)
     config = composed("train", f"model={name}", "trainer.accelerator=cpu", f"trainer.tile_points={tile}")
-    scene, progress, settings = ball_scene(num_views=4, size=32), Progress(), build(config.trainer)
+    views = 24 if name.startswith("view_transformer") else 4  # each is rendered from up to ten others
+    scene, progress, settings = ball_scene(num_views=views, size=32), Progress(), build(config.trainer)
     step = build_step(config, settings, scene, progress)
     settings.prepare(step.model)
     step.num_steps = 10

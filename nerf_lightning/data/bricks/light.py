@@ -4,15 +4,38 @@ Both are exact whatever the culling: points are sorted into cells, and a cell as
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from nerf_lightning.data.bricks.parts import Triple
 from nerf_lightning.data.bricks.solids import Solids
 
-KEY = np.array([0.42, -0.55, 0.72]) / np.linalg.norm([0.42, -0.55, 0.72])
-"""Towards the middle of the key light, in world axes."""
+
+@dataclass(frozen=True)
+class Light:
+    """What shines on a model. Colours are linear."""
+
+    key: Float[ndarray, "3"]
+    """Towards the middle of the key light, in world axes; unit length."""
+    key_color: Triple
+    fill_color: Triple
+    """Of the fill light, which casts no shadow."""
+    sky_light: Triple
+    """What an upward surface receives from the surroundings."""
+    ground_light: Triple
+    """What a downward surface receives."""
+
+
+DAY = Light(
+    key=np.array([0.42, -0.55, 0.72]) / np.linalg.norm([0.42, -0.55, 0.72]),
+    key_color=(0.98, 0.92, 0.82),
+    fill_color=(0.20, 0.23, 0.30),
+    sky_light=(0.44, 0.47, 0.52),
+    ground_light=(0.20, 0.18, 0.17),
+)
 SPREAD = 0.09
 """Tangent of the key light's angular radius: large enough for soft edges."""
 SIDES = 4
@@ -24,20 +47,20 @@ LIFT = 1e-3
 SHADOW_CELL, PROBE_CELL = 0.12, 0.24
 
 
-def key_axes() -> Float[ndarray, "3 3"]:
+def key_axes(light: Light) -> Float[ndarray, "3 3"]:
     """Return rows across, across and towards the key light."""
-    across = np.cross([0.0, 0.0, 1.0], KEY)
+    across = np.cross([0.0, 0.0, 1.0], light.key)
     across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(KEY, across), KEY])
+    return np.stack([across, np.cross(light.key, across), light.key])
 
 
-def key_directions() -> Float[ndarray, "3 directions"]:
+def key_directions(light: Light) -> Float[ndarray, "3 directions"]:
     """Return unit directions spread evenly over the light's disc (a spiral of equal areas)."""
     index = np.arange(SIDES**2)
     radius = SPREAD * np.sqrt((index + 0.5) / SIDES**2)
     angle = index * np.pi * (3 - np.sqrt(5))
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(SIDES**2)])
-    return key_axes().T @ (local / np.linalg.norm(local, axis=0))
+    return key_axes(light).T @ (local / np.linalg.norm(local, axis=0))
 
 
 def key_visible(
@@ -45,13 +68,14 @@ def key_visible(
     points: Float[ndarray, "3 points"],
     normals: Float[ndarray, "3 points"],
     rays: Int[ndarray, "points"],
+    light: Light = DAY,
 ) -> Float[ndarray, "points"]:
     """Return 1 where the key light's direction number `rays` is free, 0 where it is blocked or behind."""
-    directions = key_directions().astype(points.dtype)[:, rays]
+    directions = key_directions(light).astype(points.dtype)[:, rays]
     starts = points + points.dtype.type(LIFT) * normals
     visible = np.zeros_like(points[0])
     facing = np.flatnonzero(np.sum(directions * normals, axis=0) > 0)
-    axes = key_axes()
+    axes = key_axes(light)
     spans = solids.corners() @ axes.T
     low, high = spans.min(axis=1), spans.max(axis=1)
     seen = axes.astype(points.dtype) @ starts[:, facing]

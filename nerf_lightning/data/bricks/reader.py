@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from rich.progress import Progress
 from torch import Tensor
@@ -17,8 +17,9 @@ from torch import Tensor
 from nerf_lightning.console import ProgressLines, progress_bar
 from nerf_lightning.cores import num_cores
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
+from nerf_lightning.data.bricks.family import Model, model
+from nerf_lightning.data.bricks.solids import Solids
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
-from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
@@ -28,6 +29,8 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Sce
 
 RENDER_VERSION = 1
 """Part of the cache's key: raise it whenever a pixel changes."""
+FAMILY_VERSION = 1
+"""The same for the models beside the fire engine: raise it whenever one of them changes."""
 CHUNK = 3_000_000
 """Rays that one thread takes at a time: enough to share the search for shadows, few enough for memory."""
 MOST_THREADS = 4
@@ -40,12 +43,17 @@ class BricksReader(Reader):
     """Render the embedded scene, with exact depth and normals.
 
     Args:
+        variant: which model of the family: 0 is the fire engine; each other number is a vehicle or a tower of its own,
+            in its own colours and light.
         resolution: width and height of every picture in pixels.
         num_train: number of training views, spread over the upper hemisphere.
         num_val: number of validation views, in the gaps between the training views.
         num_test: number of test views, on an orbit.
         near: distance from a camera at which content may begin; the model lies between 2.7 and 5.4.
         far: distance at which content ends.
+        gain: every colour c (an sRGB code between 0 and 1) is photographed as gain * c^gamma, as a camera with other
+            settings would show it.
+        gamma: see gain.
         background: what the transparent pixels are blended with.
         cache_dir: folder of the rendered pictures; by default in the user's cache folder
             (`$NERF_LIGHTNING_CACHE`, `$XDG_CACHE_HOME` or ~/.cache).
@@ -54,20 +62,25 @@ class BricksReader(Reader):
 
     def __init__(
         self,
+        variant: int = 0,
         resolution: int = 128,
         num_train: int = 100,
         num_val: int = 20,
         num_test: int = 25,
         near: float = 2.0,
         far: float = 6.0,
+        gain: float = 1.0,
+        gamma: float = 1.0,
         background: Background = "white",
         cache_dir: str | None = None,
         name: str = "bricks",
     ) -> None:
+        self.variant = variant
         self.resolution = resolution
         self.counts = {"train": num_train, "val": num_val, "test": num_test}
         self.near = near
         self.far = far
+        self.gain, self.gamma = gain, gamma
         self.background = background
         self.cache_dir = cache_dir
         self.name = name
@@ -83,14 +96,16 @@ class BricksReader(Reader):
         cameras = bricks_cameras(**self.counts, resolution=self.resolution)
         folder = Path(self.cache_dir).expanduser() if self.cache_dir else default_folder("bricks")
         settings = {"version": RENDER_VERSION, "resolution": self.resolution, **self.counts}
-        pixels = views * self.resolution**2
-        rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras))
+        if self.variant:
+            settings |= {"variant": self.variant, "family": FAMILY_VERSION}
+        pixels, shown = views * self.resolution**2, model(self.variant)
+        rendered = cached(cache_file(folder, settings), pixels, lambda: render(cameras, shown))
         splits, names = self._splits()
         return Scene(
             name=self.name,
             cameras=cameras,
             pixels=PixelStore(
-                rgba=torch.from_numpy(rendered.rgba),
+                rgba=self._photographed(torch.from_numpy(rendered.rgba)),
                 offset=torch.arange(views) * self.resolution**2,
                 width=cameras.width,
                 height=cameras.height,
@@ -98,14 +113,27 @@ class BricksReader(Reader):
             ),
             near=torch.full((views,), float(self.near)),
             far=torch.full((views,), float(self.far)),
-            aabb=torch.from_numpy(model_box()),
+            aabb=torch.from_numpy(model_box(shown)),
             splits=splits,
             view_names=names,
             background=self.background,
             to_user=torch.eye(4),
-            protocol={"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"},
+            protocol=self._protocol(),
             truth=Truth(torch.from_numpy(rendered.depth), torch.from_numpy(rendered.normals)),
         )
+
+    def _photographed(self, rgba: UInt8[Tensor, "pixels 4"]) -> UInt8[Tensor, "pixels 4"]:
+        """Return the pictures as a camera with this gain and gamma shows them; alpha stays."""
+        if self.gain == self.gamma == 1.0:
+            return rgba
+        shown = (255.0 * self.gain * (torch.arange(256) / 255.0) ** self.gamma).round().clamp(max=255).to(torch.uint8)
+        return torch.cat([shown[rgba[:, :3].long()], rgba[:, 3:]], dim=1)
+
+    def _protocol(self) -> dict[str, str]:
+        protocol = {"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"}
+        if (self.gain, self.gamma) != (1.0, 1.0):
+            protocol["colors of the photographs"] = f"{self.gain:g} c^{self.gamma:g}"
+        return protocol
 
     def _splits(self) -> tuple[dict[str, tuple[int, ...]], tuple[str, ...]]:
         splits, names, first = {}, [], 0
@@ -116,6 +144,10 @@ class BricksReader(Reader):
         return splits, tuple(names)
 
     def _check(self) -> None:
+        if self.variant < 0:
+            raise InputError(
+                f"The bricks scene has no scene.variant={self.variant}: 0 is the fire engine; 1, 2, 3, ... are others."
+            )
         if self.resolution < 1:
             raise InputError(
                 f"The bricks scene cannot be rendered at scene.resolution={self.resolution}: give a width in pixels, "
@@ -131,6 +163,10 @@ class BricksReader(Reader):
                 f"The bricks scene was given scene.near={self.near} and scene.far={self.far}: near must be 0 or more "
                 "and less than far (2 and 6 hold the model)."
             )
+        if not (self.gain > 0 and self.gamma > 0):
+            raise InputError(
+                f"The bricks scene was given scene.gain={self.gain} and scene.gamma={self.gamma}: give numbers above 0."
+            )
         if self.background not in get_args(Background):
             raise InputError(
                 f"The bricks scene knows no scene.background={self.background}: choose one of "
@@ -138,15 +174,15 @@ class BricksReader(Reader):
             )
 
 
-def model_box() -> Float[ndarray, "2 3"]:
-    """Return the lower and upper corner of a box that holds the model with a little room."""
-    corners = Tracer(fire_engine()).corners.reshape(-1, 3)
+def model_box(shown: Model) -> Float[ndarray, "2 3"]:
+    """Return the lower and upper corner of a box that holds a model with a little room."""
+    corners = Solids.of(shown.parts).corners().reshape(-1, 3)
     return np.stack([corners.min(axis=0) - MARGIN, corners.max(axis=0) + MARGIN]).astype(np.float32)
 
 
-def render(cameras: Cameras) -> Rendered:
+def render(cameras: Cameras, shown: Model) -> Rendered:
     """Render every view, on a few cores, with a progress bar on stderr."""
-    tracer = Tracer(fire_engine())
+    tracer = Tracer(shown.parts, shown.light)
     resolution = int(cameras.width[0])
     views = [
         Pinhole(c2w.double().numpy(), float(focal[0]), resolution)

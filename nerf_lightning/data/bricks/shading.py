@@ -7,16 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from nerf_lightning.data.bricks.light import KEY
+from nerf_lightning.data.bricks.light import DAY, Light
 from nerf_lightning.data.bricks.parts import Part
 
 FILL = np.array([-0.60, 0.66, 0.45]) / np.linalg.norm([-0.60, 0.66, 0.45])
 """Towards the fill light, which casts no shadow."""
-KEY_COLOR, FILL_COLOR = (0.98, 0.92, 0.82), (0.20, 0.23, 0.30)
 ZENITH, HORIZON, GROUND = (0.34, 0.52, 0.92), (1.00, 1.00, 1.00), (0.26, 0.22, 0.20)
 """Linear colours of what surrounds the model, as surfaces mirror it."""
-SKY_LIGHT, GROUND_LIGHT = (0.44, 0.47, 0.52), (0.20, 0.18, 0.17)
-"""Linear light that an upward and a downward surface receive from the surroundings."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class Hits:
     """Share of the surroundings that is not hidden by nearby parts."""
 
 
-def shade(palette: Palette, hits: Hits) -> Float[ndarray, "3 hits"]:
+def shade(palette: Palette, hits: Hits, light: Light = DAY) -> Float[ndarray, "3 hits"]:
     """Return the sRGB-encoded colour of each hit.
 
     Lambert plus a Blinn-Phong highlight of the key light (the half vector's cosine to the power of 2^sharpness),
@@ -62,18 +59,18 @@ def shade(palette: Palette, hits: Hits) -> Float[ndarray, "3 hits"]:
     """
     normals, open_ = hits.normals, hits.openness
     dtype = normals.dtype
-    light = _column(KEY, dtype)
-    lambert = np.maximum(np.sum(normals * light, axis=0), 0) * hits.key
+    key = _column(light.key, dtype)
+    lambert = np.maximum(np.sum(normals * key, axis=0), 0) * hits.key
     fill = np.maximum(np.sum(normals * _column(FILL, dtype), axis=0), 0) * (0.4 + 0.6 * open_)
     upward = 0.5 + 0.5 * normals[2]
-    ambient = _mix(GROUND_LIGHT, SKY_LIGHT, upward) * open_
-    received = ambient + _column(KEY_COLOR, dtype) * lambert + _column(FILL_COLOR, dtype) * fill
+    ambient = _mix(light.ground_light, light.sky_light, upward) * open_
+    received = ambient + _column(light.key_color, dtype) * lambert + _column(light.fill_color, dtype) * fill
     cosine = np.clip(-np.sum(normals * hits.directions, axis=0), 0, 1)
     fresnel = palette.mirror[hits.part]
     fresnel = fresnel + (1 - fresnel) * (1 - cosine) ** 5 * dtype.type(0.5)
     bounced = hits.directions + 2 * cosine * normals
     mirrored = surroundings(bounced) * (0.25 + 0.75 * open_)
-    shine = palette.specular[hits.part] * hits.key * _highlight(palette, hits, light)
+    shine = palette.specular[hits.part] * hits.key * _highlight(palette, hits, key)
     linear = (1 - fresnel) * palette.albedo[:, hits.part] * received + fresnel * mirrored
     return encode_srgb(linear + shine)
 
@@ -98,8 +95,8 @@ def decode_srgb(code: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def _highlight(palette: Palette, hits: Hits, light: Float[ndarray, "3 1"]) -> Float[ndarray, "hits"]:
-    half = light - hits.directions
+def _highlight(palette: Palette, hits: Hits, key: Float[ndarray, "3 1"]) -> Float[ndarray, "hits"]:
+    half = key - hits.directions
     half /= np.sqrt(np.sum(half**2, axis=0))
     value = np.maximum(np.sum(half * hits.normals, axis=0), 0)
     squarings = palette.sharpness[hits.part]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from nerf_lightning.data.bricks.light import SIDES, key_visible, openness
+from nerf_lightning.data.bricks.light import DAY, SIDES, Light, key_visible, openness
 from nerf_lightning.data.bricks.parts import Part
 from nerf_lightning.data.bricks.shading import Hits, Palette, shade
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
@@ -56,7 +56,8 @@ class Found:
 class Tracer:
     """Trace one model. Colours take float32, geometry float64."""
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[Part], light: Light = DAY) -> None:
+        self.light = light
         self.solids = Solids.of(parts, np.float64)
         self.fast = Solids.of(parts, np.float32)
         self.palette = Palette.of(parts, np.float32)
@@ -106,10 +107,10 @@ class Tracer:
             part=found.part,
             normals=normals,
             directions=found.directions,
-            key=key_visible(self.fast, found.points, normals, found.ray),
+            key=key_visible(self.fast, found.points, normals, found.ray, self.light),
             openness=self._pixel_openness(found, normals, pixel),
         )
-        return shade(self.palette, hits)
+        return shade(self.palette, hits, self.light)
 
     def _pixel_openness(
         self, found: Found, normals: Float[ndarray, "3 hits"], pixel: Int[ndarray, "hits"]

@@ -4,17 +4,14 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, least_agreement
 from nerf_lightning.nerf.types.scene import Cameras, Space
 
-# Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees).
-FORWARD_FACING = 0.82
 # The same of all pixels' rays, one of which would never reach infinity in normalised device coordinates at 0.
 LEAST_AHEAD = 0.1
 
@@ -42,16 +39,6 @@ def choose_space(
     if ahead and cosine > FORWARD_FACING and len(capture.points):
         return "ndc", "since all cameras look the same way and sparse points give depths"
     return "contracted", "since the photographs show whatever lies behind the content"
-
-
-def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
-    """Return the cosine between the mean direction of the cameras and the camera that is farthest from it.
-
-    >>> least_agreement(torch.eye(4)[:3].repeat(2, 1, 1))
-    1.0
-    """
-    back = c2w[:, :, 2]
-    return float((back @ functional.normalize(back.mean(dim=0), dim=0)).min())
 
 
 def least_ahead(cameras: Cameras) -> float:

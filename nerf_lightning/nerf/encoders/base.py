@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+from nerf_lightning.nerf.products import Products
 
 
 class Encoder(nn.Module, ABC):
@@ -14,6 +15,8 @@ class Encoder(nn.Module, ABC):
     in_dim: int = 3
     needs_unit_cube: bool = False
     """True where points outside of the unit cube mean nothing; the field must map its positions there."""
+    products: Products = "float32"
+    """The precision of the products with the encoder's matrices, where it has any; its field sets it."""
 
     @property
     @abstractmethod
@@ -47,6 +50,28 @@ class Encoder(nn.Module, ABC):
     @abstractmethod
     def reset_parameters(self) -> None:
         """Draw the parameters anew from torch's generator; nothing to do where there are none."""
+
+
+class ConeEncoder(Encoder):
+    """An encoder that may look at the cone of a point's pixel (`geometry.cones`), in the coordinates of the points."""
+
+    sees_cones: bool
+    """Whether it does; else it need not be given any."""
+
+    @abstractmethod
+    def forward(
+        self, points: Float[Tensor, "*points 3"], covariance: Float[Tensor, "*points 6"] | None = None
+    ) -> Float[Tensor, "*points features"]:
+        """Return the features; without a covariance those of the points themselves, as if it were 0."""
+
+    @abstractmethod
+    def attach_gradients(
+        self,
+        points: Float[Tensor, "*points 3"],
+        features: Float[Tensor, "*points features"],
+        covariance: Float[Tensor, "*points 6"] | None = None,
+    ) -> Float[Tensor, "*points features"]:
+        """Return the features of points, with gradients, where they have been computed without them before."""
 
 
 def require_direction_encoder(encoder: Encoder) -> None:

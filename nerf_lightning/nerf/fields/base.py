@@ -1,10 +1,12 @@
 """The contract of a field: density and colour of points in space."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
@@ -12,11 +14,24 @@ from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
 
+@dataclass(frozen=True)
+class HiddenLayer:
+    """Neurons that a field could do without, by the names that its state has for what makes and what reads them."""
+
+    rows: tuple[str, ...]
+    """What has an entry for each neuron along its first axis; the matrix that makes them comes first."""
+    columns: tuple[str, ...]
+    """Matrices whose first columns read them, one each; columns that read something else follow."""
+
+
 class Field(nn.Module, ABC):
     """A radiance field: it answers what is asked of points (`types.points`)."""
 
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others (batch normalisation); such a field is never tiled."""
+
+    sees_cones: bool = False
+    """True where the result depends on the pixels' cones (`Points.covariance`)."""
 
     compiles: bool = True
     """False where kernels of our own do most of the work, which torch.compile cannot see into."""
@@ -28,7 +43,7 @@ class Field(nn.Module, ABC):
     def multiply_in(self, products: Products) -> None:
         """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""
         for module in self.modules():
-            if isinstance(module, Linear | Field):
+            if isinstance(module, Linear | Field | Encoder):
                 module.products = products
 
     def fit_to(self, scene: Scene) -> None:
@@ -51,6 +66,14 @@ class Field(nn.Module, ABC):
             features: what `density` returned for the same points, with or without gradients; None: nothing was asked
                 before. What comes out is the same, and its gradients too.
         """
+
+    def hidden_layers(self) -> list[HiddenLayer]:
+        """Return the layers that a narrower field of this kind, with another `width`, would have fewer neurons in."""
+        return []
+
+    def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
+        """Return what the neurons of `hidden_layers` come to at points with directions, layer by layer."""
+        return []
 
     def parts(self) -> FieldParts | None:
         """Return what kernels need that render whole rays by themselves; None where the field is of another kind."""

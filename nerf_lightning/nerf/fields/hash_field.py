@@ -6,14 +6,17 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from nerf_lightning.errors import ANOTHER, InputError
-from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
-from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.encoders.base import ConeEncoder, Encoder, require_direction_encoder
+from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
+from nerf_lightning.nerf.geometry.cones import contracted_covariance, scaled_covariance
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.products import linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -64,6 +67,7 @@ class HashField(Field):
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder
+        self.sees_cones = isinstance(position_encoder, ConeEncoder) and position_encoder.sees_cones
         self.density_bias = density_bias
         self.contracted = Contracted(contraction)
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
@@ -107,21 +111,29 @@ class HashField(Field):
 
     def density(self, points: Points) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points features"]]:
         """Return the density per unit length, and the encoder's features."""
-        encoded = self.position_encoder(self._unit(points.positions))
+        encoded = self._encoded(points, None)
         return self._density(self._through(self.density_mlp, encoded), points.positions), encoded
 
     def forward(self, points: Points, features: Float[Tensor, "*points features"] | None = None) -> FieldOutput:
         """Return density and colour; density does not depend on the direction."""
-        unit = self._unit(points.positions)
-        encoder = self.position_encoder
-        encoded = encoder(unit) if features is None else encoder.attach_gradients(unit, features)
-        hidden = self._through(self.density_mlp, encoded)
-        direction = self.direction_encoder(points.directions).to(hidden.dtype)
-        seen = [direction] if not self.appearance else [direction, self._code(points).to(hidden.dtype)]
-        seen = [each.expand(*hidden.shape[:-1], each.shape[-1]) for each in seen]
-        raw_rgb = self._through(self.color_mlp, torch.cat([hidden, *seen], dim=-1))
+        hidden = self._through(self.density_mlp, self._encoded(points, features))
+        raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
         return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
+
+    def hidden_layers(self) -> list[HiddenLayer]:
+        """Return the one layer of the density's MLP, and the two of the colour's."""
+        sizes = {"density_mlp": len(self.density_mlp), "color_mlp": len(self.color_mlp)}
+        return [
+            HiddenLayer((f"{name}.{number}",), (f"{name}.{number + 1}",))
+            for name, count in sizes.items()
+            for number in range(count - 1)
+        ]
+
+    def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
+        """Return what the neurons of `hidden_layers` come to, layer by layer."""
+        *density, features = _layer_by_layer(self.density_mlp, self._encoded(points, None))
+        return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
         """Return table and weights, of a field over a box whose colours are the same for all photographs."""
@@ -140,6 +152,12 @@ class HashField(Field):
         if self.appearance:
             nn.init.zeros_(self.codes)
 
+    def _with_direction(self, features: Tensor, points: Points) -> Tensor:
+        """Return what the colour is made of: what the density's MLP hands over, the direction, and the code."""
+        direction = self.direction_encoder(points.directions).to(features.dtype)
+        seen = [direction] if not self.appearance else [direction, self._code(points).to(features.dtype)]
+        return torch.cat([features, *(each.expand(*features.shape[:-1], each.shape[-1]) for each in seen)], dim=-1)
+
     def _code(self, points: Points) -> Tensor:
         return self.codes[self.trained].mean(dim=0) if points.photograph is None else self.codes[points.photograph]
 
@@ -155,11 +173,27 @@ class HashField(Field):
         out = mlp(features.flatten(0, -2), list(weights), self.products)
         return out.view(*features.shape[:-1], out.shape[-1])
 
+    def _encoded(self, points: Points, known: Tensor | None) -> Tensor:
+        encoder, unit = self.position_encoder, self._unit(points.positions)
+        if isinstance(encoder, ConeEncoder) and encoder.sees_cones and points.covariance is not None:
+            covariance = self._unit_covariance(points.covariance, points.positions)
+            return encoder(unit, covariance) if known is None else encoder.attach_gradients(unit, known, covariance)
+        return encoder(unit) if known is None else encoder.attach_gradients(unit, known)
+
     def _unit(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():
             # The ball of radius 2 fills the unit cube.
             return contract(in_unit_ball(positions, self.aabb)) / 4.0 + 0.5
         return to_unit_cube(positions, self.aabb)
+
+    @torch.no_grad()
+    def _unit_covariance(self, covariance: Tensor, positions: Tensor) -> Tensor:
+        to_cube = 1.0 / (self.aabb[1] - self.aabb[0])
+        if self.contracted.is_on():
+            covariance = scaled_covariance(covariance, 2.0 / 3**0.5 * to_cube)
+            covariance = contracted_covariance(covariance, in_unit_ball(positions, self.aabb))
+            to_cube = torch.full_like(to_cube, 0.25)
+        return scaled_covariance(covariance, to_cube)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
         density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
@@ -171,6 +205,15 @@ class HashField(Field):
 
 def _weights(*sizes: int) -> nn.ParameterList:
     return nn.ParameterList(torch.empty(after, before) for before, after in pairwise(sizes))
+
+
+def _layer_by_layer(weights: nn.ParameterList, features: Tensor) -> list[Tensor]:
+    """Return what `kernels.mlp` computes, with all that lies between its ends."""
+    layers = []
+    for number, weight in enumerate(weights):
+        features = linear(features if not number else functional.relu(features), weight, None, "float32")
+        layers.append(features)
+    return [*(functional.relu(layer) for layer in layers[:-1]), layers[-1]]
 
 
 class _TruncatedExponential(torch.autograd.Function):

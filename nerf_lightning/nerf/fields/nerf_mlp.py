@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
-from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import require_box
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.products import Linear, linear
@@ -122,6 +122,26 @@ class NerfMLP(Field):
         """Return what the colour is made of besides the direction; a field that follows this one may add to it."""
         return self.feature(hidden)
 
+    def hidden_layers(self) -> list[HiddenLayer]:
+        """Return the layers of the trunk, the feature and the colour's; encodings that join them stand behind them."""
+        following = ((f"trunk.{number}.0.weight",) for number in range(1, len(self.trunk)))
+        readers = (*following, ("density_head.weight", "feature.weight"))
+        trunk = [HiddenLayer(self._rows(f"trunk.{number}"), each) for number, each in enumerate(readers)]
+        feature = HiddenLayer(("feature.weight", "feature.bias"), ("color_hidden.0.weight",))
+        return [*trunk, feature, HiddenLayer(self._rows("color_hidden"), ("color_head.weight",))]
+
+    def hidden_activations(self, points: Points) -> list[Float[Tensor, "*points neurons"]]:
+        """Return what the neurons of `hidden_layers` come to, layer by layer."""
+        found: list[Tensor] = []
+        layers = (*self.trunk, self.feature, self.color_hidden)
+        hooks = [layer.register_forward_hook(lambda _, inputs, output: found.append(output)) for layer in layers]
+        try:
+            self(points)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        return found
+
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
         self.position_encoder.reset_parameters()
@@ -134,6 +154,10 @@ class NerfMLP(Field):
                 if self.xavier:
                     nn.init.xavier_uniform_(module.weight)
                     nn.init.zeros_(module.bias)
+
+    def _rows(self, layer: str) -> tuple[str, ...]:
+        norm = ("weight", "bias", "running_mean", "running_var") if self.needs_whole_batch else ()
+        return (f"{layer}.0.weight", f"{layer}.0.bias", *(f"{layer}.1.{name}" for name in norm))
 
     def _trunk(self, positions: Tensor) -> Tensor:
         if self.contracted.is_on():

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.nerf.geometry.cones import pixel_side
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
 from nerf_lightning.nerf.products import own_precision
@@ -89,7 +90,8 @@ def rays_through_pixels(
     c2w = cameras.c2w[view]
     directions = (c2w[..., :3] @ local[..., None])[..., 0]
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions)
+    side = pixel_side(cameras, view, _turned(local))
+    rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions, pixel_side=side)
     return rays if cameras.ndc is None else ndc_rays(rays, cameras.ndc[view])
 
 

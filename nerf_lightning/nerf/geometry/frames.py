@@ -8,6 +8,9 @@ from torch.nn import functional
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.types.scene import Cameras
 
+FORWARD_FACING = 0.82
+"""Cosine of the widest angle between a camera and the mean direction of forward-facing cameras (about 35 degrees)."""
+
 # An axis is told from the others where its eigenvalue is this much smaller than the next, as a share of the cameras.
 CLEAR = 0.05
 
@@ -42,6 +45,17 @@ def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
     if cameras.lens_model == "equirectangular":
         return cameras.c2w[:, :, 3].mean(dim=0)
     return focus_point(cameras.c2w)
+
+
+@own_precision
+def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
+    """Return the cosine between the mean direction of the cameras and the camera that is farthest from it.
+
+    >>> least_agreement(torch.eye(4)[:3].repeat(2, 1, 1))
+    1.0
+    """
+    back = c2w[:, :, 2]
+    return float((back @ functional.normalize(back.mean(dim=0), dim=0)).min())
 
 
 @own_precision

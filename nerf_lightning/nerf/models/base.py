@@ -9,6 +9,7 @@ from torch.nn.utils import get_total_norm
 
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
@@ -22,6 +23,8 @@ class Model(nn.Module, ABC):
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others; such a model is never cut into tiles."""
+    needs_photographs: bool = False
+    """True where it renders a scene from photographs: `look_at` is called before the first rays."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,6 +69,12 @@ class Model(nn.Module, ABC):
     @abstractmethod
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
+
+    def look_at(self, photographs: Photographs) -> None:
+        """Take the photographs that rays are rendered from, in the place of earlier ones; most models need none.
+
+        They are no part of the model's state: no checkpoint carries them.
+        """
 
     @abstractmethod
     def reset_parameters(self) -> None:

@@ -61,7 +61,7 @@ class DenseLevel(Level):
     ) -> DenseRendering:
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
-        seen = self.look(points_along(rays, samples, random))
+        seen = self.look(points_along(rays, samples, random, self.field.sees_cones))
         if random is not None:
             seen = soften_near_gradients(seen, samples.midpoints, self.whole_gradients_from)
         return composite(seen, samples, rays, background)

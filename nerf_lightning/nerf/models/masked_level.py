@@ -40,6 +40,6 @@ class MaskedLevel(Level):
         lattice = self.sampler.lattice if random is not None else self.sampler.lattice_over(rays)
         occupied, edges = occupied_intervals(rays, state, lattice, self.sampler.grid.occupied())
         samples = RaySamples(edges)
-        output = self.field(points_along(rays, samples, random))
+        output = self.field(points_along(rays, samples, random, self.field.sees_cones))
         masked = FieldOutput(density=torch.where(occupied, output.density, 0.0), rgb=output.rgb)
         return composite(masked, samples, rays, torch.zeros_like(rays.origins) if background is None else background)

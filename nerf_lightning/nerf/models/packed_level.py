@@ -114,7 +114,7 @@ class PackedLevel(Level):
         counted = torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
         with COUNTING:
             self.tally += counted
-        output = self.field(packed_points(rays, samples, random), features)
+        output = self.field(packed_points(rays, samples, random, self.field.sees_cones), features)
         return composite_packed(output, samples, rays, background)
 
     def visible_samples(
@@ -128,7 +128,7 @@ class PackedLevel(Level):
         if self.sampler.capacity_on(rays.near.device) is not None or self.sampler.opaque_below == 0:
             return samples, None
         with torch.no_grad():
-            density, features = self.field.density(packed_points(rays, samples, random))
+            density, features = self.field.density(packed_points(rays, samples, random, self.field.sees_cones))
             kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.sampler.opaque_below))
             return samples.at(*kept), None if features is None else features[kept[0]]
 
@@ -155,7 +155,7 @@ class PackedLevel(Level):
 
     def _colors(self, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
         # Most samples are all but transparent: their colour, which costs most, is not asked for.
-        points = packed_points(rays, samples, None)
+        points = packed_points(rays, samples, None, self.field.sees_cones)
         density, features = self.field.density(points)
         if features is None:
             return self.field(points)

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.learnt_part import LearntPart
+from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.refinements.carry import carry_along
 from nerf_lightning.nerf.refinements.none import NoRefinement
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
-from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 MOVED = ("c2w", "focal", "center", "lens", "width", "height", "ndc")
 
@@ -29,10 +30,14 @@ class RayGenerator(LearntPart):
         near: distance at which the rays of each view begin, scene units.
         far: where they end.
         refinement: what learns of the cameras; None: nothing.
+        capture_of: number of the capture that each view belongs to, where several were joined; None: one.
+        names_photographs: whether rays say whose pixels they belong to outside of training, too: for models that look
+            at photographs, and not at the very one that is asked for.
     """
 
     near: Tensor
     far: Tensor
+    capture_of: Tensor | None
 
     def __init__(
         self,
@@ -40,6 +45,8 @@ class RayGenerator(LearntPart):
         near: Float[Tensor, "views"],
         far: Float[Tensor, "views"],
         refinement: Refinement | None = None,
+        capture_of: Sequence[int] | None = None,
+        names_photographs: bool = False,
     ):
         super().__init__()
         self.refinement = NoRefinement() if refinement is None else refinement
@@ -49,6 +56,20 @@ class RayGenerator(LearntPart):
             self.register_buffer(name, getattr(cameras, name), persistent=False)
         self.register_buffer("near", near, persistent=False)
         self.register_buffer("far", far, persistent=False)
+        self.register_buffer("capture_of", None if capture_of is None else torch.tensor(capture_of), persistent=False)
+        self.names_photographs = names_photographs
+
+    @classmethod
+    def of_views(cls, scene: SceneRecord, model: Model, refinement: Refinement | None = None) -> "RayGenerator":
+        """Return what makes the rays through a scene's own views, as a model wants them."""
+        return cls(
+            scene.cameras,
+            scene.near,
+            scene.far,
+            refinement,
+            scene.capture_of,
+            names_photographs=model.needs_photographs,
+        )
 
     @property
     def cameras(self) -> Cameras:
@@ -62,7 +83,10 @@ class RayGenerator(LearntPart):
 
     def forward(self, pixels: PixelIndex) -> RayBundle:
         """Return the rays through the centres of pixels, in the world or in normalised device coordinates."""
-        return rays_through_pixels(self.cameras, pixels, self.near, self.far)
+        rays = rays_through_pixels(self.cameras, pixels, self.near, self.far)
+        if self.capture_of is not None:
+            rays = replace(rays, capture=self.capture_of[pixels.view])
+        return replace(rays, photograph=pixels.view) if self.names_photographs else rays
 
     def follow(self, share: float) -> None:
         """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""

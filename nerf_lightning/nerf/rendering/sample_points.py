@@ -1,12 +1,24 @@
 """From rays and their samples to the points that a field is asked about, in both layouts."""
 
+from typing import Any
+
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.cones import cone_covariance
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 
 
-def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None) -> Points:
-    """Return the midpoints of rays that have equally many samples: axes `*rays samples`."""
+def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None, cones: bool = False) -> Points:
+    """Return the midpoints of rays that have equally many samples: axes `*rays samples`.
+
+    Args:
+        rays: unit directions, scene units.
+        samples: where along them.
+        random: the step's numbers for these rays.
+        cones: whether the points carry the covariance of their pixel's cone, where rays know their pixel.
+    """
     along = samples.midpoints[..., None] * rays.directions[..., None, :]
     count = samples.edges.shape[-1] - 1
     return Points(
@@ -14,11 +26,12 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None)
         directions=rays.view_directions[..., None, :],
         photograph=None if rays.photograph is None else rays.photograph[..., None],
         random=None if random is None else random.along(count),
+        covariance=_covariance(rays, samples, (..., None, slice(None))) if cones else None,
     )
 
 
-def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | None) -> Points:
-    """Return the midpoints of packed samples: one axis."""
+def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | None, cones: bool = False) -> Points:
+    """Return the midpoints of packed samples: one axis. The arguments are those of `points_along`."""
     ray = samples.ray_index
     along = samples.midpoints[:, None] * rays.directions[ray]
     return Points(
@@ -26,4 +39,13 @@ def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | N
         directions=rays.view_directions[ray],
         photograph=None if rays.photograph is None else rays.photograph[ray],
         random=None if random is None else PointRandom(random.key[ray], random.slots[ray], samples.place),
+        covariance=_covariance(rays, samples, ray) if cones else None,
     )
+
+
+def _covariance(rays: RayBundle, samples: RaySamples | PackedSamples, ray_of: Any) -> Tensor | None:
+    if rays.pixel_side is None:
+        return None
+    side, growth = rays.pixel_side[ray_of].unbind(dim=-1)
+    # Without gradients: the shape of its cone is no reason to move a camera.
+    return cone_covariance(rays.directions[ray_of].detach(), samples.deltas, side + growth * samples.midpoints)

@@ -24,3 +24,6 @@ class Points(TensorStruct):
     """Number of the view whose photograph is explained; None outside of training steps (`RayBundle.photograph`)."""
     random: PointRandom | None = None
     """The step's random numbers; None outside of training steps."""
+    covariance: Float[Tensor, "*points 6"] | None = None
+    """Of what a sample stands for of its pixel's cone (`geometry.cones`), scene units squared; None where nobody asks
+    (`Field.sees_cones`), and where a point is no pixel's."""

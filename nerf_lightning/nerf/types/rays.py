@@ -23,7 +23,13 @@ class RayBundle(TensorStruct):
     normalised device coordinates."""
     photograph: Int[Tensor, "*rays"] | None = None
     """Number of the view whose photograph a training step explains; None everywhere else (validation, evaluation,
-    films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen."""
+    films, exports, the viewer), where what a photograph alone has, such as its exposure, is not to be seen. Models
+    that look at photographs are told of it wherever a view is rendered, since they must not look at the view itself."""
+    capture: Int[Tensor, "*rays"] | None = None
+    """Number of the capture that each ray runs through; None: the first, which is mostly the only one."""
+    pixel_side: Float[Tensor, "*rays 2"] | None = None
+    """Side of the ray's pixel (root of its area) at distance 0, and by how much it grows per unit of distance; None for
+    rays that are no pixel's."""
 
 
 @dataclass(frozen=True)

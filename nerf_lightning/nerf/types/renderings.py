@@ -1,6 +1,6 @@
 """What a field says of points, and what a level makes of it along each ray."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from jaxtyping import Float
 from torch import Tensor
@@ -31,6 +31,8 @@ class Rendering(TensorStruct):
     """Sum of weights."""
     depth: Float[Tensor, "*rays"]
     """Expected distance along the ray; light that escapes ends at far."""
+    penalty: Float[Tensor, "*rays"] | None = field(default=None, kw_only=True)
+    """What a level in training adds to the loss of each ray, whatever the loss; None: nothing."""
 
 
 @dataclass(frozen=True)

@@ -99,12 +99,30 @@ class SceneRecord:
     aabb: Float[Tensor, "2 3"]
     """Lower and upper corner of a world box that contains the content."""
     splits: dict[str, tuple[int, ...]]
-    """Views of `train`, `val` and `test`; the last two may be absent from a checkpoint."""
+    """Views of `train`, `val` and `test`; the last two may be absent from a checkpoint. Of several captures also
+    `sources`, which adds to `train` the training views of those captures that are never trained on."""
     view_names: tuple[str, ...]
     background: Background
     to_user: Float[Tensor, "4 4"]
     """Similarity that takes scene coordinates to the user's own frame."""
     space: Space = "bounded"
+    capture_of: tuple[int, ...] | None = None
+    """Number of the capture that each view belongs to, where several were joined; None: one capture."""
+    captures: tuple[str, ...] = ()
+    """The names of the captures that were joined."""
+
+    @property
+    def trained_captures(self) -> tuple[str, ...]:
+        """The names of those that are trained on; of one capture its own."""
+        if self.capture_of is None:
+            return (self.name,)
+        numbers = {self.capture_of[view] for view in self.splits["train"]}
+        return tuple(name for number, name in enumerate(self.captures) if number in numbers)
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """Views that may be looked at while others are rendered."""
+        return self.splits.get("sources") or self.splits["train"]
 
 
 @dataclass(frozen=True, kw_only=True)

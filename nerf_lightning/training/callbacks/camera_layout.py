@@ -5,6 +5,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
+from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.training.loggers import show_picture
 from nerf_lightning.visualization.camera_layout import layout_picture
 
@@ -15,4 +16,5 @@ class CameraLayout(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Draw, if this was the first step of the run."""
         if trainer.global_step == 1 and trainer.loggers:
-            show_picture(trainer.loggers, "scene/cameras", layout_picture(trainer.datamodule.scene), 0)  # type: ignore[attr-defined]
+            scene = shown_capture(trainer.datamodule.scene)  # type: ignore[attr-defined]
+            show_picture(trainer.loggers, "scene/cameras", layout_picture(scene), 0)

@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.console import spoken
+from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
@@ -85,6 +86,8 @@ class LiveView(Callback):
         if not trainer.is_global_zero:
             return
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+        if scene.capture_of is not None:
+            scene = one_capture(scene, 0)  # rays that name no capture run through the first
         renderer = SlicedRenderer(
             pl_module.model,
             scene_record(scene),

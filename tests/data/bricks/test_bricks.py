@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from nerf_lightning.data.bricks import reader as reader_module
+from nerf_lightning.data.bricks.family import model
 from nerf_lightning.data.bricks.light import cells, key_visible, openness
 from nerf_lightning.data.bricks.parts import ALONG_X, ALONG_Z, Material, ball, block, rod, slope
 from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cameras, model_box
@@ -230,7 +231,7 @@ def test_scene_is_named_split_and_boxed(scene: Scene) -> None:
     assert scene.view_names == ("train_000", "train_001", "train_002", "val_000", "test_000", "test_001")
     assert scene.protocol["filter"] == "4x4 supersampling"
     assert scene.pixels.view(5).shape == (16, 16, 4)
-    box = model_box()
+    box = model_box(model(0))
     assert (np.abs(box) < 1.25).all()
     assert (box[1] - box[0] > 1).all()
 
@@ -260,7 +261,7 @@ def test_two_renderings_are_identical(scene: Scene, tmp_path: Path) -> None:
 def test_one_of_many_readers_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
     original = reader_module.render
-    monkeypatch.setattr(reader_module, "render", lambda cameras: calls.append(1) or original(cameras))
+    monkeypatch.setattr(reader_module, "render", lambda *given: calls.append(1) or original(*given))
     scenes: list[Scene] = []
     small = BricksReader(resolution=8, num_train=1, num_val=0, num_test=0, cache_dir=str(tmp_path))
     threads = [threading.Thread(target=lambda: scenes.append(small.read())) for _ in range(4)]

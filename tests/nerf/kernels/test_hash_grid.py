@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.kernels.hash_grid import cpu
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
@@ -114,3 +115,24 @@ def test_without_numba_the_torch_twin_runs_after_one_warning(monkeypatch, caplog
     assert [record.getMessage()[:60] for record in caplog.records] == [
         "numba cannot be used here (OSError: libLLVM is missing): the"
     ]
+
+
+@pytest.mark.parametrize("features", [2, 4])
+def test_a_point_does_not_depend_on_where_it_stands(features):
+    layout = hash_grid_layout(4, 8, 2, 40)
+    table, points, _ = inputs(layout, features, count=333)
+    order = torch.randperm(333)
+    assert torch.equal(cpu.forward(table, points, layout)[order], cpu.forward(table, points[order], layout))
+    assert torch.equal(cpu.forward(table, points, layout)[5:6], cpu.forward(table, points[5:6], layout))
+
+
+def test_points_that_are_none_stay_in_the_table():
+    """A camera that has lost itself must not read or write memory that is not the table's."""
+    layout = hash_grid_layout(4, 8, 2, 40)
+    points = torch.tensor([[torch.nan, 0.5, 0.5], [torch.inf, -torch.inf, torch.nan], [1e30, -1e30, 0.0]])
+    table, into = torch.rand(layout.offsets[-1], 4), torch.zeros(layout.offsets[-1] + 2 * layout.offsets[-1], 4)
+    cpu.forward(table, points, layout)
+    middle = into[layout.offsets[-1] : 2 * layout.offsets[-1]]
+    cpu.add_table_gradient(middle, points, torch.ones(3, 16), layout)
+    assert bool((into[: layout.offsets[-1]] == 0).all())
+    assert bool((into[2 * layout.offsets[-1] :] == 0).all())

@@ -9,6 +9,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.gaussian_fourier import GaussianFourierEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.hybrid import HybridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
@@ -27,11 +28,18 @@ from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
 
+
+def a_grid():
+    return HashGridEncoder(num_levels=3, log2_table_size=10, min_resolution=4, max_resolution=24)
+
+
 POSITIONS = {
     "frequency": lambda: FrequencyEncoder(4),
     "gaussian_fourier": lambda: GaussianFourierEncoder(16, scale=0.5),
-    "hash_grid": lambda: HashGridEncoder(num_levels=3, log2_table_size=10, min_resolution=4, max_resolution=24),
+    "hash_grid": a_grid,
+    "hybrid": lambda: HybridEncoder(FrequencyEncoder(3), a_grid(), cones=True),
 }
+UNIT_CUBE = {"hash_grid", "hybrid"}
 DIRECTIONS = {"frequency": lambda: FrequencyEncoder(2), "spherical_harmonics": lambda: SphericalHarmonicsEncoder(3)}
 FIELDS = {
     "nerf_mlp": lambda p, d: NerfMLP(p, d, depth=2, width=32, skip=None, density_activation="softplus"),
@@ -51,13 +59,16 @@ MODELS = {
         "fine": DenseLevel(ProposalSampler(16), field()),
     },
 }
-PAIRS = [("frequency", "frequency"), ("gaussian_fourier", "spherical_harmonics"), ("hash_grid", "spherical_harmonics")]
+PAIRS = [
+    ("frequency", "frequency"),
+    *((each, "spherical_harmonics") for each in ("gaussian_fourier", "hash_grid", "hybrid")),
+]
 CASES = [
     (model, field, *pair)
     for model in MODELS
     for field in FIELDS
     for pair in PAIRS
-    if not (field == "nerf_mlp" and pair[0] == "hash_grid")
+    if not (field == "nerf_mlp" and pair[0] in UNIT_CUBE)
 ]
 
 

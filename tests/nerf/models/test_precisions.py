@@ -9,6 +9,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
@@ -16,7 +17,10 @@ from nerf_lightning.training.step import TrainStep
 
 # Enough to see a ball. Where a CPU has no bfloat16 it is emulated, and the largest MLP takes half a minute.
 STEPS, RAYS, SIDE, TILE_POINTS = 30, 64, 16, 8192
-LESS = {"nerf": (20, 10, 12), "nerf_occupancy": (20, 16, 12)}
+LESS = {"nerf": (20, 10, 12), "nerf_occupancy": (20, 16, 12), "view_transformer_tiny": (15, 32, 12)}
+LESS["view_transformer"] = (5, 8, 12)
+# They render each view from up to ten others.
+LOOKING = ("view_transformer", "view_transformer_tiny")
 # Two of four: from both sides.
 SEEN_FROM = (0, 2)
 
@@ -24,14 +28,15 @@ SEEN_FROM = (0, 2)
 def trained(name, scene):
     # Few frequencies: a field that is half trained at many is noise, of which any change makes other noise.
     config = composed("train", f"model={name}", *["encoder.num_frequencies=4"] * name.startswith("nerf"))
-    if "resolution" in config.model.levels.fine.sampler:
+    if "levels" in config.model and "resolution" in config.model.levels.fine.sampler:
         config.model.levels.fine.sampler.update(resolution=32, num_steps=128)  # carved in a moment
     model, loss = build(config.model), build(config.loss)
     assert isinstance(loss, Loss)
     model.fit_to(scene)
+    show_photographs(model, scene)
     progress, (steps, rays, _) = Progress(), LESS.get(name, (STEPS, RAYS, SIDE))
     step = TrainStep(
-        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, "random",
+        model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, background_of(name),
         TILE_POINTS, num_steps=steps,
     )  # fmt: skip
     model.multiply_in("bfloat16")
@@ -41,10 +46,21 @@ def trained(name, scene):
     return model.eval()
 
 
-@pytest.mark.parametrize("name", [each for each in options("model") if each != "auto"])  # it is one of the others
+def background_of(name):
+    return "white" if name in LOOKING else "random"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(each, marks=pytest.mark.exhaustive if each == "view_transformer" else ())
+        for each in options("model")
+        if each != "auto"  # it is one of the others
+    ],
+)
 def test_weights_see_the_same_in_both_precisions(name):
     *_, side = LESS.get(name, (STEPS, RAYS, SIDE))
-    scene = ball_scene(num_views=4, size=side)
+    scene = ball_scene(num_views=24 if name in LOOKING else 4, size=side)
     model, found = trained(name, scene), {}
     for products in ("float32", "bfloat16"):
         model.multiply_in(products)

@@ -12,21 +12,20 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
-from nerf_lightning.nerf.kernels.prefetch import prefetch
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
-COMPILED_WITH = "3ff815cc"
+COMPILED_WITH = "f619108e"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 
-CHUNK = 1024
-# A processor looks ahead two or three points by itself, and waits for memory most of the time; asked for so many points
-# ahead, the entries of large levels come in time. Smaller levels than this stay in the cache.
-AHEAD, LARGE_BYTES = 8, 1 << 18
+POINTS = 64
+"""So many are taken at a time: their cells are found by vectors, and then what stands there is fetched. Found one by
+one, in the midst of fetching, they keep a processor from looking ahead to memory."""
 SPREAD_Y, SPREAD_Z = np.uint32(PRIME_Y), np.uint32(PRIME_Z)
-ONE = np.float32(1.0)
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+NONE, NEXT = np.int32(0), np.int32(1)
 
 
 def forward(
@@ -127,11 +126,80 @@ def _weights(x, y, z):
     return u * a, x * a, u * b, x * b, u * c, x * c, u * d, x * d
 
 
-# Four features are kept in registers as one vector: written one by one, the compiler must fear that what it stores is
-# what it loads next, and takes a third longer.
+# Numbers of POINTS points lie side by side, and the entries and weights of their eight corners after one another, so
+# that the compiler makes vectors of these loops. A cell lies in the grid whatever the point is.
 @njit(fastmath=True)
 @no_type_check
-def _take(table, entry, weight, a, b, c, d):
+def _take_points(points, first, count, p):
+    for i in range(POINTS):
+        j = first + min(i, count - 1)
+        p[i] = min(max(points[j, 0], ZERO), ONE)
+        p[POINTS + i] = min(max(points[j, 1], ZERO), ONE)
+        p[2 * POINTS + i] = min(max(points[j, 2], ZERO), ONE)
+
+
+@njit(fastmath=True)
+@no_type_check
+def _weigh(i, x, y, z, w):
+    u, v, t = ONE - x, ONE - y, ONE - z
+    a, b, c, d = v * t, y * t, v * z, y * z
+    w[i], w[POINTS + i] = u * a, x * a
+    w[2 * POINTS + i], w[3 * POINTS + i] = u * b, x * b
+    w[4 * POINTS + i], w[5 * POINTS + i] = u * c, x * c
+    w[6 * POINTS + i], w[7 * POINTS + i] = u * d, x * d
+
+
+@njit(fastmath=True)
+@no_type_check
+def _find_hashed(p, resolution, mask, e, w):
+    scale, last, mask = np.float32(resolution), np.int32(resolution - 1), np.int32(mask)
+    spread_y, spread_z = np.int32(SPREAD_Y), np.int32(SPREAD_Z)
+    for i in range(POINTS):
+        sx, sy, sz = p[i] * scale, p[POINTS + i] * scale, p[2 * POINTS + i] * scale
+        x0 = max(min(np.int32(sx), last), NONE)
+        y, z = max(min(np.int32(sy), last), NONE), max(min(np.int32(sz), last), NONE)
+        _weigh(i, sx - np.float32(x0), sy - np.float32(y), sz - np.float32(z), w)
+        x1, y0, z0 = np.int32(x0 + NEXT), np.int32(y * spread_y), np.int32(z * spread_z)
+        y1, z1 = np.int32(y0 + spread_y), np.int32(z0 + spread_z)
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        e[i], e[POINTS + i] = (x0 ^ a) & mask, (x1 ^ a) & mask
+        e[2 * POINTS + i], e[3 * POINTS + i] = (x0 ^ b) & mask, (x1 ^ b) & mask
+        e[4 * POINTS + i], e[5 * POINTS + i] = (x0 ^ c) & mask, (x1 ^ c) & mask
+        e[6 * POINTS + i], e[7 * POINTS + i] = (x0 ^ d) & mask, (x1 ^ d) & mask
+
+
+@njit(fastmath=True)
+@no_type_check
+def _find_dense(p, resolution, e, w):
+    scale, last, row = np.float32(resolution), np.int32(resolution - 1), np.int32(resolution + 1)
+    plane = np.int32(row * row)
+    for i in range(POINTS):
+        sx, sy, sz = p[i] * scale, p[POINTS + i] * scale, p[2 * POINTS + i] * scale
+        x = max(min(np.int32(sx), last), NONE)
+        y, z = max(min(np.int32(sy), last), NONE), max(min(np.int32(sz), last), NONE)
+        _weigh(i, sx - np.float32(x), sy - np.float32(y), sz - np.float32(z), w)
+        first = np.int32(x + y * row + z * plane)
+        above = np.int32(first + plane)
+        e[i], e[POINTS + i], e[2 * POINTS + i], e[3 * POINTS + i] = first, first + NEXT, first + row, first + row + NEXT
+        e[4 * POINTS + i], e[5 * POINTS + i] = above, above + NEXT
+        e[6 * POINTS + i], e[7 * POINTS + i] = above + row, above + row + NEXT
+
+
+@njit(fastmath=True)
+@no_type_check
+def _find(p, resolution, hashed, mask, e, w):
+    if hashed:
+        _find_hashed(p, resolution, mask, e, w)
+    else:
+        _find_dense(p, resolution, e, w)
+
+
+# Four features are kept in registers as one vector: written one by one, the compiler must fear that what it stores is
+# what it loads next, and takes a third longer. A place without sign is not looked at for being negative.
+@njit(fastmath=True)
+@no_type_check
+def _take(table, place, weight, a, b, c, d):
+    entry = np.uintp(place)
     return (
         a + weight * table[entry, 0],
         b + weight * table[entry, 1],
@@ -142,7 +210,8 @@ def _take(table, entry, weight, a, b, c, d):
 
 @njit(fastmath=True)
 @no_type_check
-def _give(into, entry, weight, a, b, c, d):
+def _give(into, place, weight, a, b, c, d):
+    entry = np.uintp(place)
     p, q, r, s = into[entry, 0], into[entry, 1], into[entry, 2], into[entry, 3]
     into[entry, 0], into[entry, 1] = p + weight * a, q + weight * b
     into[entry, 2], into[entry, 3] = r + weight * c, s + weight * d
@@ -150,105 +219,65 @@ def _give(into, entry, weight, a, b, c, d):
 
 @njit(fastmath=True)
 @no_type_check
-def _gather(table, e, w, out, row, column, lanes):
+def _gather(table, offset, e, w, i, out, row, column, lanes):
     if len(lanes) == 4:
-        a = b = c = d = np.float32(0.0)
-        a, b, c, d = _take(table, e[0], w[0], a, b, c, d)
-        a, b, c, d = _take(table, e[1], w[1], a, b, c, d)
-        a, b, c, d = _take(table, e[2], w[2], a, b, c, d)
-        a, b, c, d = _take(table, e[3], w[3], a, b, c, d)
-        a, b, c, d = _take(table, e[4], w[4], a, b, c, d)
-        a, b, c, d = _take(table, e[5], w[5], a, b, c, d)
-        a, b, c, d = _take(table, e[6], w[6], a, b, c, d)
-        a, b, c, d = _take(table, e[7], w[7], a, b, c, d)
+        a = b = c = d = ZERO
+        a, b, c, d = _take(table, offset + e[i], w[i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[POINTS + i], w[POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[2 * POINTS + i], w[2 * POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[3 * POINTS + i], w[3 * POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[4 * POINTS + i], w[4 * POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[5 * POINTS + i], w[5 * POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[6 * POINTS + i], w[6 * POINTS + i], a, b, c, d)
+        a, b, c, d = _take(table, offset + e[7 * POINTS + i], w[7 * POINTS + i], a, b, c, d)
         out[row, column], out[row, column + 1], out[row, column + 2], out[row, column + 3] = a, b, c, d
         return
     for f in range(len(lanes)):
-        total = np.float32(0.0)
-        for k in range(8):
-            total += w[k] * table[e[k], f]
+        total = ZERO
+        for k in range(i, 8 * POINTS, POINTS):
+            total += w[k] * table[offset + e[k], f]
         out[row, column + f] = total
 
 
 @njit(fastmath=True)
 @no_type_check
-def _scatter(into, e, w, grad, row, column, lanes):
+def _scatter(into, offset, e, w, i, grad, row, column, lanes):
     if len(lanes) == 4:
         a, b, c, d = grad[row, column], grad[row, column + 1], grad[row, column + 2], grad[row, column + 3]
-        _give(into, e[0], w[0], a, b, c, d)
-        _give(into, e[1], w[1], a, b, c, d)
-        _give(into, e[2], w[2], a, b, c, d)
-        _give(into, e[3], w[3], a, b, c, d)
-        _give(into, e[4], w[4], a, b, c, d)
-        _give(into, e[5], w[5], a, b, c, d)
-        _give(into, e[6], w[6], a, b, c, d)
-        _give(into, e[7], w[7], a, b, c, d)
+        for k in range(i, 8 * POINTS, POINTS):
+            _give(into, offset + e[k], w[k], a, b, c, d)
         return
-    for k in range(8):
+    for k in range(i, 8 * POINTS, POINTS):
         for f in range(len(lanes)):
-            into[e[k], f] += w[k] * grad[row, column + f]
+            into[offset + e[k], f] += w[k] * grad[row, column + f]
 
 
-@njit(fastmath=True)
-@no_type_check
-def _ask_for(address, entry_bytes, e):
-    # One by one: a loop over them would store them first.
-    prefetch(address, e[0] * entry_bytes)
-    prefetch(address, e[1] * entry_bytes)
-    prefetch(address, e[2] * entry_bytes)
-    prefetch(address, e[3] * entry_bytes)
-    prefetch(address, e[4] * entry_bytes)
-    prefetch(address, e[5] * entry_bytes)
-    prefetch(address, e[6] * entry_bytes)
-    prefetch(address, e[7] * entry_bytes)
-
-
-# Each loop below finds a point's cell in the same four lines: a function that returned all of it took twice the time.
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def encode(first, last, table, points, resolutions, offsets, hashed, mask, lanes, out):
     """Write the features of the points from first to last."""
-    width = len(lanes)
-    address, entry_bytes = np.int64(table.ctypes.data), np.int64(4 * width)
-    for chunk in range(first, last, CHUNK):
-        end = min(last, chunk + CHUNK)
+    p = np.empty(3 * POINTS, np.float32)
+    e, w = np.empty(8 * POINTS, np.int32), np.empty(8 * POINTS, np.float32)
+    for start in range(first, last, POINTS):
+        count = min(POINTS, last - start)
+        _take_points(points, start, count, p)
         for level in range(resolutions.shape[0]):
-            resolution, column = resolutions[level], level * width
-            large = (offsets[level + 1] - offsets[level]) * entry_bytes > LARGE_BYTES
-            for i in range(chunk, end):
-                j = i + AHEAD
-                if large and j < end:
-                    x, fx = _cell(points[j, 0], resolution)
-                    y, fy = _cell(points[j, 1], resolution)
-                    z, fz = _cell(points[j, 2], resolution)
-                    e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-                    _ask_for(address, entry_bytes, e)
-                x, fx = _cell(points[i, 0], resolution)
-                y, fy = _cell(points[i, 1], resolution)
-                z, fz = _cell(points[i, 2], resolution)
-                e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-                _gather(table, e, _weights(fx, fy, fz), out, i, column, lanes)
+            _find(p, resolutions[level], hashed[level], mask, e, w)
+            for i in range(count):
+                _gather(table, offsets[level], e, w, i, out, start + i, level * len(lanes), lanes)
 
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
 def _add_table_gradient(level, into, points, grad, resolutions, offsets, hashed, mask, lanes):
-    resolution, column = resolutions[level], level * len(lanes)
-    address, entry_bytes = np.int64(into.ctypes.data), np.int64(4 * len(lanes))
-    large = (offsets[level + 1] - offsets[level]) * entry_bytes > LARGE_BYTES
-    for i in range(points.shape[0]):
-        j = i + AHEAD
-        if large and j < points.shape[0]:
-            x, fx = _cell(points[j, 0], resolution)
-            y, fy = _cell(points[j, 1], resolution)
-            z, fz = _cell(points[j, 2], resolution)
-            e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-            _ask_for(address, entry_bytes, e)
-        x, fx = _cell(points[i, 0], resolution)
-        y, fy = _cell(points[i, 1], resolution)
-        z, fz = _cell(points[i, 2], resolution)
-        e = _corners(x, y, z, resolution, offsets[level], hashed[level], mask)
-        _scatter(into, e, _weights(fx, fy, fz), grad, i, column, lanes)
+    p = np.empty(3 * POINTS, np.float32)
+    e, w = np.empty(8 * POINTS, np.int32), np.empty(8 * POINTS, np.float32)
+    for start in range(0, points.shape[0], POINTS):
+        count = min(POINTS, points.shape[0] - start)
+        _take_points(points, start, count, p)
+        _find(p, resolutions[level], hashed[level], mask, e, w)
+        for i in range(count):
+            _scatter(into, offsets[level], e, w, i, grad, start + i, level * len(lanes), lanes)
 
 
 @njit(nogil=True, fastmath=True, cache=True)

@@ -1,0 +1,95 @@
+"""The cones of pixels: how far the space that one sample stands for reaches (Sec. 3.1, arXiv 2103.13415).
+
+A pixel is no line. Between two distances its cone is about a normal distribution, of sigma_t along the ray and sigma_r
+across. A covariance is kept as its six entries xx, yy, zz, xy, xz, yz.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.lenses import stretches
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.scene import Cameras
+
+ROWS, COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+UNIFORM_VARIANCE = 1.0 / 12.0
+"""Of a uniform distribution over a unit of length."""
+
+
+@torch.no_grad()
+def pixel_side(
+    cameras: Cameras, view: Int[Tensor, "*rays"], directions: Float[Tensor, "*rays 3"]
+) -> Float[Tensor, "*rays 2"]:
+    """Return the side of pixels at distance 0, and by how much it grows per unit of distance: the root of their areas.
+
+    A pinhole's pixel takes the solid angle cos^3 / (f_x f_y); a lens that stretches its surroundings shows less in it.
+    In normalised device coordinates pixels, as seen from the middle of all cameras, are the same size at all depths.
+    Without gradients: the size of its pixels is no reason to move a camera.
+
+    Args:
+        cameras: all views.
+        view: of each pixel.
+        directions: of the pixels' centres in the lens's axes (right, down, forward), of any length.
+    """
+    pixel = 1.0 / cameras.focal[view]
+    if cameras.ndc is not None:
+        side = (cameras.ndc[view] * pixel).prod(dim=-1).sqrt()
+        return torch.stack([side, torch.zeros_like(side)], dim=-1)
+    area = pixel.prod(dim=-1)
+    if cameras.lens_model != "pinhole":
+        area = area / stretches(directions, cameras.lens[view], cameras.lens_model).prod(dim=-1)
+    if cameras.lens_model in ("pinhole", "radial_tangential"):
+        area = area * (directions[..., 2] / directions.norm(dim=-1)) ** 3
+    side = area.clamp(min=0.0).sqrt()
+    return torch.stack([torch.zeros_like(side), side], dim=-1)
+
+
+def cone_covariance(
+    directions: Float[Tensor, "*#points 3"], along: Float[Tensor, "*points"], across: Float[Tensor, "*points"]
+) -> Float[Tensor, "*points 6"]:
+    """Return Sigma = sigma_t^2 d d^T + sigma_r^2 (1 - d d^T), with the variances of uniform distributions.
+
+    Args:
+        directions: of the rays, unit length.
+        along: length of each sample's interval.
+        across: side of the pixel at the sample.
+
+    >>> cone_covariance(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(6.0), torch.tensor(0.0)).tolist()
+    [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]
+    """
+    of_ray, of_pixel = UNIFORM_VARIANCE * along.square(), UNIFORM_VARIANCE * across.square()
+    outer = directions[..., ROWS] * directions[..., COLUMNS]
+    isotropic = outer.new_tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    return (of_ray - of_pixel)[..., None] * outer + of_pixel[..., None] * isotropic
+
+
+def scaled_covariance(covariance: Float[Tensor, "*points 6"], scale: Float[Tensor, "3"]) -> Float[Tensor, "*points 6"]:
+    """Return the covariances once the axes of space are scaled."""
+    return covariance * (scale[ROWS] * scale[COLUMNS])
+
+
+@own_precision
+def contracted_covariance(
+    covariance: Float[Tensor, "*points 6"], positions: Float[Tensor, "*points 3"]
+) -> Float[Tensor, "*points 6"]:
+    """Return J Sigma J^T, J the Jacobian of `contraction.contract` at the positions (Sec. 3, arXiv 2111.12077).
+
+    Outside of the unit ball lengths along the radius r shrink by 1 / r^2, those around it by (2 - 1/r) / r.
+    """
+    radius = positions.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    around, outward = (2.0 - 1.0 / radius) / radius, 1.0 / radius.square()
+    heading = positions / positions.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    jacobian = (outward - around)[..., None] * heading[..., :, None] * heading[..., None, :]
+    jacobian = jacobian + around[..., None] * torch.eye(3, dtype=positions.dtype, device=positions.device)
+    return from_matrix(jacobian @ to_matrix(covariance) @ jacobian)
+
+
+def to_matrix(covariance: Float[Tensor, "*points 6"]) -> Float[Tensor, "*points 3 3"]:
+    """Return the entries as symmetric matrices."""
+    return covariance[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]].unflatten(-1, (3, 3))
+
+
+def from_matrix(matrices: Float[Tensor, "*points 3 3"]) -> Float[Tensor, "*points 6"]:
+    """Return the six entries of symmetric matrices."""
+    return matrices[..., ROWS, COLUMNS]

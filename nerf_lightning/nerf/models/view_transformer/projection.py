@@ -1,0 +1,91 @@
+"""Where the points along rays appear in other photographs.
+
+A ray appears as a line (the epipolar line): in the axes of a source camera its point at distance t is a + t b, with a
+the ray's origin and b its direction. So each ray is turned into each camera once, and not each point.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf_lightning.nerf.geometry.cameras import coarse_pixels
+from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
+from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+LEAST_COSINE = 1e-3
+"""Of the angle from the axis of a pinhole: points beside the camera have no place in its picture."""
+BEYOND = 1.1
+"""A lens is believed so far beyond the widest angle that its picture's pixels show; farther out it may fold back."""
+
+
+@dataclass(frozen=True)
+class Projected(TensorStruct):
+    """The points of rays in their source photographs."""
+
+    at: Float[Tensor, "rays samples sources 2"]
+    """In pixels from the upper left corner (x, y); 0 where it is not visible."""
+    visible: Bool[Tensor, "rays samples sources"]
+    """Whether the point lies in the picture."""
+    turned: Float[Tensor, "rays samples sources 4"]
+    """How the ray looks on the point against how the source does: the difference of directions, and their dot
+    product."""
+
+
+@own_precision
+def project_samples(
+    cameras: Cameras,
+    least_cosine: Float[Tensor, "views"],
+    places: Int[Tensor, "rays sources"],
+    rays: RayBundle,
+    t: Float[Tensor, "rays samples"],
+) -> Projected:
+    """Return where the points at distances t along rays appear, as `geometry.cameras.project` has it.
+
+    Args:
+        cameras: of the photographs.
+        least_cosine: what `seen_cosines` returns of them.
+        places: which of them each ray's sources are.
+        rays: in the world.
+        t: distances.
+    """
+    c2w, t = cameras.c2w[places], t[:, :, None, None]
+    apart = rays.origins[:, None] - c2w[..., 3]
+    # From a camera's axes (right, up, back) to those of its lens (right, down, forward).
+    axes = c2w[..., :3] * c2w.new_tensor([1.0, -1.0, -1.0])
+    start = (apart[..., None, :] @ axes)[..., 0, :]
+    along = (rays.directions[:, None, None, :] @ axes)[..., 0, :]
+    local = start[:, None] + t * along[:, None]
+    distance = local.square().sum(dim=-1).clamp(min=1e-12).sqrt()
+    ahead = local[..., 2] > least_cosine[places][:, None] * distance
+    in_front = torch.where(ahead[..., None], local, local.new_tensor([0.0, 0.0, 1.0]))
+    plane = project_plane(in_front, cameras.lens[places][:, None], cameras.lens_model)
+    at = plane * cameras.focal[places][:, None] + cameras.center[places][:, None]
+    size = torch.stack([cameras.width[places], cameras.height[places]], dim=-1)[:, None]
+    visible = ahead & ((at >= 0.0) & (at <= size)).all(dim=-1)
+    looks = rays.directions[:, None, None, :]
+    source_looks = (apart[:, None] + t * looks) / distance[..., None]
+    turned = torch.cat([looks - source_looks, (looks * source_looks).sum(dim=-1, keepdim=True)], dim=-1)
+    return Projected(torch.where(visible[..., None], at, 0.0), visible, turned)
+
+
+@own_precision
+def seen_cosines(cameras: Cameras) -> Float[Tensor, "views"]:
+    """Return the cosine of the widest angle from the axis at which each camera's picture shows anything.
+
+    A little more than that of its pixels; of panoramas -1.
+    """
+    if cameras.lens_model == "pinhole":
+        return torch.full_like(cameras.focal[:, 0], LEAST_COSINE)
+    if cameras.lens_model == "equirectangular":
+        return torch.full_like(cameras.focal[:, 0], -2.0)
+    pixels = coarse_pixels(cameras)
+    at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
+    plane = (at - cameras.center[:, None]) / cameras.focal[:, None]
+    directions = torch.nn.functional.normalize(unproject(plane, cameras.lens[:, None], cameras.lens_model), dim=-1)
+    cosine = (BEYOND * directions[..., 2].clamp(-1.0, 1.0).acos().amax(dim=1)).clamp(max=torch.pi).cos()
+    return cosine if cameras.lens_model == "fisheye" else cosine.clamp(min=LEAST_COSINE)
