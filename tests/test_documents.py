@@ -24,6 +24,7 @@ DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("[!s]*.md")),
+    ROOT / "docs" / "scaling.md",
     ROOT / "docs" / "sweeps.md",
 ]
 TAKE_PATHS = ("report", "table")

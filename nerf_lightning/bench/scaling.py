@@ -51,7 +51,7 @@ def benchmark_scaling(config: DictConfig) -> dict[str, float]:
     Returns:
         The exponent of a step's time, by axis.
     """
-    axes = {name: AXES[name](config) for name in _names(config.scaling)}
+    axes = _axes(config)
     found: dict[str, list[tuple[int | float, Point]]] = {name: [] for name in axes}
     cases = [(name, case) for name, listed in axes.items() for case in listed]
     with TemporaryDirectory(prefix="nerf-scaling-") as folder:
@@ -78,7 +78,9 @@ def exponent(points: Sequence[tuple[int | float, float]]) -> float:
     return sum((x - x_mean) * (y - y_mean) for x, y in logs) / spread if spread > 0 else math.nan
 
 
-def _names(wanted: object) -> list[str]:
+def _axes(config: DictConfig) -> dict[str, list[Case]]:
+    """Return the points along each axis that is asked for; of all, those that the model has."""
+    wanted = config.scaling
     names = list(AXES) if wanted is True else [str(name) for name in wanted] if isinstance(wanted, ListConfig) else []
     unknown = [name for name in names if name not in AXES]
     if unknown or not names:
@@ -86,7 +88,14 @@ def _names(wanted: object) -> list[str]:
             f"scaling={wanted} names no axis that there is. Give true for all, or some of them: "
             f"scaling=[{','.join(AXES)}]."
         )
-    return names
+    axes = {name: AXES[name](config) for name in names}
+    absent = [name for name, cases in axes.items() if not cases]
+    if absent and wanted is not True:
+        raise InputError(
+            f"scaling={wanted}: this model has nothing to change along {' and '.join(absent)}. Leave that out, or "
+            "choose another model (model=fast has a table)."
+        )
+    return {name: cases for name, cases in axes.items() if cases}
 
 
 def _rays(config: DictConfig) -> list[Case]:
@@ -164,40 +173,51 @@ def _measured(config: DictConfig, case: Case, folder: Path) -> Point:
             "_target_": "nerf_lightning.data.readers.transforms.TransformsReader",
             "root": str(capture),
             "space": "bounded",
-            "cache_dir": str(folder / "decoded"),
+            "cache_dir": str(folder / "decoded"),  # goes with the photographs
         }
     return measure_point(chosen, case.processes)
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """A field of `Point`, as it is shown."""
+
+    field: str
+    name: str
+    unit: str
+    factor: float
+    colour: str
+
+    def of(self, points: Sequence[tuple[int | float, Point]]) -> list[tuple[int | float, float]]:
+        """Return size and value of each point, in the unit."""
+        return [(size, self.factor * getattr(point, self.field)) for size, point in points]
+
+
+QUANTITIES = (
+    Quantity("step_seconds", "step", "ms", 1e3, "#2f6db3"),
+    Quantity("processor_seconds", "its processor time", "ms", 1e3, "#7fb0e0"),
+    Quantity("batch_seconds", "batch", "ms", 1e3, "#3c9d6b"),
+    Quantity("gigabytes", "memory", "MB", 1e3, "#8a8f98"),
+    Quantity("reading_seconds", "reading", "ms", 1e3, "#e07b39"),
+    Quantity("again_seconds", "reading again", "ms", 1e3, "#e8b48c"),
+    Quantity("setup_seconds", "set-up", "ms", 1e3, "#8d5fb0"),
+)
+
+
 def _print(found: dict[str, list[tuple[int | float, Point]]]) -> None:
     table = Table(title="nerf bench scaling=true: the shortest of several windows of steps")
-    for column in ("", "size", "a step, ms", "a batch, ms", "memory, GB", "reading, s"):
-        table.add_column(column, justify="left" if not column else "right")
+    for column in ("", "size"):
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
+    for each in QUANTITIES:
+        table.add_column(f"{each.name}, {each.unit}", justify="right")
     for name, points in found.items():
-        for size, point in points:
-            shown = (1e3 * point.step_seconds, 1e3 * point.batch_seconds, point.gigabytes, point.reading_seconds)
-            table.add_row(name, f"{size:,.4g}", *(f"{value:.3g}" for value in shown))
-        fitted = [
-            exponent([(size, value(point)) for size, point in points]) for value in (_step, _batch, _memory, _reading)
-        ]
-        table.add_row("", "grows with power", *(f"{k:.2f}" for k in fitted), style="bold", end_section=True)
-    StdoutConsole(width=100).print(table)
-
-
-def _step(point: Point) -> float:
-    return point.step_seconds
-
-
-def _batch(point: Point) -> float:
-    return point.batch_seconds
-
-
-def _memory(point: Point) -> float:
-    return point.gigabytes
-
-
-def _reading(point: Point) -> float:
-    return point.reading_seconds
+        columns = [quantity.of(points) for quantity in QUANTITIES]
+        for row in zip(*columns, strict=True):
+            table.add_row(name, f"{row[0][0]:,}", *(f"{value:,.3g}" for _, value in row))
+        table.add_row(
+            "", "grows with power", *(f"{exponent(column):.2f}" for column in columns), style="bold", end_section=True
+        )
+    StdoutConsole(width=120).print(table)
 
 
 def _draw(found: dict[str, list[tuple[int | float, Point]]], path: Path) -> None:
@@ -207,7 +227,7 @@ def _draw(found: dict[str, list[tuple[int | float, Point]]], path: Path) -> None
 
     columns = min(4, len(found))
     rows = -(-len(found) // columns)
-    figure = new_figure(320 * columns, 280 * rows)
+    figure = new_figure(360 * columns, 360 * rows)
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes, (name, points) in zip(panels, found.items(), strict=False):
         _draw_axis(axes, name, points)
@@ -217,19 +237,19 @@ def _draw(found: dict[str, list[tuple[int | float, Point]]], path: Path) -> None
 
 
 def _draw_axis(axes: "Axes", name: str, points: list[tuple[int | float, Point]]) -> None:
-    sizes = [size for size, _ in points]
-    for label, value, colour in (
-        ("a step, ms", lambda point: 1e3 * point.step_seconds, "#2f6db3"),
-        ("a batch, ms", lambda point: 1e3 * point.batch_seconds, "#3c9d6b"),
-        ("memory, MB", lambda point: 1e3 * point.gigabytes, "#8a8f98"),
-        ("reading, ms", lambda point: 1e3 * point.reading_seconds, "#e07b39"),
-    ):
-        drawn = [value(point) for _, point in points]
-        power = exponent(list(zip(sizes, drawn, strict=True)))
-        axes.plot(sizes, drawn, marker="o", markersize=3, linewidth=1.2, color=colour, label=f"{label}: {power:.2f}")
+    for each in QUANTITIES:
+        drawn = each.of(points)
+        label = f"{each.name}, {each.unit}: {exponent(drawn):.2f}"
+        axes.plot(*zip(*drawn, strict=True), marker="o", markersize=3, linewidth=1.2, color=each.colour, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    sizes = [size for size, _ in points]
+    axes.set_xticks(sizes, [f"{size:,}" for size in sizes], minor=False)
+    axes.set_xticks([], minor=True)  # within a decade their labels would lie on each other
     axes.set_title(name, fontsize=10)
-    axes.legend(fontsize=7, frameon=False)
+    # Below the panel: within, it would lie on lines.
+    axes.legend(
+        fontsize=6.5, frameon=False, ncols=2, columnspacing=0.8, loc="upper center", bbox_to_anchor=(0.45, -0.08)
+    )
     axes.tick_params(which="both", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)

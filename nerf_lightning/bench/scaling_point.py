@@ -3,9 +3,11 @@
 import multiprocessing
 import os
 import socket
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import psutil
 import torch
@@ -14,9 +16,6 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import peak_memory, seconds_of
-
-if TYPE_CHECKING:
-    from nerf_lightning.bench.benchmark import Bench
 
 WARMUP_STEPS, WINDOWS, LEAST_SECONDS = 3, 5, 0.15
 
@@ -27,12 +26,18 @@ class Point:
 
     step_seconds: float
     """Of a step of training, loading and all."""
+    processor_seconds: float
+    """That the step took of the first process's cores: other work on the machine changes it little."""
     batch_seconds: float
     """Of making its batch alone."""
     gigabytes: float
     """That the process held at most, less what it held before anything was read."""
     reading_seconds: float
     """Until the scene is there."""
+    again_seconds: float
+    """The same once more: of photographs, the pixels that were kept are mapped."""
+    setup_seconds: float
+    """From the scene to the first step: the model, fitted to the scene, and what its first step prepares."""
 
 
 def measure_point(config: DictConfig, processes: int = 1) -> Point:
@@ -83,25 +88,38 @@ def _measure(plain: Any, rank: int, world: int, port: int, pipe: Connection) -> 
             torch.distributed.destroy_process_group()
 
 
-def _numbers(config: DictConfig) -> tuple[float, float, float, float]:
+def _numbers(config: DictConfig) -> tuple[float, ...]:
+    """Return the fields of a point, in order."""
     from nerf_lightning.bench.benchmark import prepare
 
     before = psutil.Process().memory_info().rss / 1e9
-    read: list[Any] = []
-    reading = seconds_of(lambda: read.append(build(config.scene).read()))
-    bench = prepare(config, read[0])
+    made: list[Any] = []
+    reading, again = (seconds_of(lambda: made.append(build(config.scene).read())) for _ in range(2))
+    scene = made.pop()
+    made.clear()  # a scene that is no mapped file lies in memory
+    setup = seconds_of(lambda: made.append(prepare(config, scene)))
+    bench = made[0]
+    setup += seconds_of(bench.take_step)
     for _ in range(WARMUP_STEPS):
         bench.take_step()
     # As many steps in every process: the first one's pace decides.
     steps = torch.tensor(max(1, round(LEAST_SECONDS / seconds_of(bench.take_step))))
     if torch.distributed.is_initialized():
         torch.distributed.broadcast(steps, src=0)
-    windows = [seconds_of(lambda: _take(bench, int(steps))) for _ in range(WINDOWS)]
+    windows = [_window(bench.take_step, int(steps)) for _ in range(WINDOWS)]
+    step, processor = (min(each) for each in zip(*windows, strict=True))
     progress = bench.batches.progress
     batches = [seconds_of(lambda: bench.batches.at(progress.attempt, progress.rays_seen)) for _ in range(WINDOWS)]
-    return min(windows) / int(steps), min(batches), peak_memory() - before, reading
+    return step, processor, min(batches), peak_memory() - before, reading, again, setup
 
 
-def _take(bench: "Bench", steps: int) -> None:
-    for _ in range(steps):
-        bench.take_step()
+def _window(take_step: Callable[[], None], steps: int) -> tuple[float, float]:
+    """Return seconds, and seconds of this process on all cores, per step."""
+
+    def take() -> None:
+        for _ in range(steps):
+            take_step()
+
+    before = time.process_time()
+    seconds = seconds_of(take)
+    return seconds / steps, (time.process_time() - before) / steps

@@ -8,7 +8,8 @@ def run(config: DictConfig) -> float:
     if config.scaling is not False:
         from nerf_lightning.bench.scaling import benchmark_scaling
 
-        return max(benchmark_scaling(config).values())
+        # An axis of one size, as threads on one core, has none.
+        return max((k for k in benchmark_scaling(config).values() if k == k), default=float("nan"))
     from nerf_lightning.bench.benchmark import benchmark
 
     return benchmark(config)

@@ -8,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 from support.configs import composed
 
-from nerf_lightning.bench import scaling
+from nerf_lightning.bench import scaling, scaling_point
 from nerf_lightning.bench.noise_capture import write_noise_capture
 from nerf_lightning.bench.scaling import AXES, Case, benchmark_scaling, exponent
 from nerf_lightning.bench.scaling_point import Point, _numbers, measure_point
@@ -55,7 +55,7 @@ def test_every_axis_changes_one_setting_of_the_config(config):
 
 def test_a_power_is_found_again_and_drawn(config, tmp_path, monkeypatch, capsys):
     def point(_, case, folder):
-        return Point(1e-3 * case.size**1.5, 1e-4, 0.1 * case.size**0.5, 2.0)
+        return Point(1e-3 * case.size**1.5, 2e-3 * case.size, 1e-4, 0.1 * case.size**0.5, 2.0, 1.0, 3.0)
 
     monkeypatch.setattr(scaling, "_measured", point)
     found = benchmark_scaling(OmegaConf.merge(config, {"scaling": ["rays", "samples"]}))
@@ -74,11 +74,23 @@ def test_axes_that_there_are_none_of_are_refused(config, wanted):
         benchmark_scaling(OmegaConf.merge(config, {"scaling": wanted}))
 
 
-def test_a_point_is_measured(config):
-    step, batch, gigabytes, reading = _numbers(config)
-    assert 0 < batch < step < 30
-    assert 0 <= gigabytes < 8
-    assert reading > 0
+def test_an_axis_that_the_model_does_not_have_is_left_out_or_refused(config, monkeypatch):
+    monkeypatch.setattr(scaling, "_measured", lambda *_: Point(*[1.0] * 7))
+    monkeypatch.setattr(scaling, "_draw", lambda *_: None)
+    found = benchmark_scaling(config)
+    assert "table" not in found
+    assert found["rays"] == 0.0
+    with pytest.raises(InputError, match="nothing to change along table"):
+        benchmark_scaling(OmegaConf.merge(config, {"scaling": ["rays", "table"]}))
+
+
+def test_a_point_is_measured(config, monkeypatch):
+    monkeypatch.setattr(scaling_point, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(scaling_point, "WINDOWS", 2)
+    point = Point(*_numbers(config))
+    assert 0 < point.batch_seconds < point.step_seconds < 30
+    assert 0 <= point.gigabytes < 8
+    assert min(point.processor_seconds, point.reading_seconds, point.again_seconds, point.setup_seconds) > 0
 
 
 def test_what_cannot_be_built_is_told_by_the_process_that_measures(config, tmp_path):
@@ -104,13 +116,13 @@ def test_a_generated_capture_replaces_the_scene(config, tmp_path, monkeypatch):
 
     def measure(chosen, processes):
         asked.append((chosen, processes))
-        return Point(1.0, 1.0, 1.0, 1.0)
+        return Point(*[1.0] * 7)
 
     monkeypatch.setattr(scaling, "measure_point", measure)
     scaling._measured(config, Case(5, {}, photographs=(5, 16)), tmp_path)
     scaling._measured(config, Case(2, {"trainer.num_threads": 1}, processes=2), tmp_path)
     assert asked[0][0].scene.root == str(tmp_path / "5x16")
-    assert asked[0][0].scene.cache_dir.startswith(str(tmp_path))  # nothing of it stays in the user's cache
+    assert asked[0][0].scene.cache_dir.startswith(str(tmp_path))  # nothing is left in the user's folder
     assert asked[1][0].trainer.num_threads == 1
     assert asked[1][1] == 2
     assert asked[1][0].scene._target_ == config.scene._target_

@@ -29,6 +29,10 @@ GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
 KEEP_ABOVE = 127
 MaskColor = Literal["white", "black"]
+PIXELS_AT_ONCE = 1 << 16
+"""That are shrunk together: what is computed of them stays in the cache."""
+MOST_IN_32_BITS = (2**32 - 1) // (255 * (2 * 255 + 1))
+"""Pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
 JPEG_BLOCK = 64
 """Pixels of a block."""
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
@@ -165,15 +169,28 @@ def area_downscale(
     if factor == 1:
         return rgba
     height, width = rgba.shape[0] // factor, rgba.shape[1] // factor
+    small = np.empty((height, width, 4), dtype=np.uint8)
+    rows = max(1, PIXELS_AT_ONCE // (width * factor**2))
+    for top in range(0, height, rows):
+        small[top : top + rows] = _block_means(rgba[top * factor : (top + rows) * factor], factor)
+    return small
+
+
+def _block_means(rgba: UInt8[np.ndarray, "height width 4"], factor: int) -> UInt8[np.ndarray, "h w 4"]:
+    height, width, area = rgba.shape[0] // factor, rgba.shape[1] // factor, factor**2
     blocks = rgba.reshape(height, factor, width, factor, 4)
-    total = np.zeros((height, width, 4), dtype=np.uint64)
     # One pixel of each block at a time keeps the temporaries at the size of the small picture.
-    for row in range(factor):
-        for column in range(factor):
-            part = blocks[:, row, :, column].astype(np.uint32)
-            total[..., :3] += part[..., :3] * part[..., 3:]
-            total[..., 3] += part[..., 3]
-    weight, area = total[..., 3:], factor * factor
+    parts = (blocks[:, row, :, column] for row in range(factor) for column in range(factor))
+    total = np.zeros((height, width, 4), dtype=np.uint32 if area <= MOST_IN_32_BITS else np.uint64)
+    if (rgba[..., 3] == 255).all():  # all weights are alike: the same means with a fraction of the work
+        for part in parts:
+            total += part
+        return ((2 * total + area) // (2 * area)).astype(np.uint8)
+    for part in parts:
+        alpha = part[..., 3:].astype(np.uint32)
+        total[..., :3] += part[..., :3] * alpha
+        total[..., 3:] += alpha
+    weight = total[..., 3:]
     small = np.empty((height, width, 4), dtype=np.uint8)
     small[..., :3] = (2 * total[..., :3] + weight) // np.maximum(2 * weight, 1)
     small[..., 3] = (2 * total[..., 3] + area) // (2 * area)

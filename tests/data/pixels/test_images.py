@@ -64,6 +64,21 @@ def test_transparent_neighbours_do_not_darken_an_edge():
     assert area_downscale(rgba, 2).tolist() == [[[200, 100, 50, 128]]]
 
 
+@pytest.mark.parametrize("alpha", ["opaque", "opaque above", "any"])
+def test_what_is_shrunk_in_parts_has_the_means_of_the_whole(monkeypatch, alpha):
+    rgba = np.random.default_rng(0).integers(0, 256, (21, 12, 4), dtype=np.uint8)
+    if alpha != "any":
+        rgba[: 21 if alpha == "opaque" else 9, :, 3] = 255
+    monkeypatch.setattr(images, "PIXELS_AT_ONCE", 100)  # two rows of blocks, and then one that is left
+    assert np.array_equal(area_downscale(rgba, 3), slow_downscale(rgba, 3))
+
+
+def test_blocks_whose_sums_pass_32_bits_are_shrunk_exactly():
+    rgba = np.full((200, 200, 4), 255, dtype=np.uint8)
+    rgba[0, 0, 3] = 254  # not opaque: sums of 200 * 200 * 255 * 255, doubled, are more than 2^32
+    assert area_downscale(rgba, 200).tolist() == [[[255, 255, 255, 255]]]
+
+
 def test_colour_is_zero_where_alpha_is():
     rgba = np.full((2, 2, 4), [90, 80, 70, 0], dtype=np.uint8)
     rgba[0, 0, 3] = 1
