@@ -107,7 +107,7 @@ def known() -> dict[str, Any]:
     depth = 2 + torch.rand(RAYS, generator=drawn)
     quaternions = nn.functional.normalize(torch.randn(4, 4, generator=drawn), dim=-1)
     return {
-        "scene": scene, "cameras": scene.cameras, "c2w": scene.cameras.c2w, "poses": scene.cameras.c2w,
+        "scene": scene, "record": scene, "cameras": scene.cameras, "c2w": scene.cameras.c2w, "poses": scene.cameras.c2w,
         "view": 1, "width": scene.cameras.width // 2, "height": scene.cameras.height // 2, "per_side": 7,
         "pixels": all_pixels(scene.cameras, 1), "names": scene.view_names, "view_names": scene.view_names,
         "near": scene.near, "far": scene.far, "aabb": scene.aabb * 1.1, "to_user": to_user, "up": to_user[:3, 2] / 1.7,

@@ -29,5 +29,5 @@ def rays_of_views(scene, views, every=7, **changes):
         pixels = all_pixels(scene.cameras, view).map(lambda picture: picture.flatten()[::every])
         rays = rays_through_pixels(scene.cameras, pixels, scene.near, scene.far)
         parts.append(replace(rays, photograph=pixels.view))
-    names = ("origins", "directions", "near", "far", "view_directions", "photograph")
+    names = ("origins", "directions", "near", "far", "view_directions", "photograph", "pixel_side")
     return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, **changes)
