@@ -93,6 +93,7 @@ def test_a_point_is_measured(config, monkeypatch):
     assert min(point.processor_seconds, point.reading_seconds, point.again_seconds, point.setup_seconds) > 0
 
 
+@pytest.mark.exhaustive
 def test_what_cannot_be_built_is_told_by_the_process_that_measures(config, tmp_path):
     config.scene = {"_target_": "nerf_lightning.data.readers.transforms.TransformsReader", "root": str(tmp_path)}
     with pytest.raises(InputError, match=r"transforms\.json"):
