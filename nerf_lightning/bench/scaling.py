@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 COUNTS, SIDES = (8, 32, 128), (64, 128, 256, 512)
 """Photographs, and pixels along their sides, of generated captures; the one varies at SIDE, the other at COUNT."""
 COUNT, SIDE = 16, 128
-TILE_POINTS = 1 << 14
+TILE_POINTS = 1 << 16
 
 
 @dataclass(frozen=True)
