@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -66,17 +67,16 @@ def to_bits(switches: Bool[Tensor, "n"]) -> UInt8[Tensor, "bytes"]:
     >>> to_bits(torch.tensor([True, False, True, False, False, False, False, False, True])).tolist()
     [5, 1]
     """
-    padded = torch.nn.functional.pad(switches.to(torch.uint8), (0, -switches.numel() % 8)).view(-1, 8)
-    return (padded << torch.arange(8, dtype=torch.uint8)).sum(dim=1).to(torch.uint8)
+    return torch.from_numpy(np.packbits(switches.numpy(), bitorder="little"))
 
 
 def from_bits(bits: UInt8[Tensor, "bytes"], count: int) -> Bool[Tensor, "count"]:
     """Return the first switches that bytes hold."""
-    return ((bits[:, None] >> torch.arange(8, dtype=torch.uint8)) & 1).flatten()[:count].bool()
+    return torch.from_numpy(np.unpackbits(bits.numpy(), count=count, bitorder="little")).bool()
 
 
 def packed_format() -> Record:
-    """Return what a checkpoint says of its packed weights; `require_possible` asks what no single key can answer."""
+    """Return what a checkpoint says of its packed weights; `unpacked` asks what no single key can answer."""
     name = Text(500, r"model\..+")
     shape = Many(Whole(1, 1 << 40), 8, least=1)
     number = Numbers(dtypes=tuple(TYPES.values()))

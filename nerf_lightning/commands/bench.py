@@ -1,5 +1,7 @@
 """Measure training and rendering speed against plain float32 and against the machine's own matrix rate."""
 
+import math
+
 from omegaconf import DictConfig
 
 
@@ -9,7 +11,7 @@ def run(config: DictConfig) -> float:
         from nerf_lightning.bench.scaling import benchmark_scaling
 
         # An axis of one size, as threads on one core, has none.
-        return max((k for k in benchmark_scaling(config).values() if k == k), default=float("nan"))
+        return max((k for k in benchmark_scaling(config).values() if not math.isnan(k)), default=math.nan)
     from nerf_lightning.bench.benchmark import benchmark
 
     return benchmark(config)

@@ -7,22 +7,23 @@ that the models render from (`source_views.choose_sources`).
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from statistics import fmean
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.evaluation.metrics import image_metrics
-from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.photographs import photographs_of
-from nerf_lightning.nerf.models.view_transformer.projection import project_samples, seen_cosines
-from nerf_lightning.nerf.models.view_transformer.source_views import choose_sources
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.view_transformer.projection import project_samples
+from nerf_lightning.nerf.models.view_transformer.source_views import choose_sources, squared_distances
 from nerf_lightning.nerf.models.view_transformer.view_tables import ViewTables
 from nerf_lightning.nerf.rendering.blending import photograph
-from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import Background, Scene
 
@@ -45,25 +46,31 @@ class NearestViews:
     background: Background
     count: int
 
+    @cached_property
+    def tables(self) -> ViewTables:
+        """The colours of the photographs."""
+        return ViewTables(replace(photographs_of(self.scene, self.scene.sources), background=self.background))
+
+    @cached_property
+    def rays_of(self) -> RayGenerator:
+        """The rays of the scene's views, which say what they belong to."""
+        scene = self.scene
+        return RayGenerator(scene.cameras, scene.near, scene.far, capture_of=scene.capture_of, names_photographs=True)
+
     def pictures(self, view: int) -> dict[str, Float[Tensor, "height width 3"]]:
         """Return what is shown in the place of a view, for each of `KINDS`."""
-        scene = self.scene
-        photographs = replace(photographs_of(scene, scene.sources), background=self.background)
-        pixels = all_pixels(scene.cameras, view)
-        rays = rays_through_pixels(scene.cameras, pixels, scene.near, scene.far)
-        rays = replace(rays, photograph=pixels.view)
-        if scene.capture_of is not None:
-            rays = replace(rays, capture=torch.full_like(pixels.view, scene.capture_of[view]))
-        shape, rays = pixels.x.shape, rays.map(lambda of_picture: of_picture.flatten(0, 1))
+        photographs = self.tables.photographs
+        pixels = all_pixels(self.scene.cameras, view)
+        shape, rays = pixels.x.shape, self.rays_of(pixels).map(lambda of_picture: of_picture.flatten(0, 1))
         # The nearest is the first of one; more come from nearest to farthest.
         sources = choose_sources(photographs, rays, self.count, None)
         places = sources.places[sources.target]
         at = torch.stack([pixels.x, pixels.y], dim=-1).flatten(0, 1) + 0.5
-        as_is = self._colors(photographs, places, at[:, None].expand(-1, places.shape[1], -1))
-        t = self._to_plane(photographs, rays, view)
-        seen = project_samples(photographs.cameras, seen_cosines(photographs.cameras), places, rays, t[:, None])
-        on_plane = self._colors(photographs, places, seen.at[:, 0])
-        weights = self._weights(photographs, rays, places) * sources.given[sources.target]
+        as_is = self._colors(places, at[:, None].expand(-1, places.shape[1], -1))
+        t = self._to_plane(rays, view)
+        seen = project_samples(photographs.cameras, self.tables.least_cosine, places, rays, t[:, None])
+        on_plane = self._colors(places, seen.at[:, 0])
+        weights = self._weights(rays, places) * sources.given[sources.target]
         everywhere, there = torch.ones_like(seen.visible[:, 0]), seen.visible[:, 0]
         found = (
             _blended(as_is, weights, everywhere, first=True),
@@ -73,28 +80,23 @@ class NearestViews:
         )
         return {kind: picture.view(*shape, 3) for kind, picture in zip(KINDS, found, strict=True)}
 
-    def _colors(
-        self, photographs: Photographs, places: Tensor, at: Float[Tensor, "rays sources 2"]
-    ) -> Float[Tensor, "rays sources 3"]:
+    def _colors(self, places: Tensor, at: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
         used, numbered = torch.unique(places, return_inverse=True)
-        return ViewTables(photographs).colors(used.tolist(), at.device).look_up(numbered, at)
+        return self.tables.colors(used.tolist(), at.device).look_up(numbered, at)
 
-    def _to_plane(self, photographs: Photographs, rays: RayBundle, view: int) -> Float[Tensor, "rays"]:
-        capture = 0 if self.scene.capture_of is None else self.scene.capture_of[view]
+    def _to_plane(self, rays: RayBundle, view: int) -> Float[Tensor, "rays"]:
         axis = -self.scene.cameras.c2w[view, :, 2]
-        ahead = ((photographs.middle[capture] - rays.origins) * axis).sum(dim=-1)
+        ahead = ((self.tables.photographs.middle[_capture(rays)] - rays.origins) * axis).sum(dim=-1)
         cosine = (rays.directions * axis).sum(dim=-1).clamp(min=1e-6)
         return (ahead / cosine).clamp(min=1e-6)
 
-    def _weights(self, photographs: Photographs, rays: RayBundle, places: Tensor) -> Float[Tensor, "rays sources"]:
-        # By what photographs are chosen by: direction from the middle where cameras stand around it, else distance.
-        capture, eyes = photographs.capture[places], photographs.cameras.c2w[places, :, 3]
-        middle, around = photographs.middle[capture], photographs.around[capture]
-        turned = functional.normalize(rays.origins[:, None] - middle, dim=-1) - functional.normalize(
-            eyes - middle, dim=-1
-        )
-        apart = torch.where(around[..., None], turned, rays.origins[:, None] - eyes).square().sum(dim=-1)
+    def _weights(self, rays: RayBundle, places: Tensor) -> Float[Tensor, "rays sources"]:
+        apart = squared_distances(self.tables.photographs, _capture(rays), rays.origins, places)
         return 1.0 / (apart / apart.amin(dim=1, keepdim=True).clamp(min=1e-12) + SHARPNESS)
+
+
+def _capture(rays: RayBundle) -> Int[Tensor, "rays"]:
+    return torch.zeros_like(rays.near, dtype=torch.int64) if rays.capture is None else rays.capture
 
 
 def _blended(

@@ -3,7 +3,7 @@
 import io
 import shutil
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -92,3 +92,19 @@ def press(driver, by: str, what: str, seconds: float = 40.0) -> None:
             return
         assert time.monotonic() < end, f"{what} cannot be clicked"
         time.sleep(0.1)
+
+
+def unfold(driver, title: str, inside: str, seconds: float = 60.0) -> None:
+    """Open a folder of the panel, until what is in it (an XPath) shows: a click may fall while the page still moves."""
+    from selenium.common.exceptions import WebDriverException
+
+    end = time.monotonic() + seconds
+    while True:
+        press(driver, "xpath", f"//*[normalize-space(text())='{title}']")
+        shown_by = time.monotonic() + 6.0
+        while time.monotonic() < shown_by:
+            with suppress(WebDriverException):  # an element may go while it is asked
+                if any(element.is_displayed() for element in driver.find_elements("xpath", inside)):
+                    return
+            time.sleep(0.1)
+        assert time.monotonic() < end, f"{title} does not open"

@@ -3,12 +3,13 @@
 import time
 
 import pytest
-from support.browser import opened, press, wait_until
+from support.browser import opened, press, unfold, wait_until
 from support.served_page import served
 
 pytestmark = pytest.mark.slow
 
 NAME = '<iframe srcdoc="<script>parent.document.title=1</script>"></iframe>'
+PHOTOGRAPH = "//img[@class='nerf-photograph']"
 # What markup of a stranger would do, had it got in all the same.
 GOT_IN = """
 const frame = document.createElement("div");
@@ -50,8 +51,8 @@ def test_the_page_works_behind_its_policy_and_a_strangers_name_is_text(page):
         wait_until(browser, lambda picture: picture.std() > 5)
         assert complaints_of(browser) == []
         title = browser.title
-        press(browser, "xpath", "//*[text()='Photographs']")
-        press(browser, "xpath", "(//img[@class='nerf-photograph'])[1]")
+        unfold(browser, "Photographs", PHOTOGRAPH)
+        press(browser, "xpath", f"({PHOTOGRAPH})[1]")
         wait(lambda: NAME in browser.find_element("css selector", "body").text)
         assert browser.find_elements("css selector", "iframe") == []
         assert browser.title == title

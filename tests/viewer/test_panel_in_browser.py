@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from PIL import Image
-from support.browser import drag, opened, press
+from support.browser import drag, opened, press, unfold
 from support.known_fields import ball, solid
 from support.scenes import ball_scene
 from support.served_page import served
@@ -83,14 +83,14 @@ def test_a_person_makes_a_path_plays_it_films_it_and_chooses_a_photograph(tmp_pa
         assert math.tan(math.radians(shown) / 2) * width / height == pytest.approx(math.tan(PHOTOGRAPH / 2), rel=0.03)
 
         # The box's edges behind the ball are hidden, others are not.
-        button(browser, "Crop box")
+        unfold(browser, "Crop box", "//*[contains(text(), 'Show only')]")
         press(browser, "xpath", "//*[contains(text(), 'Show only')]/following::input[@type='checkbox'][1]")
         wait(lambda: any(map(is_blue, near(browser, (1.0, -0.9, 1.0)))))
         wait(lambda: not any(map(is_blue, near(browser, (-1.0, -0.55, -1.0)))))
         press(browser, "xpath", "//*[contains(text(), 'Show only')]/following::input[@type='checkbox'][1]")
         button(browser, "Crop box")
 
-        button(browser, "Camera path")
+        unfold(browser, "Camera path", "//*[text()='Add keyframe']")
         for _ in range(2):
             button(browser, "Add keyframe")
             wait(lambda: "keyframe" in text(browser))
@@ -103,14 +103,14 @@ def test_a_person_makes_a_path_plays_it_films_it_and_chooses_a_photograph(tmp_pa
         wait(lambda: "path.file=" in text(browser))
         button(browser, "Camera path")
 
-        button(browser, "Film")
+        unfold(browser, "Film", "//*[text()='Render film']")
         button(browser, "Render film")
         wait(lambda: "Frame " in text(browser))
         button(browser, "Stop the film")
         wait(lambda: "The film was stopped." in text(browser))
         button(browser, "Film")
 
-        button(browser, "Photographs")
+        unfold(browser, "Photographs", "//img[@class='nerf-photograph']")
         press(browser, "css selector", "img.nerf-photograph")
         wait(lambda: "Through the camera of" in text(browser))
         across = {each.rect["y"] for each in browser.find_elements("css selector", "img.nerf-photograph")}

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.packed.integrate import num_visible
-from nerf_lightning.nerf.kernels.render.render import can_render_whole, render_whole
+from nerf_lightning.nerf.kernels.render.whole_rays import whole_rays
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
@@ -135,8 +135,9 @@ class PackedLevel(Level):
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         walk = self.sampler.walk(rays)
         march, parts = walk.march(), self.field.parts()
-        if march is not None and parts is not None and can_render_whole(parts, self.field.products, rays.near.device):
-            rgb, opacity, depth = render_whole(rays, parts, *march, LEAST_ALPHA, self.sampler.opaque_below)
+        kernel = whole_rays(parts, self.field.products, rays.near.device)
+        if march is not None and kernel is not None:
+            rgb, opacity, depth = kernel.render(rays, parts, *march, LEAST_ALPHA, self.sampler.opaque_below)
             return _in_front_of(background, rays, rgb, 1.0 - opacity, depth)
         rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
         light = torch.ones_like(rays.near)  # what no sample has absorbed yet

@@ -48,7 +48,17 @@ def render(
     least_alpha: float,
     opaque_below: float,
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"]]:
-    """Return foreground, opacity, and the sum of w t; the arguments are those of `render_whole`."""
+    """Return, per ray, sum of w rgb, sum of w, and sum of w t, in the letters of `rendering.quadrature`.
+
+    Args:
+        rays: unit directions, scene units.
+        field: what is asked about the samples.
+        state: where each ray's march begins.
+        lattice: the intervals (`kernels.march`).
+        grid: which of them are asked about.
+        least_alpha: less opaque samples count with their density and without their colour.
+        opaque_below: a ray ends where less light than this is left.
+    """
     count = rays.near.shape[0]
     out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
     march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)

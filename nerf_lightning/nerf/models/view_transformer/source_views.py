@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
@@ -79,6 +80,27 @@ def choose_sources(photographs: Photographs, rays: RayBundle, count: int, random
     return SourceViews(places[:, :count], known[:, :count], targets.of_ray)
 
 
+def squared_distances(
+    photographs: Photographs,
+    capture: Int[Tensor, "targets"],
+    eye: Float[Tensor, "targets 3"],
+    places: Int[Tensor, "#targets views"],
+) -> Float[Tensor, "targets views"]:
+    """Return how far photographs are from targets, as the nearest are chosen: of directions where cameras stand around.
+
+    Args:
+        photographs: of all captures.
+        capture: that each target belongs to.
+        eye: where it is seen from.
+        places: which photographs are asked about; of its own capture.
+    """
+    eyes, middle = photographs.cameras.c2w[places, :, 3], photographs.middle[capture][:, None]
+    # Not by the cosine, which hardly changes where directions all but agree.
+    turned = functional.normalize(eye[:, None] - middle, dim=-1) - functional.normalize(eyes - middle, dim=-1)
+    apart = torch.where(photographs.around[capture][:, None, None], turned, eye[:, None] - eyes)
+    return apart.square().sum(dim=-1)
+
+
 def _targets(rays: RayBundle) -> _Targets:
     # Origins are told apart by their bits, as the whole numbers beside them.
     none = torch.zeros_like(rays.near, dtype=torch.int64)
@@ -93,13 +115,8 @@ def _targets(rays: RayBundle) -> _Targets:
 
 def _distances(photographs: Photographs, targets: _Targets) -> Float[Tensor, "targets views"]:
     # Infinite where a photograph is the target itself, or of another capture.
-    eyes = photographs.cameras.c2w[:, :, 3]
-    from_middle = torch.nn.functional.normalize(eyes - photographs.middle[photographs.capture], dim=-1)
-    direction = torch.nn.functional.normalize(targets.eye - photographs.middle[targets.capture], dim=-1)
-    # Not by the cosine, which hardly changes where directions all but agree.
-    turned = (direction[:, None] - from_middle).square().sum(dim=-1)
-    apart = (targets.eye[:, None] - eyes).square().sum(dim=-1)
-    distance = torch.where(photographs.around[targets.capture][:, None], turned, apart)
+    places = torch.arange(len(photographs.capture), device=targets.eye.device)
+    distance = squared_distances(photographs, targets.capture, targets.eye, places[None])
     other = photographs.capture != targets.capture[:, None]
     itself = photographs.numbers == targets.photograph[:, None]
     return distance.masked_fill(other | itself, torch.inf)
