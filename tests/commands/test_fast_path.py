@@ -77,13 +77,14 @@ def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, 
 
 @pytest.mark.slow
 def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
-    long = ("trainer.max_steps=1000000", "budget.seconds=2", "scheduler.decay_rate=0.01")
+    long = ("trainer.max_steps=1000000", "budget.seconds=2", "scheduler.cooldown=1.0")
     code, output = finished(start(*arguments(capture, tmp_path / "run", *long)))
     assert code == 0, output
     content = saved(tmp_path / "run")
     assert 10 < content["global_step"] < 100_000
     rate = content["optimizer_states"][0]["param_groups"][0]
-    assert rate["lr"] / rate["base_lr"] < 0.02  # the schedule has come to its end
+    # The schedule has come to its end, of which a busy machine has few steps.
+    assert rate["lr"] / rate["base_lr"] < 0.02 + 3 / content["global_step"]
     used = [state["used"] for state in content["callbacks"].values() if "used" in state]
     assert used
     assert used[0] >= 1.5

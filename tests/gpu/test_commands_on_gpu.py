@@ -90,8 +90,8 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(ball, trainer, device, tmp_p
     assert states[0]["nerf_lightning"]["progress"] == states[1]["nerf_lightning"]["progress"]
     name = "model.levels.fine.field.position_encoder.table"
     ours, theirs = (state["state_dict"][name] for state in states)
-    # GPUs add in any order, and Adam makes whole steps (0.03) of rounding where gradients are all but zero.
-    assert float(((ours - theirs).abs() > 0.03).double().mean()) <= (0.1 if device.type == "cuda" else 0.0)
+    # GPUs add in any order, and Adam makes whole steps (0.02) of rounding where gradients are all but zero.
+    assert float(((ours - theirs).abs() > 0.02).double().mean()) <= (0.1 if device.type == "cuda" else 0.0)
 
 
 def test_a_checkpoint_of_the_gpu_is_read_on_the_cpu_and_scores_the_same(trained, trainer, ball, tmp_path):
