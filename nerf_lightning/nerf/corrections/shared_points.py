@@ -24,9 +24,9 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 Look = Callable[[PixelIndex], tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels"]]]
 """Tells where the light of pixels comes from in the world, as the scene has been learnt, and their opacity."""
 
-PIXELS = 512
-"""Of each photograph, whose points are looked for in others."""
-OTHERS = 16
+POINTS = 65_536
+"""Pixels of all photographs together, whose points are looked for in others."""
+OTHERS = 32
 """Photographs in which each point is looked for, about."""
 OPAQUE = 0.95
 LEAST_COSINE = 0.5
@@ -37,10 +37,12 @@ CLIPPED = 0.97
 """Encoded colour from which on a photograph may have been brighter than it shows."""
 DARK = 2.0**-12
 """Linear light that any channel is taken to have at least."""
-LEAST_LIGHT = -5.0
+LEAST_LIGHT = -4.5
 """Stops below white, once the gains are undone: a channel that is darker mostly shows what the surface mirrors."""
-NARROW = 0.25
-"""A pair counts half whose error is this share of the median error."""
+NARROW = 0.1
+"""A pair counts half whose error is this share of the median error,"""
+LEAST_ERROR = 0.02
+"""or, in stops, what eight bits leave open."""
 ROUNDS = 30
 PRIOR = 1e-2
 """Weight of the stops as they were, against 1 of a pair: it holds photographs that share nothing."""
@@ -69,7 +71,7 @@ def shared_points(scene: Scene, cameras: Cameras, look: Look, key: int) -> Pairs
         key: of the random numbers that choose the pixels.
     """
     trained = torch.tensor(scene.splits["train"])
-    view = trained.repeat_interleave(PIXELS)
+    view = trained.repeat_interleave(-(-POINTS // len(trained)))
     across, down = batch_random(fold(key, "shared"), len(view)).uniform("pixel", 2).unbind(dim=1)
     size = scene.pixels.width[view], scene.pixels.height[view]
     pixels = PixelIndex(view, (across * size[0]).long(), (down * size[1]).long())
@@ -144,7 +146,7 @@ def solved_stops(pairs: Pairs, stops: Float[Tensor, "views 3"]) -> Float[Tensor,
         counts = pairs.whole & (neutral > LEAST_LIGHT)
         if not bool(counts.any()):
             return stops
-        scale = NARROW * error[counts].median().clamp(min=1e-6)
+        scale = (NARROW * error[counts].median()).clamp(min=LEAST_ERROR)
         weight = counts / (1.0 + (error / scale).square())
         found = torch.stack(
             [_least_squares(one, other, ratio[:, c], weight[:, c], found[:, c]) for c in range(3)], dim=1
