@@ -40,10 +40,11 @@ DARK = 2.0**-12
 LEAST_LIGHT = -4.5
 """Stops below white, once the gains are undone: a channel that is darker mostly shows what the surface mirrors."""
 NARROW = 0.1
-"""A pair counts half whose error is this share of the median error,"""
+"""In the end a pair counts half whose error is this share of the median error,"""
 LEAST_ERROR = 0.02
 """or, in stops, what eight bits leave open."""
-ROUNDS = 30
+ROUNDS, NARROWING = 30, 0.8
+"""That share begins with 1 and falls by this factor a round, so that a poor beginning is left behind."""
 PRIOR = 1e-2
 """Weight of the stops as they were, against 1 of a pair: it holds photographs that share nothing."""
 
@@ -129,9 +130,9 @@ def solved_stops(pairs: Pairs, stops: Float[Tensor, "views 3"]) -> Float[Tensor,
     """Return the stops of red, green and blue that explain what pairs of photographs show.
 
     They minimise, for each channel, the sum over pairs of w (s_i - s_j - (l_i - l_j))^2 by iteratively reweighted least
-    squares, where w = 1 / (1 + (error / scale)^2) falls with the error of a pair (Cauchy). A channel counts where the
-    mean of both lights, its gains undone, is not dark: a bound on what each photograph shows by itself would keep the
-    noise that brightens the darker one. The mean of the stops stays as it is.
+    squares, where w = 1 / (1 + (error / scale)^2) falls with the error of a pair (Cauchy), and the scale from round to
+    round. A channel counts where the mean of both lights, its gains undone, is not dark: a bound on what each
+    photograph shows by itself would keep the noise that brightens the darker one. The mean of the stops stays as it is.
 
     Args:
         pairs: of photographs.
@@ -140,13 +141,14 @@ def solved_stops(pairs: Pairs, stops: Float[Tensor, "views 3"]) -> Float[Tensor,
     one, other = pairs.view.unbind(dim=1)
     light, found = pairs.light.double(), stops.double()
     ratio = light[:, 0] - light[:, 1]
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         error = (found[one] - found[other] - ratio).abs()
         neutral = (light.sum(dim=1) - found[one] - found[other]) / 2.0
         counts = pairs.whole & (neutral > LEAST_LIGHT)
         if not bool(counts.any()):
             return stops
-        scale = (NARROW * error[counts].median()).clamp(min=LEAST_ERROR)
+        share = max(NARROW, NARROWING**number)
+        scale = (share * error[counts].median()).clamp(min=LEAST_ERROR)
         weight = counts / (1.0 + (error / scale).square())
         found = torch.stack(
             [_least_squares(one, other, ratio[:, c], weight[:, c], found[:, c]) for c in range(3)], dim=1

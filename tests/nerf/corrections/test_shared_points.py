@@ -1,6 +1,7 @@
 """Exposures in closed form: pairs of pixels show one point, and what most of them say is found."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -14,6 +15,11 @@ from nerf_lightning.nerf.corrections.shared_points import Pairs, shared_points, 
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 
 VIEWS, SIZE = 32, 40
+
+
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch):
+    monkeypatch.setattr("nerf_lightning.nerf.corrections.shared_points.POINTS", 4096)
 
 
 def looking(scene):
@@ -123,7 +129,7 @@ def test_planted_exposures_of_a_ball_are_found(planted):
     exposure = (red + green + blue) / 3
     found = torch.stack([exposure, red - exposure, blue - exposure], dim=-1)[list(scene.splits["train"])]
     for ours, true in zip(found.T, stops.T, strict=True):
-        assert float(torch.corrcoef(torch.stack([ours, true]))[0, 1]) > 0.995
+        assert float(torch.corrcoef(torch.stack([ours, true]))[0, 1]) > 0.99
 
 
 def test_a_run_solves_after_equal_parts_and_holds_the_stops_in_between(planted, monkeypatch):
@@ -137,16 +143,16 @@ def test_a_run_solves_after_equal_parts_and_holds_the_stops_in_between(planted, 
     step.correction, step.num_steps = Exposure(solves=2), 9
     step.correction.fit_to(scene)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    optimizer, loader, seen = step.new_optimizer(), RayBatches(scene, step.progress, 0, 64), []
+    optimizer, loader, seen = step.new_optimizer(), RayBatches(scene, step.progress, 0, 16), []
     for _ in range(9):
         step(loader.at(0, step.progress.rays_seen), optimizer)
         seen.append(step.correction.stops.detach().clone())
-    changed = [not torch.equal(before, after) for before, after in zip(seen, seen[1:], strict=False)]
+    changed = [not torch.equal(before, after) for before, after in pairwise(seen)]
     assert changed == [True, True, True, False, False, True, False, False]
     assert int(step.correction.state_dict()["solved"]) == 2
     assert step.model.training
     found = seen[-1][list(scene.splits["train"])]
-    assert float(torch.corrcoef(torch.stack([found[:, 0], stops[:, 0]]))[0, 1]) > 0.995
+    assert float(torch.corrcoef(torch.stack([found[:, 0], stops[:, 0]]))[0, 1]) > 0.99
     assert float(found.mean(dim=0).abs().max()) < 1e-6
     step.restart(optimizer)
     assert int(step.correction.solved) == 0
