@@ -13,7 +13,7 @@ from nerf_lightning.nerf.kernels.backends import cpu_twin
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
 from nerf_lightning.nerf.types.scene import Scene
 
-WRONG_BY = math.radians(1.5)
+WRONG_BY = math.radians(1.0)
 """Cameras that are learnt may be turned by so much."""
 AGREEING = 3
 """So many of them must see through a cell."""
@@ -29,7 +29,7 @@ def possible_cells(
     nothing is carved.
 
     What is carved is gone for good, and cameras that are learnt may begin at a wrong place. They carve less: not within
-    1.5 degrees of what their photographs show, and what three of them agree on.
+    1 degree of what their photographs show, and what three of them agree on.
 
     Args:
         scene: cameras and pixels.
