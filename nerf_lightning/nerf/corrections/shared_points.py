@@ -24,12 +24,12 @@ from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 Look = Callable[[PixelIndex], tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels"]]]
 """Tells where the light of pixels comes from in the world, as the scene has been learnt, and their opacity."""
 
-POINTS = 65_536
+POINTS = 131_072
 """Pixels of all photographs together, whose points are looked for in others."""
 OTHERS = 32
 """Photographs in which each point is looked for, about."""
 OPAQUE = 0.95
-LEAST_COSINE = 0.5
+LEAST_COSINE = 0.75
 """Of the angle at a point between two cameras: from farther aside surfaces shine differently."""
 TOLERANCE = 0.02
 """How far what a pixel shows may lie from the point, as a share of its distance."""
@@ -37,7 +37,7 @@ CLIPPED = 0.97
 """Encoded colour from which on a photograph may have been brighter than it shows."""
 DARK = 2.0**-12
 """Linear light that any channel is taken to have at least."""
-LEAST_LIGHT = -4.5
+LEAST_LIGHT = -5.0
 """Stops below white, once the gains are undone: a channel that is darker mostly shows what the surface mirrors."""
 NARROW = 0.1
 """In the end a pair counts half whose error is this share of the median error,"""
