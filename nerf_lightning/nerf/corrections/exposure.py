@@ -14,8 +14,8 @@ from nerf_lightning.nerf.rendering.linear_light import scale_light
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
 
-ACCURACY = 0.04
-"""Of solutions, in stops: about how far they were off on bricks."""
+FAR = 0.08
+"""Stops, root mean square over photographs: on bricks, twice as much as solutions are off."""
 
 
 class Exposure(Correction):
@@ -26,8 +26,8 @@ class Exposure(Correction):
     Neighbouring cameras see the same surfaces, so that what they have in common is told from the scene only by way of
     others: gradients take thousands of steps for it, in which the model learns to shine differently to each side. So
     once there is a scene, the stops are also solved for, from the points that photographs share (`shared_points`).
-    Gradients find what sets single photographs apart better than that: of the way to the solution, s on average, the
-    share 1 - (a / s)^2 is gone, where a is how accurate solutions are (James and Stein, 1961).
+    Where the solution is far from what gradients have found, the stops are set to it, and stay so until the next;
+    where it is near (photographs that hardly differ), gradients are the more accurate, and go on.
 
     The light of all photographs can be scaled together, and the model's the other way: a penalty on the three means
     over the photographs that train holds them near zero, so that the neutral picture is exposed as the mean photograph.
@@ -40,8 +40,9 @@ class Exposure(Correction):
 
     trained: Tensor
     solved: Tensor
+    held: Tensor
 
-    def __init__(self, learning_rate: float = 1e-2, mean_weight: float = 1.0, solves: int = 2):
+    def __init__(self, learning_rate: float = 1e-2, mean_weight: float = 1.0, solves: int = 3):
         super().__init__()
         ranges = {"learning_rate": (1e-8, 1.0), "mean_weight": (0.0, 1e6), "solves": (0, 1000)}
         require_ranges(locals(), ranges)
@@ -52,6 +53,8 @@ class Exposure(Correction):
         self.register_buffer("trained", torch.zeros(1, dtype=torch.int64), persistent=False)
         self.register_buffer("solved", torch.tensor(0))
         """How often."""
+        self.register_buffer("held", torch.tensor(False))
+        self.is_held = False
 
     def fit_to(self, scene: Scene) -> None:
         """Make room for each photograph.
@@ -70,15 +73,15 @@ class Exposure(Correction):
 
     def gains(self) -> Float[Tensor, "views 3"]:
         """Return the factors on the linear light of red, green and blue in each photograph."""
-        return torch.exp2(_of_channels(self.stops))
+        return torch.exp2(_of_channels(self.stops.detach() if self.is_held else self.stops))
 
-    def penalty(self) -> Float[Tensor, ""]:
+    def penalty(self) -> Float[Tensor, ""] | None:
         """Return the sum of the squared means of exposure, red and blue over the photographs that train."""
-        return self.mean_weight * self.stops[self.trained].mean(dim=0).square().sum()
+        return None if self.is_held else self.mean_weight * self.stops[self.trained].mean(dim=0).square().sum()
 
     def follow(self, share: float, model: Model, rays_of: RayGenerator, tile_points: int, key: int) -> None:
         """Solve for the stops where it is time."""
-        due = int(share * (self.solves + 1))
+        due, self.is_held = int(share * (self.solves + 1)), bool(self.held)
         if self.scene is None or due <= int(self.solved):
             return
         was_training = model.training
@@ -88,24 +91,28 @@ class Exposure(Correction):
             return surface_points(model, rays_of, pixels, tile_points)
 
         with torch.no_grad():
-            self._approach(shared_points(self.scene, rays_of.cameras.to("cpu"), look, key))
+            self._solve(shared_points(self.scene, rays_of.cameras.to("cpu"), look, key))
         model.train(was_training)
         self.solved.fill_(due)
 
-    def _approach(self, pairs: Pairs) -> None:
-        """Go towards the solution, as far as it is surely better."""
+    def _solve(self, pairs: Pairs) -> None:
+        """Set the stops to the solution, and hold them there, unless it is near."""
         before, trained = self.stops.cpu(), self.trained.cpu()
         red, green, blue = solved_stops(pairs, _of_channels(before)).unbind(-1)
         exposure = (red + green + blue) / 3.0
         way = (torch.stack([exposure, red - exposure, blue - exposure], dim=-1) - before)[trained]
         way -= way.mean(dim=0)
-        size = way.square().mean(dim=0).clamp(min=ACCURACY**2)
-        self.stops[self.trained] += ((1.0 - ACCURACY**2 / size) * way).to(self.stops)
+        if self.is_held or bool((way.square().mean(dim=0).sqrt() > FAR).any()):
+            self.stops[self.trained] += way.to(self.stops)
+            self.held.fill_(True)
+            self.is_held = True
 
     def reset_parameters(self) -> None:
         """Begin with photographs that are all alike."""
         nn.init.zeros_(self.stops)
         self.solved.zero_()
+        self.held.zero_()
+        self.is_held = False
 
 
 def _of_channels(stops: Float[Tensor, "views 3"]) -> Float[Tensor, "views 3"]:

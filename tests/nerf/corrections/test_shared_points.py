@@ -10,7 +10,7 @@ from support.scenes import BALL_RADIUS, ball_scene
 from support.steps import make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.corrections.exposure import ACCURACY, Exposure
+from nerf_lightning.nerf.corrections.exposure import FAR, Exposure
 from nerf_lightning.nerf.corrections.shared_points import Pairs, shared_points, solved_stops
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 
@@ -92,7 +92,7 @@ def test_pairs_show_one_point_in_both_photographs():
     assert bool((pairs.view[:, 0] != pairs.view[:, 1]).all())
     assert set(pairs.view.flatten().tolist()) <= set(scene.splits["train"])
     shown = torch.exp2(pairs.light)
-    assert float((shown[:, 0] - shown[:, 1]).abs().mean()) < 0.03
+    assert float((shown[:, 0] - shown[:, 1]).abs().max()) < 0.25
     other = shared_points(scene, scene.cameras, looking(scene), key=4)
     assert other.view.shape != pairs.view.shape or not torch.equal(other.view, pairs.view)
 
@@ -159,36 +159,34 @@ def stops_after_each(step, optimizer, loader, count):
     return seen
 
 
-def test_a_run_goes_to_the_solution_after_equal_parts(planted, new_step):
+def test_a_run_solves_after_equal_parts_and_holds_the_stops_in_between(planted, new_step):
     scene, stops = planted
     step, optimizer, loader = new_step()
-    seen = [each[list(scene.splits["train"])] for each in stops_after_each(step, optimizer, loader, 9)]
-    moved = [float((after - before).abs().max()) for before, after in pairwise(seen)]
-    # Adam's steps of 0.01, and before the fourth step that way; when it is time again, there is none left to go.
-    assert moved[2] > 0.5
-    assert max(moved[:2] + moved[3:]) < 0.02
+    seen = stops_after_each(step, optimizer, loader, 9)
+    changed = [not torch.equal(before, after) for before, after in pairwise(seen)]
+    assert changed == [True, True, True, False, False, True, False, False]
     assert step.model.training
-    assert float(torch.corrcoef(torch.stack([seen[3][:, 0], stops[:, 0]]))[0, 1]) > 0.99
-    assert int(step.correction.solved) == 2
+    found = seen[-1][list(scene.splits["train"])]
+    assert float(torch.corrcoef(torch.stack([found[:, 0], stops[:, 0]]))[0, 1]) > 0.99
+    assert float(found.mean(dim=0).abs().max()) < 0.02
     step.restart(optimizer)
-    assert int(step.correction.solved) == 0
+    assert (int(step.correction.solved), bool(step.correction.held), step.correction.is_held) == (0, False, False)
 
 
-def test_a_way_no_longer_than_solutions_are_accurate_is_not_gone():
+@pytest.mark.parametrize(("size", "taken"), [(0.5 * FAR, False), (2.0 * FAR, True)])
+def test_a_solution_that_is_near_leaves_the_stops_to_gradients(size, taken):
     scene = ball_scene(VIEWS, SIZE)
     correction, trained = Exposure(), list(scene.splits["train"])
     correction.fit_to(scene)
-    for size, share in ((0.5 * ACCURACY, 0.0), (2.0 * ACCURACY, 0.75)):
-        goal = torch.randn(VIEWS, 3, generator=torch.Generator().manual_seed(1))
-        goal -= goal[trained].mean(dim=0)
-        goal[:, 1:] = 0.0
-        goal *= size / goal[trained, 0].square().mean().sqrt()
-        pairs = made_pairs(goal[:, :1].expand(-1, 3))[0]
-        pairs = pairs[(pairs.view < len(trained)).all(dim=1)]
-        correction.reset_parameters()
-        with torch.no_grad():
-            correction._approach(pairs)
-        torch.testing.assert_close(correction.stops[trained], share * goal[trained], atol=2e-3, rtol=0)
+    goal = torch.randn(VIEWS, 1, generator=torch.Generator().manual_seed(1))
+    goal -= goal[trained].mean()
+    goal *= size / goal[trained].square().mean().sqrt()
+    pairs = made_pairs(goal.expand(-1, 3))[0]
+    with torch.no_grad():
+        correction._solve(pairs[(pairs.view < len(trained)).all(dim=1)])
+    torch.testing.assert_close(correction.stops[trained, :1], taken * goal[trained], atol=2e-3, rtol=0)
+    assert correction.is_held == bool(correction.held) == taken
+    assert (correction.penalty() is None) == taken
 
 
 def test_a_resumed_run_solves_when_one_that_never_stopped_would(new_step):

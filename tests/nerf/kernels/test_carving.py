@@ -1,5 +1,6 @@
 """Carving: what it keeps, and the compiled twin against its reference."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ from support.scenes import BALL_RADIUS, LENSES, ball_scene
 from support.wrong_cameras import with_noise
 
 from nerf_lightning.nerf.geometry.footprints import footprint
+from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.carving import cpu as carving_cpu
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
@@ -129,7 +131,11 @@ def test_cameras_that_are_learnt_carve_with_a_margin():
     scene = replace(ball_scene(num_views=48, size=80), refined=True)
     centers, half_diagonal = cells(scene)
     inside = centers.norm(dim=-1) < BALL_RADIUS + half_diagonal
-    for wrong in (with_noise(scene, degrees=1.0, share=0.01), with_noise(scene, 30.0, 0.0, views=[3, 9])):
+    turned = scene.cameras.c2w.clone()
+    turned[:, :, :3] = turned[:, :, :3] @ rotation_from_vector(torch.tensor([0.0, math.radians(0.9), 0.0]))
+    all_alike = replace(scene, cameras=replace(scene.cameras, c2w=turned))
+    noisy, two = with_noise(scene, degrees=1.0, share=0.01), with_noise(scene, 30.0, 0.0, views=[3, 9])
+    for wrong in (all_alike, noisy, two):
         possible = possible_cells(wrong, centers, half_diagonal)
         assert bool(possible[inside].all())
         assert float((~possible).float().mean()) > 0.05
