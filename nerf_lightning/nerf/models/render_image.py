@@ -91,6 +91,7 @@ def surface_points(
         pixels: any pixels of any views.
         tile_points: most points that go through a field at once.
     """
+    pixels = pixels.to(rays_of.near.device)
     rays = rays_of(pixels).to("cpu")
     _, depth, opacity, *_ = render_rays(model, rays, "black", tile_points)
     if rays_of.cameras.ndc is None:

@@ -129,7 +129,7 @@ def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
 def test_cameras_that_are_learnt_carve_with_a_margin():
     """From places that are wrong by a degree, too, nothing of the content; two that are far off carve nothing alone."""
     scene = replace(ball_scene(num_views=48, size=80), refined=True)
-    centers, half_diagonal = cells(scene)
+    centers, half_diagonal = cells(scene, resolution=48)
     inside = centers.norm(dim=-1) < BALL_RADIUS + half_diagonal
     turned = scene.cameras.c2w.clone()
     turned[:, :, :3] = turned[:, :, :3] @ rotation_from_vector(torch.tensor([0.0, math.radians(0.9), 0.0]))
