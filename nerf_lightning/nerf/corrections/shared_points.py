@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import cosine_similarity
 
 from nerf_lightning.nerf.geometry.cameras import seen_at
 from nerf_lightning.nerf.products import own_precision
@@ -81,8 +82,8 @@ def shared_points(scene: Scene, cameras: Cameras, look: Look, key: int) -> Pairs
     solid = opacity > OPAQUE
     pixels, points = pixels[solid], points[solid]
     found = [_seen_by(scene, cameras, int(other), pixels, points, key) for other in trained]
-    row, there = torch.cat([row for row, _ in found]), [there for _, there in found]
-    others = PixelIndex(*(torch.cat([getattr(each, name) for each in there]) for name in ("view", "x", "y")))
+    row = torch.cat([rows for rows, _ in found])
+    others = PixelIndex(*(torch.cat([getattr(each, name) for _, each in found]) for name in ("view", "x", "y")))
     seen, opacity = look(others)
     distance = (points[row] - cameras.c2w[others.view][:, :, 3]).norm(dim=1)
     agree = (opacity > OPAQUE) & ((seen - points[row]).norm(dim=1) < TOLERANCE * distance)
@@ -101,13 +102,13 @@ def _seen_by(
     if scene.capture_of is not None:
         capture = torch.tensor(scene.capture_of)
         chosen &= capture[pixels.view] == capture[other]
-    here, there = (cameras.c2w[view][..., 3] - points for view in (pixels.view, other))
-    cosine = torch.nn.functional.cosine_similarity(here, there, dim=1)
-    inside, x, y = seen_at(cameras, other, points)
-    row = (chosen & inside & (cosine > LEAST_COSINE)).nonzero()[:, 0]
-    there = PixelIndex(torch.full_like(row, other), x[row], y[row])
-    solid = _is_solid(scene, there)
-    return row[solid], there[solid]
+    row = chosen.nonzero()[:, 0]
+    one, two = (cameras.c2w[view][..., 3] - points[row] for view in (pixels.view[row], other))
+    inside, x, y = seen_at(cameras, other, points[row])
+    near = inside & (cosine_similarity(one, two, dim=1) > LEAST_COSINE)
+    places = PixelIndex(torch.full_like(row, other), x, y)[near]
+    solid = _is_solid(scene, places)
+    return row[near][solid], places[solid]
 
 
 def _index(scene: Scene, pixels: PixelIndex) -> Int[Tensor, "pixels"]:
