@@ -62,7 +62,7 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
 
 
 def test_exposures_are_told_from_the_scene():
-    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.997, 0.989 and 0.984."""
+    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.998, 0.994 and 0.986."""
     views = 60
     scene = bricks(64, views)
     clean, stops = with_stops(scene, torch.zeros(views, 3), dim=0.5), random_stops(views)
