@@ -13,12 +13,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.machine import require_memory
-from nerf_lightning.nerf.geometry.cameras import (
-    all_pixels,
-    at_most,
-    camera_coordinates,
-    project,
-)
+from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most, camera_coordinates, seen_at
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
 from nerf_lightning.nerf.models.base import Model
@@ -108,14 +103,9 @@ def num_agreeing(
 
 
 def _sees(points: Tensor, cameras: Cameras, view: int, depth: Tensor, tolerance: float) -> Bool[Tensor, "points"]:
-    local = camera_coordinates(cameras, view, points)
-    distance = local.norm(dim=-1)
-    place = project(cameras, view, points)
-    height, width = depth.shape
-    ahead = (local[:, 2] < 0) | (cameras.lens_model == "equirectangular")
-    ahead &= (place >= 0).all(dim=-1) & (place[:, 0] < width) & (place[:, 1] < height)
-    x, y = torch.where(ahead[:, None], place, 0.0).long().unbind(dim=-1)
-    return ahead & ((depth[y, x] - distance).abs() <= tolerance * distance)
+    distance = camera_coordinates(cameras, view, points).norm(dim=-1)
+    inside, x, y = seen_at(cameras, view, points)
+    return inside & ((depth[y, x] - distance).abs() <= tolerance * distance)
 
 
 # Training views that are rendered, and their longer side in pixels.

@@ -39,6 +39,8 @@ from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, 
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
+# Points of a tile where pictures are rendered beside steps that are not cut into tiles.
+WHOLE_BATCH_POINTS = 65_536
 
 log = logging.getLogger(__name__)
 
@@ -216,6 +218,9 @@ class TrainStep:
         if self.num_steps is not None:
             follow_run(self.model, progress.step / self.num_steps)
             self.rays.follow(progress.step / self.num_steps)
+            key = fold(self.seed, progress.attempt, progress.step, "correction")
+            tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
+            self.correction.follow(progress.step / self.num_steps, self.model, self.rays, tile_points, key)
         self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
         num_rays = progress.batch_rays
         first = ranks.share(num_rays // self.rays_together).start * self.rays_together

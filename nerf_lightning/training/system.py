@@ -24,11 +24,10 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
-from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
 from nerf_lightning.training.launch.devices import use_threads
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.open_checkpoint import rendering_step
-from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 
 
 class RadianceFieldSystem(LightningModule):

@@ -8,7 +8,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cones import pixel_side
@@ -134,6 +134,20 @@ def project(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> 
     else:
         plane = project_plane(_turned(local), cameras.lens[view], cameras.lens_model)
     return plane * cameras.focal[view] + cameras.center[view]
+
+
+def seen_at(
+    cameras: Cameras, view: int, points: Float[Tensor, "points 3"]
+) -> tuple[Bool[Tensor, "points"], Int[Tensor, "points"], Int[Tensor, "points"]]:
+    """Tell which world points lie in the picture of one view, and in which of its pixels (x, y; elsewhere 0).
+
+    Whether something hides them is not asked.
+    """
+    place = project(cameras, view, points)
+    inside = (camera_coordinates(cameras, view, points)[:, 2] < 0) | (cameras.lens_model == "equirectangular")
+    inside &= (place >= 0).all(dim=-1) & (place[:, 0] < cameras.width[view]) & (place[:, 1] < cameras.height[view])
+    x, y = torch.where(inside[:, None], place, 0.0).long().unbind(dim=-1)
+    return inside, x, y
 
 
 def image_plane(cameras: Cameras, view: int, per_side: int = 33) -> Float[Tensor, "points 2"]:

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors
-from nerf_lightning.nerf.types.rays import RayBundle
+from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
@@ -77,6 +77,27 @@ def view_rays(rays_of: RayGenerator, view: int, clip: Clip | None = None) -> tup
     if clip is not None:
         rays = clip(rays, straight, ndc=cameras.ndc is not None)
     return rays, straight
+
+
+@torch.no_grad()
+def surface_points(
+    model: Model, rays_of: RayGenerator, pixels: PixelIndex, tile_points: int
+) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels"]]:
+    """Return where in the world the light of pixels comes from, at the expected depth, and their opacity; on the CPU.
+
+    Args:
+        model: in evaluation mode.
+        rays_of: the cameras.
+        pixels: any pixels of any views.
+        tile_points: most points that go through a field at once.
+    """
+    pixels = pixels.to(rays_of.near.device)
+    rays = rays_of(pixels).to("cpu")
+    _, depth, opacity, *_ = render_rays(model, rays, "black", tile_points)
+    if rays_of.cameras.ndc is None:
+        return rays.origins + depth[:, None] * rays.directions, opacity
+    straight = rays_of.through_world(pixels).to("cpu")
+    return straight.origins + world_distance(straight, depth / rays.far)[:, None] * straight.directions, opacity
 
 
 def _flat(picture: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from nerf_lightning.console import spoken
 from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
-from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS
+from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.film_job import FILM, end_film
 from nerf_lightning.viewer.page import Page, require_viser

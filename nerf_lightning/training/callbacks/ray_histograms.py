@@ -12,8 +12,8 @@ from nerf_lightning.nerf.models.tiles import weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along
 from nerf_lightning.nerf.types.rays import PixelIndex
-from nerf_lightning.training.callbacks.watcher import WHOLE_BATCH_POINTS, Watcher, tensorboard_writers
-from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.callbacks.watcher import Watcher, tensorboard_writers
+from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 from nerf_lightning.training.tensorboard import ALONG_RAYS, PER_RAY
 
 PARTS = 50

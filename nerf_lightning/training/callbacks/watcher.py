@@ -14,6 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 from nerf_lightning.errors import require_positive
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 
 
 class Watcher(Callback):
@@ -79,9 +80,6 @@ def errors_told_once() -> Iterator[None]:
 
 def _writes(thread: threading.Thread | None) -> bool:
     return type(thread).__module__ == WRITES
-
-
-WHOLE_BATCH_POINTS = 65_536
 
 
 def render_validation_view(trainer: Any, system: Any, number: int) -> tuple[int, Picture]:

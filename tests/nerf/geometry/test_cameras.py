@@ -10,6 +10,7 @@ from nerf_lightning.nerf.geometry.cameras import (
     project,
     rays_through_pixels,
     resized,
+    seen_at,
 )
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
 from nerf_lightning.nerf.types.rays import PixelIndex
@@ -35,6 +36,20 @@ def test_projecting_a_point_on_a_ray_gives_the_pixels_centre(cameras):
         pixels = project(cameras, view, rays.origins + 2.5 * rays.directions)
         index = all_pixels(cameras, view)
         torch.testing.assert_close(pixels, torch.stack([index.x, index.y], -1) + 0.5, check_dtype=False)
+
+
+def test_points_are_seen_at_their_pixels_and_beside_or_behind_the_picture_nowhere(cameras):
+    wider = pinhole_cameras(cameras.c2w, 30.0, 48, 32)  # 12 more columns and 8 more rows on each side
+    for view in range(2):
+        rays, index = rays_of(wider, view), all_pixels(wider, view)
+        x, y = (index.x - 12).flatten(), (index.y - 8).flatten()
+        shown = (x >= 0) & (x < 24) & (y >= 0) & (y < 16)
+        for distance in (2.5, -2.5):
+            points = (rays.origins + distance * rays.directions).flatten(0, 1)
+            inside, column, row = seen_at(cameras, view, points)
+            expected = shown & (distance > 0)
+            assert torch.equal(inside, expected)
+            assert torch.equal(torch.stack([column, row]), torch.stack([x, y]) * expected)
 
 
 def test_directions_have_unit_length_even_at_wide_angles():

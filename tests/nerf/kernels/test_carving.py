@@ -1,12 +1,15 @@
 """Carving: what it keeps, and the compiled twin against its reference."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from support.scenes import BALL_RADIUS, LENSES, ball_scene
+from support.wrong_cameras import with_noise
 
 from nerf_lightning.nerf.geometry.footprints import footprint
+from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.carving import cpu as carving_cpu
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
@@ -123,9 +126,18 @@ def test_a_scene_is_carved_alike_with_and_without_the_compiled_twin():
         assert torch.equal(possible_cells(scene, *cells(scene)), fast)
 
 
-def test_where_cameras_are_learnt_nothing_is_carved():
-    scene = ball_scene(size=24)
-    centers, half_diagonal = cells(scene)
-    kept = possible_cells(replace(scene, refined=True), centers, half_diagonal)
-    assert bool(kept.all())
-    assert not bool(possible_cells(scene, centers, half_diagonal).all())
+def test_cameras_that_are_learnt_carve_with_a_margin():
+    """From places that are wrong by a degree, too, nothing of the content; two that are far off carve nothing alone."""
+    scene = replace(ball_scene(num_views=48, size=80), refined=True)
+    centers, half_diagonal = cells(scene, resolution=48)
+    inside = centers.norm(dim=-1) < BALL_RADIUS + half_diagonal
+    turned = scene.cameras.c2w.clone()
+    turned[:, :, :3] = turned[:, :, :3] @ rotation_from_vector(torch.tensor([0.0, math.radians(0.9), 0.0]))
+    all_alike = replace(scene, cameras=replace(scene.cameras, c2w=turned))
+    noisy, two = with_noise(scene, degrees=1.0, share=0.01), with_noise(scene, 30.0, 0.0, views=[3, 9])
+    for wrong in (all_alike, noisy, two):
+        possible = possible_cells(wrong, centers, half_diagonal)
+        assert bool(possible[inside].all())
+        assert float((~possible).float().mean()) > 0.05
+        # As if the poses were right, they would have carved into it.
+        assert not bool(possible_cells(replace(wrong, refined=False), centers, half_diagonal)[inside].all())

@@ -1,15 +1,22 @@
 """What the photographs' frames and alpha say of space before anything is learnt: seen at all, and not seen through."""
 
+import math
 from types import ModuleType
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.kernels.backends import cpu_twin
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
 from nerf_lightning.nerf.types.scene import Scene
+
+WRONG_BY = math.radians(1.0)
+"""Cameras that are learnt may be turned by so much."""
+AGREEING = 3
+"""So many of them must see through a cell."""
 
 
 def possible_cells(
@@ -19,7 +26,10 @@ def possible_cells(
 
     A cell is left out where no view sees it, and where some view sees it whole and shows only pixels of alpha 0 there:
     a ray of alpha 0 meets nothing, so the cell is empty (space carving, Kutulakos and Seitz, 2000). Without alpha
-    nothing is carved, nor where cameras are learnt: from a wrong place they would carve into the content, for good.
+    nothing is carved.
+
+    What is carved is gone for good, and cameras that are learnt may begin at a wrong place. They carve less: not within
+    1 degree of what their photographs show, and what three of them agree on.
 
     Args:
         scene: cameras and pixels.
@@ -34,9 +44,13 @@ def possible_cells(
         if bool(cells.all()):
             break
         steps.add_seen(cells, scene.cameras, view, centers, half_diagonal)
-    if scene.pixels.has_transparency and not scene.refined:
+    if scene.pixels.has_transparency:
+        seen_through = torch.zeros(len(cells), dtype=torch.int16)
         for view in evenly_spaced_subset(views, most_views):
-            steps.carve(cells, scene.cameras, view, centers, half_diagonal, _matter(scene, view))
+            left = cells.clone()
+            steps.carve(left, scene.cameras, view, centers, half_diagonal, _matter(scene, view))
+            seen_through += cells & ~left
+            cells &= seen_through < (AGREEING if scene.refined else 1)
     return cells
 
 
@@ -49,4 +63,13 @@ def _steps(scene: Scene, centers: Tensor) -> ModuleType:
 def _matter(scene: Scene, view: int) -> Bool[Tensor, "height width"]:
     matter = scene.pixels.view(view)[..., 3] > 0
     kept = scene.pixels.kept(view)
-    return matter if kept is None else matter | ~kept  # what is masked may be anything
+    matter = matter if kept is None else matter | ~kept  # what is masked may be anything
+    return _grown(matter, round(WRONG_BY * float(scene.cameras.focal[view].mean()))) if scene.refined else matter
+
+
+def _grown(matter: Bool[Tensor, "height width"], pixels: int) -> Bool[Tensor, "height width"]:
+    """Return where matter is at most so many pixels away, along both axes."""
+    grown, side = matter[None].float(), 2 * pixels + 1
+    for kernel, padding in (((side, 1), (pixels, 0)), ((1, side), (0, pixels))):
+        grown = max_pool2d(grown, kernel, stride=1, padding=padding)
+    return grown[0] > 0
