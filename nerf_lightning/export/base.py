@@ -17,6 +17,8 @@ class Beside:
 
     photographs: Scene | None = None
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
+    corrected: bool = False
+    """Whether the model learnt what each camera makes of its colours, which then are not the photographs'."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
     keyframes: tuple[dict[str, Any], ...] = ()
