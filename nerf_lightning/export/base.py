@@ -93,3 +93,17 @@ def require_no_folders(paths: Iterable[Path]) -> None:
                 f"{path} is a folder, and a file of that name is to be written. Remove it, or give another place with "
                 "paths.output_dir=DIR."
             )
+
+
+def require_no_files(paths: Iterable[Path]) -> None:
+    """Refuse places for folders at which files lie.
+
+    Raises:
+        InputError: one does.
+    """
+    for path in paths:
+        if path.exists() and not path.is_dir():
+            raise InputError(
+                f"{path} is a file, and a folder of that name is to be filled. Remove it, or give another place with "
+                "paths.output_dir=DIR."
+            )
