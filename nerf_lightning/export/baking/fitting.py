@@ -151,6 +151,7 @@ class _TrainingRays:
         random = RayRandom(torch.full((count,), fold("fitting", step)), torch.arange(count))
         behind = background_colors(scene.background, count, torch.device("cpu"), random)
         rgb = blend(scene.pixels.rgba[places].float() / 255.0, behind)
-        *taken, _ = marcher.in_grid(self.rays_of(PixelIndex(view=view, x=within % width, y=within // width)))
+        pixels = PixelIndex(view=view, x=within % width, y=within // width)
+        origins, directions, looks, lengths, _ = marcher.in_grid(self.rays_of(pixels))
         behind = torch.zeros(count, 3) if behind is None else behind
-        return Wanted(*taken, rgb.numpy(), behind.numpy())
+        return Wanted(origins, directions, looks, lengths, rgb.numpy(), behind.numpy())
