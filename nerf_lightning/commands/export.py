@@ -47,7 +47,7 @@ def export_one(config: DictConfig) -> list[Path]:
     if what.needs_density and opened.model.needs_photographs:
         opened.model.density(torch.zeros(1, 3, device=opened.settings.device))  # or says by name that there is none
     if path is not None:
-        asked = config.what.photographs or config.what.max_views
+        asked = config.what.photographs or config.what.max_views or config.what.fit_steps
         photographs = read_photographs(config, opened) if asked else None
         what.beside = beside_page(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
@@ -86,4 +86,6 @@ def beside_page(checkpoint: Checkpoint, photographs: Scene | None, path: CameraP
         ("step", f"{checkpoint.step:,}"),
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
-    return Beside(photographs, tuple(known), page_path(path, checkpoint.scene, run))
+    corrected = checkpoint.choices.get("correction", "none") != "none"
+    keyframes = page_path(path, checkpoint.scene, run)
+    return Beside(photographs, corrected, tuple(known), keyframes)

@@ -17,6 +17,8 @@ class Beside:
 
     photographs: Scene | None = None
     """The capture, in the frame of the checkpoint's record; None: it cannot be read, or is not asked for."""
+    corrected: bool = False
+    """Whether the model learnt what each camera makes of its colours, which then are not the photographs'."""
     facts: tuple[tuple[str, str], ...] = ()
     """What is known of the run: label and value, as texts that may come from anybody."""
     keyframes: tuple[dict[str, Any], ...] = ()
@@ -89,5 +91,19 @@ def require_no_folders(paths: Iterable[Path]) -> None:
         if path.is_dir():
             raise InputError(
                 f"{path} is a folder, and a file of that name is to be written. Remove it, or give another place with "
+                "paths.output_dir=DIR."
+            )
+
+
+def require_no_files(paths: Iterable[Path]) -> None:
+    """Refuse places for folders at which files lie.
+
+    Raises:
+        InputError: one does.
+    """
+    for path in paths:
+        if path.exists() and not path.is_dir():
+            raise InputError(
+                f"{path} is a file, and a folder of that name is to be filled. Remove it, or give another place with "
                 "paths.output_dir=DIR."
             )

@@ -11,7 +11,7 @@ import torch
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_colmap
 from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
-from nerf_lightning.export.base import Export, require_no_folders
+from nerf_lightning.export.base import Export, require_no_files, require_no_folders
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import poses_from_user
@@ -60,6 +60,8 @@ class CamerasExport(Export):
         if self.format != "transforms":
             return [self._animation(cameras, record.view_names, folder / ANIMATIONS[self.format])]
         transforms = folder / "transforms.json"
+        require_no_folders([transforms])
+        require_no_files([folder / "sparse", folder / "sparse" / "0"])
         write_json(transforms, self._transforms(record, cameras))
         reason = beyond_colmap(cameras)
         if reason:

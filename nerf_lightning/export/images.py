@@ -15,7 +15,7 @@ from nerf_lightning.console import StageProgress, say
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_file_name
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import Export, require_no_files, require_no_folders
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
@@ -55,6 +55,8 @@ class ImagesExport(Export):
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
+        require_no_files(folder / name for name in ("depth", "opacity", "normals"))
+        require_no_folders([folder / "images.json"])
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)
         names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}

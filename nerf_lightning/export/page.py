@@ -7,6 +7,7 @@ from nerf_lightning.console import StageProgress, say
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
+from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export
 from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
@@ -19,11 +20,18 @@ QUALITIES: tuple[Quality, ...] = get_args(Quality)
 RESOLUTIONS: dict[Space, dict[Quality, int]] = {
     "bounded": {"small": 128, "medium": 216, "large": 320},
     "ndc": {"small": 128, "medium": 216, "large": 320},
-    "contracted": {"small": 128, "medium": 192, "large": 240},
+    "contracted": {"small": 108, "medium": 128, "large": 192},
 }
-# and spherical harmonics of its colours.
-HARMONICS: dict[Quality, int] = {"small": 4, "medium": 4, "large": 9}
-COSTS = {"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0, "measured": 8.0}
+# and spherical harmonics of its colours: without bounds much is fog, which hides less what changes with the direction.
+HARMONICS: dict[Space, dict[Quality, int]] = {
+    "bounded": {"small": 4, "medium": 4, "large": 9},
+    "ndc": {"small": 4, "medium": 4, "large": 9},
+    "contracted": {"small": 4, "medium": 9, "large": 9},
+}
+COSTS = {
+    **{"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0},
+    **{"fitted": 20.0, "measured": 8.0},
+}
 
 
 class PageExport(Export):
@@ -35,6 +43,8 @@ class PageExport(Export):
             along the side of the box, and as many around it. None: as the quality has it.
         photographs: most photographs that are places to jump to, spread over all; 0: none.
         max_views: most views that the page is compared with the model on, spread over the test views; 0: none.
+        fit_steps: so many steps move the bytes towards the photographs that the model learnt from; 0: they stay as
+            baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
     """
 
     shows_photographs = True
@@ -45,14 +55,15 @@ class PageExport(Export):
         resolution: int | None = None,
         photographs: int = 24,
         max_views: int = 8,
+        fit_steps: int = 60,
     ):
         if resolution is not None and resolution < 8:
             raise InputError(f"what.resolution={resolution}: give 8 voxels or more, or null for what.quality's.")
-        for name, value in (("photographs", photographs), ("max_views", max_views)):
+        for name, value in (("photographs", photographs), ("max_views", max_views), ("fit_steps", fit_steps)):
             if value < 0:
                 raise InputError(f"what.{name}={value}: give 0 or more.")
         self.quality, self.photographs, self.max_views = quality, photographs, max_views
-        self.resolution, self.num_harmonics = resolution, HARMONICS[quality]
+        self.resolution, self.fit_steps = resolution, fit_steps
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the page, and say what it costs."""
@@ -60,7 +71,10 @@ class PageExport(Export):
         require_no_other(target)
         with StageProgress(COSTS) as report:
             resolution = self.resolution or RESOLUTIONS[record.space][self.quality]
-            baked = bake(model, record, resolution, self.num_harmonics, tile_points, report)
+            baked = bake(model, record, resolution, HARMONICS[record.space][self.quality], tile_points, report)
+            photographs = None if self.beside.corrected else self.beside.photographs
+            if photographs is not None:
+                baked = fitted(baked, photographs, record, self.fit_steps, report)
             marcher = Marcher(baked)
             cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
         page = page_of(marcher, record, self.beside, self.photographs, cost.facts())

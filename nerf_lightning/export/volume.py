@@ -9,7 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.console import StageProgress
-from nerf_lightning.export.base import Export, refuse_ndc
+from nerf_lightning.export.base import Export, refuse_ndc, require_no_folders
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
 from nerf_lightning.export.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
@@ -41,12 +41,13 @@ class VolumeExport(Export):
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the grids."""
         refuse_ndc(record, "volume")
+        arrays, about = folder / "volume.npz", folder / "volume.json"
+        require_no_folders([arrays, about])
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
         with StageProgress(COSTS) as report:
             density = sample_density(model, lattice, tile_points, report)
             rgb = _colors(model, record, lattice, density, tile_points, report)
         unit = unit_of(record.to_user.double())
-        arrays, about = folder / "volume.npz", folder / "volume.json"
         with whole_file(arrays) as part:
             np.savez_compressed(part, density=density / np.float32(unit), rgb=rgb)
         write_json(about, _described(record, lattice))

@@ -45,7 +45,9 @@ def test_every_kind_of_export_writes_what_it_says(nerf, last, tmp_path):
 
 def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, finished_run, tmp_path):
     where = f"paths.output_dir={tmp_path}"
-    result = nerf("export", f"ckpt={last}", "what=page", "what.resolution=16", "what.max_views=1", where)
+    result = nerf(
+        "export", f"ckpt={last}", "what=page", "what.resolution=16", "what.max_views=1", "what.fit_steps=3", where
+    )
     if result.code:  # 20 steps may leave a field without anything in it
         said(result, "There is nothing to export")
         return
@@ -61,7 +63,14 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, f
 
 
 def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):
-    given = ("what=page", "what.resolution=16", "what.max_views=1", "scene=npz", f"scene.path={tmp_path}/gone.npz")
+    given = (
+        "what=page",
+        "what.resolution=16",
+        "what.max_views=1",
+        "what.fit_steps=3",
+        "scene=npz",
+        f"scene.path={tmp_path}/gone.npz",
+    )
     result = nerf("export", f"ckpt={last}", *given, f"paths.output_dir={tmp_path}")
     if result.code:
         said(result, "There is nothing to export")
@@ -84,6 +93,31 @@ def test_bad_input_is_one_paragraph(nerf, last, tmp_path):
         "1e+09",
     )
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "kind"),
+    [
+        ("mesh", "mesh.ply", "folder"),
+        ("points", "points.ply", "folder"),
+        ("volume", "volume.npz", "folder"),
+        ("cameras", "transforms.json", "folder"),
+        ("cameras", "sparse", "file"),
+        ("images", "normals", "file"),
+        ("page", "page.html", "folder"),
+    ],
+)
+def test_what_lies_where_something_is_to_be_written_is_said_before_the_work(nerf, last, tmp_path, what, name, kind):
+    place = tmp_path / name
+    place.mkdir() if kind == "folder" else place.write_text("something")
+    said(nerf("export", f"ckpt={last}", f"what={what}", f"paths.output_dir={tmp_path}"), name, f"is a {kind}", "DIR")
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_a_place_that_cannot_be_written_is_one_paragraph(nerf, last):
+    for what in ("mesh", "page", "cameras"):
+        result = nerf("export", f"ckpt={last}", f"what={what}", "paths.output_dir=/dev/null/x")
+        said(result, "The output folder /dev/null/x cannot be written", "paths.output_dir=DIR")
 
 
 def test_a_full_disk_is_one_paragraph_and_leaves_nothing(nerf, last, tmp_path, monkeypatch):

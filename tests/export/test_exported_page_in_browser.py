@@ -37,7 +37,7 @@ WITHOUT = "HTMLCanvasElement.prototype.getContext = () => null;"
 @pytest.fixture(scope="module", params=["small", pytest.param("large", marks=pytest.mark.exhaustive)])
 def page(request, tmp_path_factory):
     """With harmonics of degree 1, and of degree 2."""
-    what, scene = PageExport(request.param, 32, photographs=3, max_views=0), all_around()
+    what, scene = PageExport(request.param, 32, photographs=3, max_views=0, fit_steps=0), all_around()
     what.beside = beside(scene)
     with torch.no_grad():
         return what.export(shiny_model(), record_of(scene), tmp_path_factory.mktemp("page"), 4096)[0]
@@ -122,7 +122,7 @@ def test_the_photograph_lies_over_its_camera_and_other_things_can_be_shown(page)
 
 
 def test_a_scene_without_bounds_is_shown_as_the_marcher_computes_it(tmp_path):
-    what, scene = PageExport("small", 48, photographs=2, max_views=0), hall_scene()
+    what, scene = PageExport("small", 48, photographs=2, max_views=0, fit_steps=0), hall_scene()
     what.beside = beside(scene)
     with torch.no_grad():
         page = what.export(hall_model(), record_of(scene), tmp_path, 1 << 14)[0]
@@ -140,7 +140,7 @@ def test_a_scene_without_bounds_is_shown_as_the_marcher_computes_it(tmp_path):
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory):
     """A page of a capture in other units and axes, with an orbit of ten seconds; and its record."""
-    what, scene = PageExport("small", 32, photographs=3, max_views=0), all_around()
+    what, scene = PageExport("small", 32, photographs=3, max_views=0, fit_steps=0), all_around()
     turn = torch.linalg.qr(torch.tensor([[0.2, 1.0, 0.3], [-0.5, 0.1, 1.0], [1.0, 0.4, 0.2]]))[0]
     record = record_of(scene, to_user=similarity(turn * turn.det(), torch.tensor([50.0, -3.0, 2.0]), 3.0))
     orbit = page_path(Orbit(120, fps=12), record, tmp_path_factory.mktemp("run"))

@@ -52,4 +52,4 @@ def baked_ball(resolution: int = 48, harmonics: int = 4, model=None, record=None
 
 
 def beside(scene, *facts) -> Beside:
-    return Beside(scene, tuple(facts))
+    return Beside(scene, facts=tuple(facts))

@@ -15,6 +15,7 @@ from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, den
 from nerf_lightning.export.baking.lit_voxels import lit
 from nerf_lightning.export.baking.seen_colors import (
     LOOKS,
+    LOOKS_AROUND,
     RANGES,
     TRIES,
     TRIES_AROUND,
@@ -69,7 +70,7 @@ def bake(
     else:
         kept, closed = lit(grid, record)
         report("lit", 1.0)
-        around = _who_sees(grid, np.argwhere(kept).astype(np.int32), record, LOOKS[num_harmonics], report)
+        around = _who_sees(grid, np.argwhere(kept).astype(np.int32), record, LOOKS_AROUND, report)
     if not (kept.any() and (around.cameras[:, 0] >= 0).any()):
         raise InputError(
             f"Nothing of {for_terminal(record.name)} is seen: no training camera looks at what has density. Correct "

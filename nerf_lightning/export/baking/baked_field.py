@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
 from numpy import ndarray
 
 from nerf_lightning.export.baking.contraction import Contraction
@@ -91,10 +91,10 @@ def to_bytes_of_density(optical: Float[ndarray, "*any"]) -> UInt8[ndarray, "*any
 
 
 def tiles_of(
-    values: UInt8[ndarray, "bricks 8 8 8"], index: Int[ndarray, "x y z"], empty: int
-) -> UInt8[ndarray, "bricks 9 9 9"]:
+    values: Integer[ndarray, "bricks 8 8 8"], index: Int[ndarray, "x y z"], empty: int
+) -> Integer[ndarray, "bricks 9 9 9"]:
     """Return the bricks with a border beyond their last values: the first ones of the next bricks, else `empty`."""
-    tiles = np.full((len(values), TILE, TILE, TILE), empty, np.uint8)
+    tiles = np.full((len(values), TILE, TILE, TILE), empty, values.dtype)
     tiles[:, :SIDE, :SIDE, :SIDE] = values
     place = np.argwhere(index >= 0)
     padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)

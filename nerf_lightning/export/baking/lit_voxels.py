@@ -19,7 +19,7 @@ RAYS = 1_000_000
 CLOSED = 0.98
 # Values at which all but so much of it is stopped are kept, and their neighbours: where the scene is closed, and where
 # what is left out would let the background through.
-LEFT_OUT_OF_CLOSED, LEFT_OUT = 0.02, 0.002
+LEFT_OUT_OF_CLOSED, LEFT_OUT = 0.01, 0.002
 
 
 def lit(grid: DensityGrid, record: SceneRecord) -> tuple[Bool[ndarray, "x y z"], bool]:

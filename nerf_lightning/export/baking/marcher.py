@@ -45,28 +45,17 @@ class Marcher:
     def render(self, rays: RayBundle) -> MarchedRays:
         """Return what rays meet in the box, or in all of space."""
         shape, contraction = rays.near.shape, self.baked.contraction
-        module, unit = "bricks.cpu", torch.tensor(self.baked.spacing)
-        apart = rays.origins - torch.tensor(self.baked.lower)
-        if contraction is not None:
-            module, unit = "bricks.contracted", torch.full((3,), contraction.half)
-            apart = rays.origins - torch.tensor(contraction.center)
-        origins = (apart / unit).float().reshape(-1, 3).contiguous()
-        along = rays.directions.float().reshape(-1, 3) / unit
-        # How far a ray goes in the scene while it goes one in the grid.
-        way = 1.0 / along.norm(dim=-1)
-        directions, looks = along * way[:, None], rays.view_directions.float().reshape(-1, 3)
-        more = (way / self.baked.length).numpy() if contraction is None else contraction.near / contraction.half
-        basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
-        found = kernels(module).march_tiles(
-            origins.numpy(),
-            directions.contiguous().numpy(),
-            basis.contiguous().numpy(),
+        origins, directions, basis, lengths, way = self.in_grid(rays)
+        found = kernels("bricks.cpu" if contraction is None else "bricks.contracted").march_tiles(
+            origins,
+            directions,
+            basis,
             self.index,
             self.density,
             self.colors,
             self.baked.scale,
             STEP,
-            more,
+            lengths if contraction is None else contraction.near / contraction.half,
         )
         columns = torch.from_numpy(found)
         depth = way * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
@@ -80,3 +69,31 @@ class Marcher:
             float(mean[0]),
             float(mean[1]),
         )
+
+    def in_grid(
+        self, rays: RayBundle
+    ) -> tuple[
+        Float[ndarray, "rays 3"],
+        Float[ndarray, "rays 3"],
+        Float[ndarray, "rays basis"],
+        Float[ndarray, "rays"],
+        Float[Tensor, "rays"],
+    ]:
+        """Return origins, directions, spherical harmonics and lengths of rays, as kernels take them, and their ways.
+
+        A way is how far a ray goes in the scene while it goes one in the grid.
+        """
+        contraction, unit = self.baked.contraction, torch.tensor(self.baked.spacing)
+        apart = rays.origins - torch.tensor(self.baked.lower)
+        if contraction is not None:
+            unit = torch.full((3,), contraction.half)
+            apart = rays.origins - torch.tensor(contraction.center)
+        origins = (apart / unit).float().reshape(-1, 3).contiguous()
+        along = rays.directions.float().reshape(-1, 3) / unit
+        way = 1.0 / along.norm(dim=-1)
+        directions, looks = along * way[:, None], rays.view_directions.float().reshape(-1, 3)
+        lengths = way / self.baked.length
+        if contraction is not None:
+            lengths = torch.full_like(way, contraction.near / contraction.half)
+        basis = SphericalHarmonicsEncoder(math.isqrt(self.baked.num_harmonics))(looks)
+        return origins.numpy(), directions.contiguous().numpy(), basis.contiguous().numpy(), lengths.numpy(), way

@@ -21,8 +21,8 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 
 # Of each voxel, so many cameras that see it are asked, and so many in all to find them.
 LOOKS, TRIES = {1: 4, 4: 10, 9: 12}, 48
-# Without bounds, where most voxels lie behind walls and all are asked in vain.
-TRIES_AROUND = 24
+# Without bounds, where most voxels lie behind walls and all are asked in vain, and where more looks change little.
+TRIES_AROUND, LOOKS_AROUND = 24, 4
 # What holds back coefficients of degree 1 and 2, as a share of a voxel's light.
 RIDGE = 0.02
 # Half range of the bytes of coefficients, of degree 1 and of degree 2.
@@ -143,6 +143,15 @@ def to_bytes_of_colors(fitted: Float[Tensor, "voxels harmonics 3"]) -> UInt8[Ten
     """Return bytes, channel by channel: the first as the colour that it is, the others within their ranges."""
     base = (fitted[:, :1] * DEGREE_1).clamp(0, 1) * 255.0
     ranges = torch.tensor([RANGES[0]] * 3 + [RANGES[1]] * 5)[: fitted.shape[1] - 1, None]
-    most = 127 // COARSE
-    others = COARSE * (fitted[:, 1:] / ranges * 127.0 / COARSE).round().clamp(-most, most) + NO_CHANGE
+    others = in_coarse_steps(fitted[:, 1:] / ranges * 127.0 + NO_CHANGE)
     return torch.cat([base, others], dim=1).round().to(torch.uint8).flatten(1)
+
+
+def in_coarse_steps(coefficients: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Return the nearest bytes that coefficients of degree 1 and 2 may have.
+
+    >>> in_coarse_steps(torch.tensor([0.0, 129.0, 133.0, 255.0])).tolist()
+    [8.0, 128.0, 136.0, 248.0]
+    """
+    most = 127 // COARSE
+    return COARSE * ((coefficients - NO_CHANGE) / COARSE).round().clamp(-most, most) + NO_CHANGE

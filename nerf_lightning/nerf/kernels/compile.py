@@ -8,7 +8,7 @@ from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 
 CPU_TWINS = (
     *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "bricks.contracted"),
-    *("fusion.cpu", "texels.cpu"),
+    *("bricks.gradients", "fusion.cpu", "texels.cpu"),
     *(["mlp.bfloat16", "render.bfloat16"] if cpu_multiplies_bfloat16() else []),
 )
 

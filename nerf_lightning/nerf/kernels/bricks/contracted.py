@@ -19,17 +19,21 @@ from nerf_lightning.nerf.kernels.bricks.cpu import (
     LEAST_ALPHA,
     LEAST_LIGHT,
     LEAST_TRANSMITTANCE,
+    LOG_2,
+    MOST_SAMPLES,
     ONE,
     OPAQUE_DEPTH,
-    _add_color,
+    SAMPLE,
     _between,
     _in_view,
     _way_out,
+    look_at,
+    note,
 )
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
-COMPILED_WITH = "00763081"
+COMPILED_WITH = "e9a3ffbe"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 MOST_STEPS = 4096
@@ -269,44 +273,53 @@ def march_tiles(
 @njit(nogil=True, cache=True)
 @no_type_check
 def _march(first, last, origins, directions, looks, index, density, colors, scale, step, near, out):
-    basis, spacing = looks.shape[1], np.float32(4.0 / (index.shape[0] * SIDE))
-    nothing = np.exp2(scale[0])
+    samples = np.empty((MOST_SAMPLES, SAMPLE), np.float32)
     for ray in range(first, last):
-        (ox, oy, oz), (dx, dy, dz), result = origins[ray], directions[ray], out[ray]
-        t, through = near, ONE
-        for _ in range(MOST_STEPS):
-            if through <= LEAST_TRANSMITTANCE:
-                break
-            x, y, z, gx, gy, gz, r, v = _contracted(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz)
-            if r > FARTHEST:
-                break
-            speed = np.sqrt(gx * gx + gy * gy + gz * gz)
-            gx, gy, gz = gx / speed, gy / speed, gz / speed
-            x, y, z = (x + TWO) / spacing, (y + TWO) / spacing, (z + TWO) / spacing
-            i, j, k = int(x) // SIDE, int(y) // SIDE, int(z) // SIDE
-            i, j, k = min(i, index.shape[0] - 1), min(j, index.shape[1] - 1), min(k, index.shape[2] - 1)
-            tile = index[i, j, k]
-            voxels = step if tile >= 0 else max(_way_out(x, y, z, gx, gy, gz), np.float32(0.0)) + INTO_NEXT
-            way = _ahead(voxels * spacing, speed, r, v)
-            if way < 0:
-                break
-            if tile >= 0:
-                x, y, z = x + HALF * step * gx, y + HALF * step * gy, z + HALF * step * gz
-                outward = max(abs(x * spacing - TWO), max(abs(y * spacing - TWO), abs(z * spacing - TWO)))
-                shrunk = min(ONE, TWO - outward)
-                x, y, z = _in_tile(x - i * SIDE), _in_tile(y - j * SIDE), _in_tile(z - k * SIDE)
-                value = _between(density[tile], x, y, z)
-                result[5] += ONE
-                share = way * shrunk * shrunk / spacing
-                alpha = ONE - np.exp(-(np.exp2(scale[0] + scale[1] * value) - nothing) * share)
-                if alpha >= LEAST_ALPHA:
-                    result[6] += ONE
-                    weight = through * alpha
-                    _add_color(result, weight, colors[tile], x, y, z, looks[ray], basis, scale)
-                    result[3] += weight
-                    result[4] += weight * (t + HALF * way)
-                    through *= ONE - alpha
-            t += way
+        count, asked = walk(origins[ray], directions[ray], index, density, scale, step, near, samples)
+        look_at(samples[:count], looks[ray], colors, scale, out[ray])
+        out[ray, 5] = asked
+
+
+@njit
+@no_type_check
+def walk(origin, along, index, density, scale, step, near, samples):
+    """Note where a ray's light is stopped, as that of `bricks.cpu` does."""
+    spacing = np.float32(4.0 / (index.shape[0] * SIDE))
+    nothing, doubling = np.exp2(scale[0]), LOG_2 * scale[1]
+    (ox, oy, oz), (dx, dy, dz) = origin, along
+    t, through, count, asked = near, ONE, 0, 0
+    for _ in range(MOST_STEPS):
+        if through <= LEAST_TRANSMITTANCE:
+            break
+        x, y, z, gx, gy, gz, r, v = _contracted(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz)
+        if r > FARTHEST:
+            break
+        speed = np.sqrt(gx * gx + gy * gy + gz * gz)
+        gx, gy, gz = gx / speed, gy / speed, gz / speed
+        x, y, z = (x + TWO) / spacing, (y + TWO) / spacing, (z + TWO) / spacing
+        i, j, k = int(x) // SIDE, int(y) // SIDE, int(z) // SIDE
+        i, j, k = min(i, index.shape[0] - 1), min(j, index.shape[1] - 1), min(k, index.shape[2] - 1)
+        tile = index[i, j, k]
+        voxels = step if tile >= 0 else max(_way_out(x, y, z, gx, gy, gz), np.float32(0.0)) + INTO_NEXT
+        way = _ahead(voxels * spacing, speed, r, v)
+        if way < 0:
+            break
+        if tile >= 0:
+            x, y, z = x + HALF * step * gx, y + HALF * step * gy, z + HALF * step * gz
+            outward = max(abs(x * spacing - TWO), max(abs(y * spacing - TWO), abs(z * spacing - TWO)))
+            shrunk = min(ONE, TWO - outward)
+            x, y, z = _in_tile(x - i * SIDE), _in_tile(y - j * SIDE), _in_tile(z - k * SIDE)
+            value = _between(density[tile], x, y, z)
+            asked += 1
+            share = way * shrunk * shrunk / spacing
+            deep = np.exp2(scale[0] + scale[1] * value)
+            alpha = ONE - np.exp(-(deep - nothing) * share)
+            if alpha >= LEAST_ALPHA:
+                note(samples[count], tile, x, y, z, through * alpha, alpha, t + HALF * way, deep * doubling * share)
+                count += 1
+                through *= ONE - alpha
+        t += way
+    return count, asked
 
 
 @njit

@@ -13,7 +13,7 @@ from numpy import ndarray
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
-COMPILED_WITH = "1f16be6c"
+COMPILED_WITH = "e1f7f3f2"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 OPAQUE_DEPTH = np.float32(6.0)
@@ -21,7 +21,9 @@ OPAQUE_DEPTH = np.float32(6.0)
 LEAST_LIGHT = np.float32(0.005)
 """A camera sees a voxel from which so much of its light arrives."""
 LEAST_ALPHA, LEAST_TRANSMITTANCE = np.float32(0.002), np.float32(0.004)
-ONE, HALF, TINY = np.float32(1.0), np.float32(0.5), np.float32(1e-9)
+SAMPLE, MOST_SAMPLES = 8, 2760
+"""Numbers of one; after so many of the least opacity no light is left: log(0.004) / log(1 - 0.002)."""
+ONE, HALF, TINY, LOG_2 = np.float32(1.0), np.float32(0.5), np.float32(1e-9), np.float32(0.6931472)
 
 
 def seeing_cameras(
@@ -155,42 +157,76 @@ def march_tiles(
 @njit(nogil=True, cache=True)
 @no_type_check
 def _march(first, last, origins, directions, looks, index, density, colors, scale, step, lengths, out):
-    basis = looks.shape[1]
-    size = np.array([index.shape[0] * SIDE, index.shape[1] * SIDE, index.shape[2] * SIDE], np.float32)
-    nothing = np.exp2(scale[0])
+    samples = np.empty((MOST_SAMPLES, SAMPLE), np.float32)
     for ray in range(first, last):
-        origin, along, result = origins[ray], directions[ray], out[ray]
-        enter, leave = np.float32(0.0), np.float32(1e9)
-        for axis in range(3):
-            speed = along[axis] if abs(along[axis]) > TINY else TINY
-            a, b = -origin[axis] / speed, (size[axis] - origin[axis]) / speed
-            enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-        number, through = 0, ONE
-        while through > LEAST_TRANSMITTANCE:
-            t = enter + (number + HALF) * step
-            if t >= leave:
-                break
-            x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
-            i, j, k = int(x) // SIDE, int(y) // SIDE, int(z) // SIDE
-            i, j, k = min(i, index.shape[0] - 1), min(j, index.shape[1] - 1), min(k, index.shape[2] - 1)
-            tile = index[i, j, k]
-            if tile < 0:
-                beyond = t + _way_out(x, y, z, along[0], along[1], along[2])
-                number = max(number + 1, int(np.ceil((beyond - enter) / step - HALF)))
-                continue
-            number += 1
-            x, y, z = x - i * SIDE, y - j * SIDE, z - k * SIDE
-            value = _between(density[tile], x, y, z)
-            result[5] += ONE
-            alpha = ONE - np.exp(-(np.exp2(scale[0] + scale[1] * value) - nothing) * step * lengths[ray])
-            if alpha < LEAST_ALPHA:
-                continue
-            result[6] += ONE
-            weight = through * alpha
-            _add_color(result, weight, colors[tile], x, y, z, looks[ray], basis, scale)
-            result[3] += weight
-            result[4] += weight * t
-            through *= ONE - alpha
+        given = (index, density, scale, step, lengths[ray])
+        count, asked = walk(origins[ray], directions[ray], *given, samples)
+        look_at(samples[:count], looks[ray], colors, scale, out[ray])
+        out[ray, 5] = asked
+
+
+@njit
+@no_type_check
+def walk(origin, along, index, density, scale, step, length, samples):
+    """Note where a ray's light is stopped, and return at how many places of how many that were asked.
+
+    A sample is a tile, a place in it (3), its share of the light, its opacity, its distance, and by how much its
+    optical depth changes when its byte does.
+    """
+    size = np.array([index.shape[0] * SIDE, index.shape[1] * SIDE, index.shape[2] * SIDE], np.float32)
+    nothing, doubling = np.exp2(scale[0]), LOG_2 * scale[1]
+    enter, leave = np.float32(0.0), np.float32(1e9)
+    for axis in range(3):
+        speed = along[axis] if abs(along[axis]) > TINY else TINY
+        a, b = -origin[axis] / speed, (size[axis] - origin[axis]) / speed
+        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    number, through, count, asked = 0, ONE, 0, 0
+    while through > LEAST_TRANSMITTANCE:
+        t = enter + (number + HALF) * step
+        if t >= leave:
+            break
+        x, y, z = origin[0] + t * along[0], origin[1] + t * along[1], origin[2] + t * along[2]
+        i, j, k = int(x) // SIDE, int(y) // SIDE, int(z) // SIDE
+        i, j, k = min(i, index.shape[0] - 1), min(j, index.shape[1] - 1), min(k, index.shape[2] - 1)
+        tile = index[i, j, k]
+        if tile < 0:
+            beyond = t + _way_out(x, y, z, along[0], along[1], along[2])
+            number = max(number + 1, int(np.ceil((beyond - enter) / step - HALF)))
+            continue
+        number, asked = number + 1, asked + 1
+        x, y, z = x - i * SIDE, y - j * SIDE, z - k * SIDE
+        value = _between(density[tile], x, y, z)
+        deep = np.exp2(scale[0] + scale[1] * value)
+        alpha = ONE - np.exp(-(deep - nothing) * step * length)
+        if alpha < LEAST_ALPHA:
+            continue
+        note(samples[count], tile, x, y, z, through * alpha, alpha, t, deep * doubling * step * length)
+        count += 1
+        through *= ONE - alpha
+    return count, asked
+
+
+@njit
+@no_type_check
+def note(sample, tile, x, y, z, weight, alpha, t, rate):
+    """Write a sample down."""
+    sample[0], sample[1], sample[2], sample[3] = tile, x, y, z
+    sample[4], sample[5], sample[6], sample[7] = weight, alpha, t, rate
+
+
+@njit
+@no_type_check
+def look_at(samples, look, colors, scale, result):
+    """Add up the colours, opacity and distance of a ray's samples."""
+    rgb, mixed = np.empty(3, np.float32), np.empty(colors.shape[-1], np.float32)
+    for sample in samples:
+        weight = sample[4]
+        color_at(colors[int(sample[0])], sample[1], sample[2], sample[3], look, scale, mixed, rgb)
+        for channel in range(3):
+            result[channel] += weight * min(max(rgb[channel], np.float32(0.0)), ONE)
+        result[3] += weight
+        result[4] += weight * sample[6]
+    result[6] = len(samples)
 
 
 @njit
@@ -214,21 +250,22 @@ def _between(tile, x, y, z):
 
 @njit
 @no_type_check
-def _add_color(result, weight, tile, x, y, z, look, basis, scale):
+def color_at(tile, x, y, z, look, scale, mixed, rgb):
+    """Mix the bytes of the eight values around a place, and find their colour; it may lie beyond 0 to 1."""
     (i, u), (j, v), (k, w) = _corner(x), _corner(y), _corner(z)
-    rgb = np.zeros(3, np.float32)
+    mixed[:] = np.float32(0.0)
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         share = (u if a else ONE - u) * (v if b else ONE - v) * (w if c else ONE - w)
         values = tile[i + a, j + b, k + c]
-        for channel in range(3):
-            rgb[channel] += share * values[channel] / np.float32(255.0)
-        for term in range(1, basis):
-            factor = share * look[term] * (scale[2] if term < 4 else scale[3]) / np.float32(127.0)
-            for channel in range(3):
-                rgb[channel] += factor * (values[3 * term + channel] - np.float32(128.0))
+        for channel in range(len(mixed)):
+            mixed[channel] += share * values[channel]
     for channel in range(3):
-        result[channel] += weight * min(max(rgb[channel], np.float32(0.0)), ONE)
+        rgb[channel] = mixed[channel] / np.float32(255.0)
+    for term in range(1, len(look)):
+        factor = look[term] * (scale[2] if term < 4 else scale[3]) / np.float32(127.0)
+        for channel in range(3):
+            rgb[channel] += factor * (mixed[3 * term + channel] - np.float32(128.0))
 
 
 def trial() -> None:

@@ -1,9 +1,10 @@
 """Bricks: a grid of values cut into cubes, of which those are kept that hold something."""
 
+from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from nerf_lightning.errors import InputError
@@ -15,8 +16,41 @@ TILE = SIDE + 1
 """And with the border that the next bricks lend, so that every place of a brick lies between values of its tile."""
 
 
+@dataclass(frozen=True)
+class Bricks:
+    """A baked field as the kernels take it."""
+
+    index: Int[ndarray, "x y z"]
+    """The number of each brick's tile, -1 where it is empty."""
+    density: UInt8[ndarray, "bricks 9 9 9"]
+    colors: UInt8[ndarray, "bricks 9 9 9 channels"]
+    owner: Int[ndarray, "bricks 9 9 9"]
+    """Which row of a table each value of a tile is of; -1: none."""
+    scale: Float[ndarray, "numbers"]
+    step: float
+    outside: bool
+    """Whether the grid is the contracted cube of a scene without bounds."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Rays, in the grid as the kernels take them, and what they should meet."""
+
+    origins: Float[ndarray, "rays 3"]
+    directions: Float[ndarray, "rays 3"]
+    looks: Float[ndarray, "rays basis"]
+    lengths: Float[ndarray, "rays"]
+    """As `bricks.cpu.march_tiles` takes them; outside, the distance at which each begins."""
+    rgb: Float[ndarray, "rays 3"]
+    behind: Float[ndarray, "rays 3"]
+    """The colours of the background."""
+
+
 def kernels(module: str = "bricks.cpu") -> ModuleType:
-    """Return the compiled kernels, of scenes in a box or `bricks.contracted`; without them, a page would take hours.
+    """Return the compiled kernels, of scenes in a box, `bricks.contracted`, or `bricks.gradients` of both.
+
+    Without them, a page would take hours.
+
 
     Raises:
         InputError: they cannot be compiled here.
