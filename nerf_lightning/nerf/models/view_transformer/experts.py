@@ -4,6 +4,7 @@ All are computed, and the gate multiplies what they give: shapes are fixed, and 
 experts, g the gates of a point, of which two are not 0.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -53,7 +54,7 @@ class Gate(nn.Module):
     def reset_parameters(self) -> None:
         """Draw the vectors anew, and set the temperature back; the projection is torch's own to reset."""
         nn.init.normal_(self.vectors)
-        nn.init.constant_(self.log_temperature, torch.tensor(FIRST_TEMPERATURE).log().item())
+        nn.init.constant_(self.log_temperature, math.log(FIRST_TEMPERATURE))
 
     @own_precision
     def forward(self, states: Float[Tensor, "*points width"], noise: Float[Tensor, "*points experts"] | None) -> Gates:
