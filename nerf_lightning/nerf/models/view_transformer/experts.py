@@ -64,7 +64,9 @@ class Gate(nn.Module):
             states: normalised.
             noise: standard normal numbers; its deviation becomes 1 / E. None: none.
         """
-        cosines = functional.normalize(self.project(states), dim=-1) @ functional.normalize(self.vectors, dim=-1).mT
+        cosines = (
+            functional.normalize(self.project(states.float()), dim=-1) @ functional.normalize(self.vectors, dim=-1).mT
+        )
         clean = cosines / self.log_temperature.exp().clamp(min=LEAST_TEMPERATURE)
         deviation = 1.0 / len(self.vectors)
         noisy = clean if noise is None else clean + deviation * noise
