@@ -13,6 +13,7 @@ FAST_MANY = (
     *(each for each in FAST if not each.startswith(("model=", "data.crop", "trainer.tile_points"))),
     "model=view_transformer_tiny", "model.width=8", "model.heads=2", "model.num_sources=3",
     "model.sampler.num_samples=6", "model.image_features=4", "model.image_width=4", "model.image_blocks=0",
+    "model.experts=3",
     "data.views_per_step=2", "data.crop_steps=0", "trainer.precision=32-true", "trainer.num_threads=1",
     "logger=none",
 )  # fmt: skip

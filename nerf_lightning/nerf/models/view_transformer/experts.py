@@ -4,6 +4,7 @@ All are computed, and the gate multiplies what they give: shapes are fixed, and 
 experts, g the gates of a point, of which two are not 0.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -53,7 +54,7 @@ class Gate(nn.Module):
     def reset_parameters(self) -> None:
         """Draw the vectors anew, and set the temperature back; the projection is torch's own to reset."""
         nn.init.normal_(self.vectors)
-        nn.init.constant_(self.log_temperature, torch.tensor(FIRST_TEMPERATURE).log().item())
+        nn.init.constant_(self.log_temperature, math.log(FIRST_TEMPERATURE))
 
     @own_precision
     def forward(self, states: Float[Tensor, "*points width"], noise: Float[Tensor, "*points experts"] | None) -> Gates:
@@ -63,7 +64,9 @@ class Gate(nn.Module):
             states: normalised.
             noise: standard normal numbers; its deviation becomes 1 / E. None: none.
         """
-        cosines = functional.normalize(self.project(states), dim=-1) @ functional.normalize(self.vectors, dim=-1).mT
+        cosines = (
+            functional.normalize(self.project(states.float()), dim=-1) @ functional.normalize(self.vectors, dim=-1).mT
+        )
         clean = cosines / self.log_temperature.exp().clamp(min=LEAST_TEMPERATURE)
         deviation = 1.0 / len(self.vectors)
         noisy = clean if noise is None else clean + deviation * noise

@@ -21,6 +21,11 @@ def test_exactly_two_gates_are_not_zero_and_sum_to_1():
         torch.testing.assert_close(chosen.sum(dim=-1), torch.ones(chosen.shape[:-1]))
 
 
+def test_gates_are_those_of_float32_where_states_are_not():
+    gate, states = Gate(8, 4), torch.randn(3, 5, 8).bfloat16()
+    assert torch.equal(gate(states, None).shares, gate(states.float(), None).shares)
+
+
 def test_the_load_is_how_often_an_expert_is_chosen_under_the_noise():
     torch.manual_seed(2)
     gate = Gate(8, 4)

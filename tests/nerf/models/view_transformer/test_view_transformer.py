@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.looking import looking_model, rays_of_views
+from support.looking import SETTINGS, looking_model, rays_of_views
 from support.scenes import ball_scene
 
 from nerf_lightning.errors import InputError
@@ -12,7 +12,9 @@ from nerf_lightning.nerf.geometry.photographs import photographs_of
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.view_transformer.experts import Experts
+from nerf_lightning.nerf.models.view_transformer.model import ViewTransformer
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.points import Points
 
 
@@ -112,6 +114,13 @@ def test_samples_of_deep_rays_are_even_in_inverse_distance():
 def test_experts_stand_in_every_second_block():
     model = looking_model(blocks=5, experts=3)
     assert [isinstance(block.after_views, Experts) for block in model.blocks] == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize("changes", [{"experts": 4}, {"image_norm": "neurn"}, {"image_norm": "instance"}])
+def test_it_is_made_without_memory_as_a_checkpoint_is_opened(changes):
+    with torch.device("meta"):
+        model = ViewTransformer(StratifiedSampler(4), **SETTINGS, **changes)
+    assert all(weight.is_meta for weight in model.parameters())
 
 
 def test_weights_are_a_function_of_the_seed_alone():
