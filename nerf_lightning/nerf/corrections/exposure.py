@@ -35,8 +35,9 @@ class Exposure(Correction):
     Args:
         learning_rate: of the stops; Adam moves each by at most about so much in a step.
         mean_weight: factor on the sum of the squared means, which is added to the loss.
-        solves: how often the stops are solved for, after equal parts of the run; 0: they learn by gradients alone. 3 finds
-            planted exposures more exactly; it takes as long as some hundred steps, and real photographs gained nothing.
+        solves: how often the stops are solved for, after equal parts of the run; 0: they learn by gradients alone.
+            3 finds planted exposures more exactly; it takes as long as some hundred steps, and real photographs gained
+            nothing.
     """
 
     trained: Tensor
