@@ -22,7 +22,7 @@ MOST_SECONDS = 900
 SETTINGS = (
     "model=fast_small", "encoder.num_levels=4", "encoder.log2_table_size=10", "encoder.max_resolution=32",
     "field.width=16", "model.levels.fine.sampler.resolution=16", "model.levels.fine.sampler.num_steps=48",
-    "data.batch_rays=256", "data.sample_budget=4000", "data.val_rays=128", "scheduler.decay_rate=1.0",
+    "data.batch_rays=256", "data.sample_budget=4000", "data.val_rays=128", "scheduler=constant",
     "trainer.tile_points=8192", "evaluation.num_pictures=0", "evaluation.num_worst=0", "logger=none",
     "path=photographs", f"path.views=[{FILM_VIEWS[0]},{FILM_VIEWS[1]}]", "path.num_frames=2",
 )  # fmt: skip
