@@ -108,7 +108,7 @@ class PixelDomain:
 
 def gather_batch(scene: Scene, pixels: PixelIndex) -> Batch:
     """Return colours and weights of pixels."""
-    flat = scene.pixels.offset[pixels.view] + pixels.y * scene.pixels.width[pixels.view] + pixels.x
+    flat = scene.pixels.index_of(pixels.view, pixels.x, pixels.y)
     mask = scene.pixels.mask
     return Batch(
         pixels=pixels,

@@ -29,8 +29,14 @@ HARMONICS: dict[Space, dict[Quality, int]] = {
     "contracted": {"small": 4, "medium": 9, "large": 9},
 }
 COSTS = {
-    **{"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0},
-    **{"fitted": 20.0, "measured": 8.0},
+    "box": 1.0,
+    "coarse": 1.0,
+    "density": 4.0,
+    "lit": 4.0,
+    "seen": 10.0,
+    "colours": 15.0,
+    "fitted": 20.0,
+    "measured": 8.0,
 }
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
+from nerf_lightning.data.ray_batches import PixelDomain, gather_batch
 from nerf_lightning.export.baking.baked_field import LEAST_MET, BakedField, tiles_of
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.baking.seen_colors import in_coarse_steps
@@ -21,7 +22,6 @@ from nerf_lightning.nerf.kernels.bricks.layout import Bricks, Wanted, kernels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.randomness import RayRandom, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 RAYS = 8192
@@ -131,27 +131,20 @@ class _TrainingRays:
     """A part of the rays through the training photographs for each step, spread evenly over all of them."""
 
     def __init__(self, scene: Scene, views: list[int]):
-        self.scene, self.views = scene, torch.tensor(views)
-        self.sizes = scene.pixels.width[self.views] * scene.pixels.height[self.views]
-        self.ends = self.sizes.cumsum(dim=0)
+        self.scene, self.domain = scene, PixelDomain(scene, views)
         self.rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
 
     def of_step(self, step: int, marcher: Marcher) -> Wanted:
         """Return them as the kernel takes them, and what they should meet."""
-        scene, total = self.scene, int(self.ends[-1])
+        total = len(self.domain)
         stride = max(1, total // RAYS)
         numbers = torch.arange(int(stride * (step * GOLDEN % 1.0)), total, stride)
-        which = torch.searchsorted(self.ends, numbers, right=True)
-        view, within = self.views[which], numbers - (self.ends - self.sizes)[which]
-        places = scene.pixels.offset[view] + within
-        if scene.pixels.mask is not None:
-            kept = scene.pixels.mask[places] > 0
-            view, within, places = view[kept], within[kept], places[kept]
-        width, count = scene.pixels.width[view], len(view)
+        batch = gather_batch(self.scene, self.domain.locate(numbers))
+        batch = batch[batch.weight > 0]
+        count = batch.num_rays
         random = RayRandom(torch.full((count,), fold("fitting", step)), torch.arange(count))
-        behind = background_colors(scene.background, count, torch.device("cpu"), random)
-        rgb = blend(scene.pixels.rgba[places].float() / 255.0, behind)
-        pixels = PixelIndex(view=view, x=within % width, y=within // width)
-        origins, directions, looks, lengths, _ = marcher.in_grid(self.rays_of(pixels))
+        behind = background_colors(self.scene.background, count, torch.device("cpu"), random)
+        rgb = blend(batch.rgba, behind)
+        origins, directions, looks, lengths, _ = marcher.in_grid(self.rays_of(batch.pixels))
         behind = torch.zeros(count, 3) if behind is None else behind
         return Wanted(origins, directions, looks, lengths, rgb.numpy(), behind.numpy())

@@ -83,8 +83,11 @@ class Exposure(Correction):
 
     def follow(self, share: float, model: Model, rays_of: RayGenerator, tile_points: int, key: int) -> None:
         """Solve for the stops where it is time."""
-        due, self.is_held = int(share * (self.solves + 1)), bool(self.held)
-        if self.scene is None or due <= int(self.solved):
+        due = int(share * (self.solves + 1))
+        if self.scene is None or not due:
+            return
+        self.is_held = bool(self.held)
+        if due <= int(self.solved):
             return
         was_training = model.training
         model.eval()

@@ -111,19 +111,15 @@ def _seen_by(
     return row[near][solid], places[solid]
 
 
-def _index(scene: Scene, pixels: PixelIndex) -> Int[Tensor, "pixels"]:
-    store = scene.pixels
-    return store.offset[pixels.view] + pixels.y * store.width[pixels.view] + pixels.x
-
-
 def _rgba(scene: Scene, pixels: PixelIndex) -> Tensor:
-    return scene.pixels.rgba[_index(scene, pixels)]
+    return scene.pixels.rgba[scene.pixels.index_of(pixels.view, pixels.x, pixels.y)]
 
 
 def _is_solid(scene: Scene, pixels: PixelIndex) -> Bool[Tensor, "pixels"]:
     """Tell which pixels show the scene and nothing else."""
-    solid = _rgba(scene, pixels)[:, 3] == 255
-    return solid if scene.pixels.mask is None else solid & (scene.pixels.mask[_index(scene, pixels)] > 0)
+    place = scene.pixels.index_of(pixels.view, pixels.x, pixels.y)
+    solid = scene.pixels.rgba[place][:, 3] == 255
+    return solid if scene.pixels.mask is None else solid & (scene.pixels.mask[place] > 0)
 
 
 @own_precision

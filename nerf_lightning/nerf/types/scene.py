@@ -71,6 +71,12 @@ class PixelStore:
         """Tell which pixels of one view the mask keeps; None where there is no mask."""
         return None if self.mask is None else self._picture(self.mask, index) > 0
 
+    def index_of(
+        self, view: Int[Tensor, "*pixels"], x: Int[Tensor, "*pixels"], y: Int[Tensor, "*pixels"]
+    ) -> Int[Tensor, "*pixels"]:
+        """Return where pixels lie in the flat arrays."""
+        return self.offset[view] + y * self.width[view] + x
+
     def _picture(self, flat: Tensor, index: int) -> Tensor:
         start, width, height = (int(x[index]) for x in (self.offset, self.width, self.height))
         return flat[start : start + width * height].view(height, width, *flat.shape[1:])

@@ -13,7 +13,7 @@ from numpy import ndarray
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
-COMPILED_WITH = "e1f7f3f2"
+COMPILED_WITH = "a22e28bc"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 OPAQUE_DEPTH = np.float32(6.0)
@@ -173,12 +173,11 @@ def walk(origin, along, index, density, scale, step, length, samples):
     A sample is a tile, a place in it (3), its share of the light, its opacity, its distance, and by how much its
     optical depth changes when its byte does.
     """
-    size = np.array([index.shape[0] * SIDE, index.shape[1] * SIDE, index.shape[2] * SIDE], np.float32)
     nothing, doubling = np.exp2(scale[0]), LOG_2 * scale[1]
     enter, leave = np.float32(0.0), np.float32(1e9)
     for axis in range(3):
         speed = along[axis] if abs(along[axis]) > TINY else TINY
-        a, b = -origin[axis] / speed, (size[axis] - origin[axis]) / speed
+        a, b = -origin[axis] / speed, (np.float32(index.shape[axis] * SIDE) - origin[axis]) / speed
         enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     number, through, count, asked = 0, ONE, 0, 0
     while through > LEAST_TRANSMITTANCE:

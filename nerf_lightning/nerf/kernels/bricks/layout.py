@@ -51,7 +51,6 @@ def kernels(module: str = "bricks.cpu") -> ModuleType:
 
     Without them, a page would take hours.
 
-
     Raises:
         InputError: they cannot be compiled here.
     """

@@ -47,10 +47,11 @@ def possible_cells(
     if scene.pixels.has_transparency:
         seen_through = torch.zeros(len(cells), dtype=torch.int16)
         for view in evenly_spaced_subset(views, most_views):
-            left = cells.clone()
+            left = cells.clone() if scene.refined else cells
             steps.carve(left, scene.cameras, view, centers, half_diagonal, _matter(scene, view))
-            seen_through += cells & ~left
-            cells &= seen_through < (AGREEING if scene.refined else 1)
+            if scene.refined:
+                seen_through += cells & ~left
+                cells &= seen_through < AGREEING
     return cells
 
 
