@@ -11,6 +11,7 @@ from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
+from nerf_lightning.nerf.products import Products, cpu_multiplies_bfloat16
 
 POINTS, RAY_SAMPLES = 65_536, 32
 
@@ -18,7 +19,10 @@ POINTS, RAY_SAMPLES = 65_536, 32
 def kernel_ratios(device: torch.device, rounds: int) -> dict[str, list[float]]:
     """Return seconds of our kernels, and how many times longer torch takes, round by round (forward and backward)."""
     result: dict[str, list[float]] = {}
-    for name, kinds in {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device)}.items():
+    compared = {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device, "float32")}
+    if device.type != "cpu" or cpu_multiplies_bfloat16():
+        compared["MLP 32-64-64-3 in bfloat16"] = _mlp(device, "bfloat16")
+    for name, kinds in compared.items():
         seconds = {kind: [seconds_of(work) for _ in range(2)][1:] for kind, work in kinds.items()}
         for _ in range(rounds):
             for kind, work in kinds.items():
@@ -48,12 +52,11 @@ def _hash_grid(device: torch.device) -> dict[str, Callable[[], None]]:
     return _kinds(lambda fn: fn(table, points, layout), interpolate, interpolate_torch, [table], grad)
 
 
-def _mlp(device: torch.device) -> dict[str, Callable[[], None]]:
+def _mlp(device: torch.device, products: Products) -> dict[str, Callable[[], None]]:
     weights = [torch.randn(b, a, device=device, requires_grad=True) for a, b in ((32, 64), (64, 64), (64, 3))]
     points = torch.randn(POINTS, 32, device=device, requires_grad=True)
-    return _kinds(
-        lambda fn: fn(points, weights), mlp, mlp_torch, [points, *weights], torch.randn(POINTS, 3, device=device)
-    )
+    leaves, grad = [points, *weights], torch.randn(POINTS, 3, device=device)
+    return _kinds(lambda fn: fn(points, weights, products), mlp, mlp_torch, leaves, grad)
 
 
 def _kinds(

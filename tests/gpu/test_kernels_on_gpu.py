@@ -3,6 +3,7 @@
 import pytest
 import torch
 from support.self_tested import a_place
+from support.triton_perceptron import check_perceptron
 from support.triton_twin import check_against_the_reference
 
 from nerf_lightning.nerf.kernels import backends
@@ -31,6 +32,10 @@ def test_a_kernel_agrees_with_its_reference(name, device):
 
 def test_triton_agrees_on_many_points_and_in_half_precision(cuda):
     check_against_the_reference("cuda", 30_000)
+
+
+def test_tritons_perceptron_agrees_on_whole_numbers(cuda):
+    check_perceptron("cuda", [0, 1, 127, 128, 129, 70_000])
 
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 1 << 20])

@@ -120,7 +120,7 @@ def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
 
 def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
     """Return a triton module for tensors on a CUDA device; else None."""
-    return twin(module) if device.type == "cuda" else None
+    return twin(module) if device.type == "cuda" and is_on(module) else None
 
 
 def can_compile(device: torch.device) -> bool:

@@ -130,7 +130,7 @@ class PackedLevel(Level):
         with torch.no_grad():
             density, features = self.field.density(packed_points(rays, samples, random, self.field.sees_cones))
             kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.sampler.opaque_below))
-            return samples.at(*kept), None if features is None else features[kept[0]]
+            return samples.at(*kept), None if features is None else features.index_select(0, kept[0])
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         walk = self.sampler.walk(rays)

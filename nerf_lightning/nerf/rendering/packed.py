@@ -37,5 +37,5 @@ def composite_packed(
 
 def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
     """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
-    kept = (samples.place < counts[samples.ray_index]).nonzero()[:, 0]
+    kept = (samples.place < counts.index_select(0, samples.ray_index)).nonzero()[:, 0]
     return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

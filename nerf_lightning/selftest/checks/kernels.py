@@ -112,7 +112,7 @@ def checks(place: Place) -> list[Check]:
 def _twins(place: Place) -> list[Check]:
     """Return a check for each compiled kernel: whether it runs at all. What it computes, the checks below say."""
     if place.is_cuda:
-        return [_loads("hash_grid.cuda", "triton")]
+        return [_loads("hash_grid.cuda", "triton"), _loads("mlp.cuda", "triton")]
     if place.device.type == "cpu":
         found = [_loads(name, "numba") for name in CPU_TWINS]
         return [*found, _absent("hash_grid (triton)", "it is for GPUs, and the device here is the CPU")]

@@ -1,7 +1,8 @@
 """Small multilayer perceptrons without biases: matrix products with ReLU between them.
 
 At widths of 64 a general framework spends as much on moving activations through memory as on arithmetic. On the CPU
-each core takes tiles of rows through all layers, forward and backward, so that they stay in its cache.
+each core takes tiles of rows through all layers, forward and backward, so that they stay in its cache; on CUDA a block
+of rows stays in registers.
 """
 
 from types import ModuleType
@@ -11,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import is_on, twin
+from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin, is_on
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
 from nerf_lightning.nerf.products import Products, cpu_multiplies_bfloat16, linear
 
@@ -20,9 +21,10 @@ def mlp(
     points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
 ) -> Float[Tensor, "points out"]:
     """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32."""
-    if points.device.type != "cpu" or points.dtype == torch.float64 or not is_on("mlp.cpu"):
+    found = _kernels_for(points, weights, products)
+    if found is None:
         return mlp_torch(points, weights, products)
-    kernels, dtype = _kernels_for(points, weights, products)
+    kernels, dtype = found
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
         return _TiledMLP.apply(points, kernels, dtype, *weights)
     return kernels.forward(points.detach(), [weight.detach().to(dtype) for weight in weights], keep=False)[0]
@@ -31,21 +33,29 @@ def mlp(
 def mlp_torch(
     points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
 ) -> Float[Tensor, "points out"]:
-    """Return the same in plain torch: the reference, and what runs on GPUs."""
+    """Return the same in plain torch: the reference, and what runs where there are no kernels."""
     for weight in weights[:-1]:
         points = linear(points, weight, None, products).relu_()
     return linear(points, weights[-1], None, products)
 
 
-def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> tuple[ModuleType, torch.dtype]:
-    """Return the CPU's kernels, and what they take the weights in; those for its own bfloat16 round by themselves."""
+def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> tuple[ModuleType, torch.dtype] | None:
+    """Return the device's kernels, and what they take the weights in; those for bfloat16 round by themselves."""
+    if points.dtype == torch.float64:
+        return None
+    if points.is_cuda:
+        return _own(cuda_twin("mlp.cuda", points.device), weights) if products == "bfloat16" else None
+    if not points.is_cpu or not is_on("mlp.cpu"):
+        return None
     if products != "bfloat16":
         return mlp_cpu, points.dtype
-    if cpu_multiplies_bfloat16() and is_on("mlp.bfloat16"):
-        own = twin("mlp.bfloat16")
-        if own is not None and own.takes([weight.shape[1] for weight in weights]):
-            return own, torch.float32
-    return mlp_cpu, torch.bfloat16
+    own = cpu_multiplies_bfloat16() and _own(cpu_twin("mlp.bfloat16", points.device), weights)
+    return own or (mlp_cpu, torch.bfloat16)
+
+
+def _own(kernels: ModuleType | None, weights: list[Tensor]) -> tuple[ModuleType, torch.dtype] | None:
+    takes = kernels is not None and kernels.takes([weight.shape[1] for weight in weights])
+    return (kernels, torch.float32) if kernels is not None and takes else None
 
 
 class _TiledMLP(torch.autograd.Function):

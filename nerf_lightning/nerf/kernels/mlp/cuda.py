@@ -1,0 +1,214 @@
+"""The perceptron in bfloat16 for CUDA: a block of rows goes through all layers without leaving the registers.
+
+A framework writes and reads the activations of each layer; here only what the way back needs is written. Products are
+of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import BFloat16, Float
+from torch import Tensor
+from torch.nn import functional
+
+BLOCK = 128
+PROGRAMS = 256
+"""So many sum up the gradients of the weights, each for itself: the order of sums, and so their bits, are fixed."""
+NARROWEST, WIDEST = 16, 128
+LAYERS = (2, 3)
+
+
+def takes(widths: Sequence[int]) -> bool:
+    """Tell whether the kernels take a perceptron whose layers have inputs of these widths."""
+    return len(widths) in LAYERS and max(widths) <= WIDEST
+
+
+def forward(
+    points: Float[Tensor, "points in"], weights: Sequence[Tensor], keep: bool
+) -> tuple[Float[Tensor, "points out"], BFloat16[Tensor, "kept words"]]:
+    """Return the outputs, and the inputs of all layers where they are to be kept."""
+    widths, rows = _padded_widths(weights), points.shape[0]
+    out = torch.empty(rows, weights[-1].shape[0], device=points.device)
+    kept = out.new_empty(rows if keep else 0, sum(widths[:-1]), dtype=torch.bfloat16)
+    if rows:
+        arrays = points.contiguous(), _packed(weights, widths), out, kept
+        sizes = points.shape[1], out.shape[1], *widths, widths[-1]
+        _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *sizes[:6], len(weights), keep, BLOCK, _interpreted(out))
+    return out, kept
+
+
+def backward(
+    grad: Float[Tensor, "points out"], weights: Sequence[Tensor], kept: BFloat16[Tensor, "points words"],
+    wants_points: bool,
+) -> tuple[Float[Tensor, "points in"] | None, list[Tensor]]:  # fmt: skip
+    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
+    widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
+    of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
+    programs = max(1, min(PROGRAMS, triton.cdiv(rows, BLOCK)))
+    sums = of_points.new_zeros(programs, sum(a * b for a, b in pairwise(widths)))
+    if rows:
+        arrays = grad.contiguous(), _packed(weights, widths), kept, of_points, sums
+        sizes = inputs, grad.shape[1], *widths, widths[-1]
+        _backward[(programs,)](*arrays, rows, *sizes[:6], len(weights), wants_points, BLOCK, _interpreted(sums))
+    total, grads, place = sums.sum(dim=0), [], 0
+    for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
+        of_weight = total[place : place + inner * outer].view(outer, inner)
+        grads.append(of_weight[: weight.shape[0], : weight.shape[1]])
+        place += inner * outer
+    return of_points if wants_points else None, grads
+
+
+def trial(device: str = "cuda") -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler or driver raises.
+
+    Raises:
+        RuntimeError: it multiplies wrongly; all numbers here are powers of two, or three times one, and so exact.
+    """
+    for hidden in range(1, max(LAYERS)):
+        points, count = torch.ones(3, 16, device=device), 16.0**hidden
+        weights = [torch.ones(16, 16, device=device) for _ in range(hidden)] + [torch.ones(3, 16, device=device)]
+        out, kept = forward(points, weights, keep=True)
+        of_points, of_weights = backward(torch.ones_like(out), weights, kept, wants_points=True)
+        expected = torch.full_like(out, 16.0 * count), torch.full_like(points, 3.0 * count)
+        if not (torch.equal(out, expected[0]) and of_points is not None and torch.equal(of_points, expected[1])):
+            raise RuntimeError("a trial of its kernels gave wrong numbers")
+        if not torch.equal(of_weights[-1], torch.full_like(of_weights[-1], 3.0 * count)):
+            raise RuntimeError("a trial of its kernels gave wrong gradients")
+
+
+def _padded_widths(weights: Sequence[Tensor]) -> list[int]:
+    """Return the widths of all layers' inputs and of what comes out, in sizes that tensor cores take."""
+    widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
+    return [max(NARROWEST, triton.next_power_of_2(width)) for width in widths]
+
+
+def _packed(weights: Sequence[Tensor], widths: Sequence[int]) -> BFloat16[Tensor, "numbers"]:
+    """Return all layers' weights with zeros around them, row by row, one after the other."""
+    padded = [
+        functional.pad(weight, (0, inner - weight.shape[1], 0, outer - weight.shape[0])).flatten()
+        for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True)
+    ]
+    return torch.cat(padded).bfloat16()
+
+
+def _interpreted(tensor: Tensor) -> bool:
+    """Tell whether triton's interpreter runs, which multiplies no bfloat16 numbers."""
+    return not tensor.is_cuda
+
+
+@triton.jit
+@no_type_check
+def _multiply(left, right, widen: tl.constexpr):
+    if widen:
+        left, right = left.to(tl.float32), right.to(tl.float32)
+    return tl.dot(left, right)
+
+
+@triton.jit
+@no_type_check
+def _weights(packed, inner: tl.constexpr, outer: tl.constexpr):
+    return tl.load(packed + tl.arange(0, outer)[:, None] * inner + tl.arange(0, inner)[None, :])
+
+
+@triton.jit
+@no_type_check
+def _rows(array, row, count, width: tl.constexpr, padded: tl.constexpr):
+    """Return some rows of `width` numbers as bfloat16, with zeros beside and below them."""
+    column = tl.arange(0, padded)
+    there = (row < count)[:, None] & (column < width)[None, :]
+    return tl.load(array + row[:, None] * width + column[None, :], mask=there, other=0.0).to(tl.bfloat16)
+
+
+@triton.jit
+@no_type_check
+def _kept_at(kept, row, words: tl.constexpr, first: tl.constexpr, width: tl.constexpr):
+    return kept + row[:, None] * words + first + tl.arange(0, width)[None, :]
+
+
+@triton.jit
+@no_type_check
+def _activated(x, packed, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr):
+    sums = _multiply(x, tl.trans(_weights(packed, inner, outer)), widen)
+    return tl.maximum(sums, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.bfloat16)
+
+
+@triton.jit
+@no_type_check
+def _forward(
+    points, packed, out, kept, count,
+    inputs: tl.constexpr, outputs: tl.constexpr, d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr,
+    d3: tl.constexpr, layers: tl.constexpr, keep: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
+):  # fmt: skip
+    row = (tl.program_id(0) * block + tl.arange(0, block)).to(tl.int64)
+    valid = (row < count)[:, None]
+    words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
+    x = _rows(points, row, count, inputs, d0)
+    y = _activated(x, packed, d0, d1, widen)
+    if keep:
+        tl.store(_kept_at(kept, row, words, 0, d0), x, mask=valid)
+        tl.store(_kept_at(kept, row, words, d0, d1), y, mask=valid)
+    if layers == 3:
+        z = _activated(y, packed + d0 * d1, d1, d2, widen)
+        if keep:
+            tl.store(_kept_at(kept, row, words, d0 + d1, d2), z, mask=valid)
+        sums = _multiply(z, tl.trans(_weights(packed + d0 * d1 + d1 * d2, d2, d3)), widen)
+        column = tl.arange(0, d3)
+    else:
+        sums = _multiply(y, tl.trans(_weights(packed + d0 * d1, d1, d2)), widen)
+        column = tl.arange(0, d2)
+    tl.store(out + row[:, None] * outputs + column[None, :], sums, mask=valid & (column < outputs)[None, :])
+
+
+@triton.jit
+@no_type_check
+def _passed_back(flowing, x, packed, inner: tl.constexpr, outer: tl.constexpr, widen: tl.constexpr):
+    """Return the gradient of a layer's inputs x before their ReLU."""
+    sums = _multiply(flowing, _weights(packed, inner, outer), widen)
+    return tl.where(x.to(tl.float32) > 0.0, sums, 0.0).to(tl.bfloat16)
+
+
+@triton.jit
+@no_type_check
+def _store_sum(sums, first: tl.constexpr, of_weight, inner: tl.constexpr, outer: tl.constexpr):
+    tl.store(sums + first + tl.arange(0, outer)[:, None] * inner + tl.arange(0, inner)[None, :], of_weight)
+
+
+@triton.jit
+@no_type_check
+def _backward(
+    grad, packed, kept, of_points, sums, count,
+    inputs: tl.constexpr, outputs: tl.constexpr, d0: tl.constexpr, d1: tl.constexpr, d2: tl.constexpr,
+    d3: tl.constexpr, layers: tl.constexpr, wants_points: tl.constexpr, block: tl.constexpr, widen: tl.constexpr,
+):  # fmt: skip
+    words: tl.constexpr = d0 + d1 if layers == 2 else d0 + d1 + d2
+    of_0, of_1 = tl.zeros([d1, d0], tl.float32), tl.zeros([d2, d1], tl.float32)
+    of_2 = tl.zeros([d3, d2], tl.float32)
+    for start in range(tl.program_id(0) * block, count, tl.num_programs(0) * block):
+        row = (start + tl.arange(0, block)).to(tl.int64)
+        valid = (row < count)[:, None]
+        if layers == 3:
+            flowing = _rows(grad, row, count, outputs, d3)
+            z = tl.load(_kept_at(kept, row, words, d0 + d1, d2), mask=valid, other=0.0)
+            of_2 += _multiply(tl.trans(flowing), z, widen)
+            flowing = _passed_back(flowing, z, packed + d0 * d1 + d1 * d2, d2, d3, widen)
+        else:
+            flowing = _rows(grad, row, count, outputs, d2)
+        y = tl.load(_kept_at(kept, row, words, d0, d1), mask=valid, other=0.0)
+        of_1 += _multiply(tl.trans(flowing), y, widen)
+        flowing = _passed_back(flowing, y, packed + d0 * d1, d1, d2, widen)
+        x = tl.load(_kept_at(kept, row, words, 0, d0), mask=valid, other=0.0)
+        of_0 += _multiply(tl.trans(flowing), x, widen)
+        if wants_points:
+            column = tl.arange(0, d0)
+            there = valid & (column < inputs)[None, :]
+            into = of_points + row[:, None] * inputs + column[None, :]
+            tl.store(into, _multiply(flowing, _weights(packed, d0, d1), widen), mask=there)
+    own = sums + tl.program_id(0) * (d0 * d1 + d1 * d2 + (d2 * d3 if layers == 3 else 0))
+    _store_sum(own, 0, of_0, d0, d1)
+    _store_sum(own, d0 * d1, of_1, d1, d2)
+    if layers == 3:
+        _store_sum(own, d0 * d1 + d1 * d2, of_2, d2, d3)

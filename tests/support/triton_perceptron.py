@@ -1,0 +1,45 @@
+"""The CUDA twin of the perceptron against its reference, on a GPU or through triton's interpreter.
+
+Whole numbers so small that every sum is exact in bfloat16, whichever way somebody rounds: the two must be equal.
+"""
+
+from itertools import pairwise
+
+import torch
+
+from nerf_lightning.nerf.kernels.mlp.mlp import mlp_torch
+
+SIZES = [(32, 64, 16), (32, 64, 64, 3), (20, 40, 24, 5), (16, 16, 1)]
+
+
+def _weight(outer, inner, generator):
+    """Two ones or minus ones a row, and zeros: sums at most double from layer to layer."""
+    weight = torch.zeros(outer, inner)
+    for row in weight:
+        row[torch.randperm(inner, generator=generator)[:2]] = torch.tensor([1.0, -1.0])
+    return weight
+
+
+def check_perceptron(device, counts):
+    from nerf_lightning.nerf.kernels.mlp import cuda as twin
+
+    twin.trial(device)
+    generator = torch.Generator().manual_seed(7)
+    for sizes in SIZES:
+        assert twin.takes(sizes[:-1])
+        weights = [_weight(outer, inner, generator).to(device) for inner, outer in pairwise(sizes)]
+        for count in counts:
+            points = torch.randint(-3, 4, (count, sizes[0]), generator=generator).float().to(device)
+            grad = torch.randint(-1, 2, (count, sizes[-1]), generator=generator).float().to(device)
+            leaves = [each.clone().requires_grad_() for each in (points, *weights)]
+            expected = mlp_torch(leaves[0], leaves[1:])
+            expected.backward(grad)
+            out, kept = twin.forward(points, weights, keep=True)
+            of_points, of_weights = twin.backward(grad, weights, kept, wants_points=True)
+            assert torch.equal(out, expected.detach()), (sizes, count)
+            for found, leaf in zip((of_points, *of_weights), leaves, strict=True):
+                assert torch.equal(found, leaf.grad), (sizes, count, found.shape)
+            assert torch.equal(twin.forward(points, weights, keep=False)[0], out)
+            assert twin.backward(grad, weights, kept, wants_points=False)[0] is None
+    assert not twin.takes([32])
+    assert not twin.takes([32, 256])
