@@ -86,8 +86,8 @@ class PackedSamples(TensorStruct):
 
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""
-        of_sample = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
-        return PackedSamples(*of_sample, bounds, self.found)
+        ray, starts, ends = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
+        return PackedSamples(ray, starts, ends, bounds, self.found)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:
