@@ -18,6 +18,7 @@ from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.ray_statistics import median_distances
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle, RaySamples
+from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.visualization.pictures import to_bytes
 
 # So many rays of the training views are asked.
@@ -105,21 +106,30 @@ def surface_colors(
     for part in tiles(len(points), max(1, tile_points // SAMPLES)):
         at, normal = points[part], normals[part]
         looks = -normal[None] if seen_from == "normal" else looks_from_facing(at, normal, eyes)
-        rgb = [_short_rays(model, at.to(device), look.to(device), reach) for look in looks]
+        rgb = [short_rays(model, at.to(device), look.to(device), reach, closed=True).rgb for look in looks]
         colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
         report(stage, part.stop / max(1, len(points)))
     return colors
 
 
-def _short_rays(model: Model, at: Tensor, look: Tensor, reach: float) -> Float[Tensor, "points 3"]:
-    # From before the surface to behind it; what light is left then ends there.
+def short_rays(
+    model: Model, at: Float[Tensor, "points 3"], look: Float[Tensor, "points 3"], reach: float, closed: bool
+) -> DenseRendering:
+    """Return what rays see from a little before points to a little behind them, asking the last level alone.
+
+    Args:
+        model: in evaluation mode.
+        at: on the surface, scene frame.
+        look: unit directions.
+        reach: half the length of a ray, scene units.
+        closed: whether all light ends on them, that which is left at their ends; else it goes on.
+    """
     edges = torch.linspace(0.0, 2.0 * reach, SAMPLES + 1, device=at.device).expand(len(at), SAMPLES + 1)
     samples, origins = RaySamples(edges), at - reach * look
     positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
     output = model.at(Points(positions, look[:, None]))
-    near = torch.zeros(len(at), device=at.device)
-    rays = RayBundle(origins, look, near, near + 2.0 * reach, look)
-    return composite(output, samples, rays, None).rgb
+    near, behind = torch.zeros(len(at), device=at.device), None if closed else torch.zeros_like(at)
+    return composite(output, samples, RayBundle(origins, look, near, near + 2.0 * reach, look), behind)
 
 
 # Cameras that are taken of each point.

@@ -12,6 +12,7 @@ from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.atlas import Texels
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.export.mesh_files import require_library
+from nerf_lightning.export.surface import SAMPLES, short_rays
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates, project
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -51,7 +52,10 @@ def require_texture_room(size: int) -> None:
 
 
 class TextureMaker:
-    """Look at the places of a mesh from the training cameras, along whole rays: so as photographs show them.
+    """Look at the places of a mesh from the training cameras that see them best.
+
+    How well a camera sees a vertex is told by a whole ray; the colour of a texel then by a short one, from a little
+    before the surface to a little behind it, so that the haze before a surface is not painted on it.
 
     Args:
         model: in evaluation mode.
@@ -73,7 +77,7 @@ class TextureMaker:
     ):
         self.model, self.record, self.tile_points = model, record, tile_points
         self.points, self.normals, self.reach = points, normals, reach
-        self.views = evenly_spaced_subset(record.splits["train"], VIEWS)
+        self.views, self.device = evenly_spaced_subset(record.splits["train"], VIEWS), next(model.parameters()).device
 
     def __call__(self, texels: Texels, size: int, report: Report) -> UInt8[ndarray, "size size 3"]:
         """Return the picture; between charts the nearest colour goes on, so that no seam shows.
@@ -108,8 +112,7 @@ class TextureMaker:
             cosine = self._facing(view)
             asked = (cosine > LEAST_COSINE).nonzero()[:, 0]
             if len(asked):
-                arrives, _, _ = self._look(self.points[asked], torch.full_like(asked, view))
-                scores[asked, number] = cosine[asked].square() * arrives
+                scores[asked, number] = cosine[asked].square() * self._arriving(self.points[asked], view)
             report("sight", (number + 1) / len(self.views))
         return scores
 
@@ -131,34 +134,32 @@ class TextureMaker:
         score = sum(shares[:, corner, None] * scores[corners[:, corner]] for corner in range(3))
         best, which = torch.as_tensor(score).topk(min(LOOKS, len(self.views)), dim=1)
         light, weight = torch.zeros(len(at), 3), torch.zeros(len(at))
-        views = torch.tensor(self.views)
+        eyes = self.record.cameras.c2w[torch.tensor(self.views), :, 3]
         for look in range(best.shape[1]):
             asked = (best[:, look] > 0).nonzero()[:, 0]
-            if not len(asked):
-                continue
-            arrives, stopped, rgb = self._look(at[asked], views[which[asked, look]])
-            share = best[asked, look] * arrives
-            light[asked] += share[:, None] * rgb
-            weight[asked] += share * stopped
+            share = best[asked, look]
+            for some in tiles(len(asked), max(1, self.tile_points // SAMPLES)):
+                here = asked[some]
+                way = normalize(at[here] - eyes[which[here, look]], dim=-1)
+                places, ways = at[here].to(self.device), way.to(self.device)
+                seen = short_rays(self.model, places, ways, self.reach, closed=False)
+                light[here] += share[some, None] * seen.foreground.cpu()
+                weight[here] += share[some] * seen.opacity.cpu()
         return light / weight.clamp(min=torch.finfo(weight.dtype).tiny)[:, None], weight > LEAST_SEEN
 
-    def _look(
-        self, at: Float[Tensor, "points 3"], view: Tensor
-    ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points"], Float[Tensor, "points 3"]]:
-        """Return the light that comes from each place to a view, what the ray there stops, and its colour times that.
-
-        Rays end a little behind the place.
-        """
-        record, device = self.record, next(self.model.parameters()).device
+    def _arriving(self, at: Float[Tensor, "points 3"], view: int) -> Float[Tensor, "points"]:
+        """Return the share of the light that comes from each place to a view."""
+        record = self.record
         way = at - record.cameras.c2w[view, :, 3]
         distance = way.norm(dim=-1)
-        directions = way / distance[:, None]
-        near = torch.minimum(record.near[view], distance - self.reach).clamp(min=0.0)
-        rays = RayBundle(record.cameras.c2w[view, :, 3], directions, near, distance + self.reach, directions).to(device)
+        directions, origins = way / distance[:, None], record.cameras.c2w[view, :, 3].expand(at.shape)
+        end = distance - self.reach
+        near = torch.minimum(record.near[view], end).clamp(min=0.0)
+        # A little beyond the place, since a ray that ends at once would be sampled at the surface alone.
+        rays = RayBundle(origins, directions, near, distance + self.reach, directions).to(self.device)
         found = []
-        key = fold(0, "surface")
-        for tile, levels in weighted_renderings(self.model, rays, record.background, key, self.tile_points):
-            arrives = transmittance_at(levels[-1], tile, tile.far - 2.0 * self.reach)
-            found.append((arrives.cpu(), levels[-1].opacity.cpu(), levels[-1].foreground.cpu()))
-        arrives, stopped, rgb = (torch.cat(parts).float() for parts in zip(*found, strict=True))
-        return arrives, stopped, rgb
+        for tile, levels in weighted_renderings(
+            self.model, rays, record.background, fold(0, "surface"), self.tile_points
+        ):
+            found.append(transmittance_at(levels[-1], tile, tile.far - 2.0 * self.reach).cpu())
+        return torch.cat(found).float()

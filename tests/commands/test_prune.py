@@ -60,7 +60,7 @@ def test_a_run_is_pruned_packed_measured_and_trained_on(nerf, stopped_fast, capt
     assert result.code == 0, result.err
     small, run = tmp_path / "small" / "checkpoints" / "last.ckpt", tmp_path / "small" / "finetuned"
     weights = read_checkpoint(small).weights
-    assert weights["levels.fine.field.color_mlp.1"].shape == (8, 8)
+    assert weights["levels.fine.field.color_mlp.1"].shape == (3, 8)
     assert weights["levels.fine.field.position_encoder.table"].dtype == torch.float32
     assert read_checkpoint(run).step == 2
     assert "field.width=8" in yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text())

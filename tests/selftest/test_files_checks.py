@@ -95,7 +95,7 @@ def test_on_a_gpu_other_weights_are_wrong_and_rounding_is_not(copied):
 
 
 def test_a_checkpoint_that_lost_weights_is_wrong(copied):
-    change(copied, "whole", lambda content: content["state_dict"]["model.levels.fine.field.color_mlp.2"].mul_(0.5))
+    change(copied, "whole", lambda content: content["state_dict"]["model.levels.fine.field.color_mlp.1"].mul_(0.5))
     assert verdicts(copied)["checkpoint"] == "wrong"
 
 

@@ -32,7 +32,9 @@ def points(count=50):
 def hash_field(width=32):
     small = "encoder.num_levels=3", "encoder.log2_table_size=8", "encoder.max_resolution=16"
     torch.manual_seed(2)
-    field = build(composed("train", "model=fast", *small, f"field.width={width}", "field.density_bias=0.0").field)
+    field = build(
+        composed("train", "model=fast", "field=hash", *small, f"field.width={width}", "field.density_bias=0.0").field
+    )
     torch.nn.init.normal_(field.position_encoder.table)
     return field
 
