@@ -106,14 +106,22 @@ def surface_colors(
     for part in tiles(len(points), max(1, tile_points // SAMPLES)):
         at, normal = points[part], normals[part]
         looks = -normal[None] if seen_from == "normal" else looks_from_facing(at, normal, eyes)
-        rgb = [short_rays(model, at.to(device), look.to(device), reach, closed=True).rgb for look in looks]
+        rgb = [
+            short_rays(model, at.to(device), look.to(device), reach, reach, SAMPLES, closed=True).rgb for look in looks
+        ]
         colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
         report(stage, part.stop / max(1, len(points)))
     return colors
 
 
 def short_rays(
-    model: Model, at: Float[Tensor, "points 3"], look: Float[Tensor, "points 3"], reach: float, closed: bool
+    model: Model,
+    at: Float[Tensor, "points 3"],
+    look: Float[Tensor, "points 3"],
+    before: float,
+    behind: float,
+    samples: int,
+    closed: bool,
 ) -> DenseRendering:
     """Return what rays see from a little before points to a little behind them, asking the last level alone.
 
@@ -121,15 +129,17 @@ def short_rays(
         model: in evaluation mode.
         at: on the surface, scene frame.
         look: unit directions.
-        reach: half the length of a ray, scene units.
+        before: how far before the points rays begin, scene units.
+        behind: how far behind them they end.
+        samples: of each ray.
         closed: whether all light ends on them, that which is left at their ends; else it goes on.
     """
-    edges = torch.linspace(0.0, 2.0 * reach, SAMPLES + 1, device=at.device).expand(len(at), SAMPLES + 1)
-    samples, origins = RaySamples(edges), at - reach * look
-    positions = origins[:, None] + samples.midpoints[..., None] * look[:, None]
+    edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
+    intervals, origins = RaySamples(edges), at - before * look
+    positions = origins[:, None] + intervals.midpoints[..., None] * look[:, None]
     output = model.at(Points(positions, look[:, None]))
-    near, behind = torch.zeros(len(at), device=at.device), None if closed else torch.zeros_like(at)
-    return composite(output, samples, RayBundle(origins, look, near, near + 2.0 * reach, look), behind)
+    near, beyond = torch.zeros(len(at), device=at.device), None if closed else torch.zeros_like(at)
+    return composite(output, intervals, RayBundle(origins, look, near, near + before + behind, look), beyond)
 
 
 # Cameras that are taken of each point.
