@@ -62,7 +62,7 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
 
 
 def test_exposures_are_told_from_the_scene():
-    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.998, 0.994 and 0.986."""
+    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.997, 0.989 and 0.980, and 30.5 dB."""
     views = 60
     scene = bricks(64, views)
     clean, stops = with_stops(scene, torch.zeros(views, 3), dim=0.5), random_stops(views)
@@ -72,7 +72,7 @@ def test_exposures_are_told_from_the_scene():
     agreement = [float(torch.corrcoef(torch.stack(pair))[0, 1]) for pair in zip(found.T, stops.T, strict=True)]
     assert agreement[0] > 0.99
     assert min(agreement[1:]) > 0.96
-    assert quality(corrected, clean) > 29.0
+    assert quality(corrected, clean) > 29.5
 
 
 def test_a_ball_that_jumps_between_photographs_is_left_out():
