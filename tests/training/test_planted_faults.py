@@ -49,7 +49,7 @@ def quality(step, scene):
 
 
 def test_cameras_that_are_a_little_wrong_find_their_place():
-    """Of 1 degree and 1 % of the distance on each of 100 cameras, 0.16 degrees and 0.23 % were left."""
+    """Of 1 degree and 1 % of the distance on each of 100 cameras, 0.15 degrees and 0.23 % were left."""
     true = bricks(128, views=100)
     scene = with_noise(true, degrees=1.0, share=0.01)
     step = trained(scene, 2000, "data.batch_rays=2048", "refinement=se3", "encoder.blend_in=0.5")
@@ -62,7 +62,7 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
 
 
 def test_exposures_are_told_from_the_scene():
-    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.998, 0.994 and 0.986."""
+    """Of +-1 EV and +-20 % of red and blue, the correlations were 0.997, 0.989 and 0.980, and 30.5 dB."""
     views = 60
     scene = bricks(64, views)
     clean, stops = with_stops(scene, torch.zeros(views, 3), dim=0.5), random_stops(views)
@@ -72,11 +72,11 @@ def test_exposures_are_told_from_the_scene():
     agreement = [float(torch.corrcoef(torch.stack(pair))[0, 1]) for pair in zip(found.T, stops.T, strict=True)]
     assert agreement[0] > 0.99
     assert min(agreement[1:]) > 0.96
-    assert quality(corrected, clean) > 29.0
+    assert quality(corrected, clean) > 29.5
 
 
 def test_a_ball_that_jumps_between_photographs_is_left_out():
-    """On clean photographs 24.8 dB were reached, with the ball 20.6, with the ball and the robust loss 24.0."""
+    """On clean photographs 26.1 dB were reached, with the ball 20.6, with the ball and the robust loss 25.0."""
     small = (
         "data.batch_rays=1024", "data.sample_budget=16384", "encoder.num_levels=4", "encoder.log2_table_size=12",
         "encoder.max_resolution=64", "field.width=32", "model.levels.fine.sampler.resolution=32",
@@ -84,5 +84,5 @@ def test_a_ball_that_jumps_between_photographs_is_left_out():
     )  # fmt: skip
     clean = bricks(32, views=40)
     spoilt = with_jumping_ball(clean)
-    plain, robust = (trained(spoilt, 800, *small, *loss) for loss in ((), ("loss=robust", "loss.patch=4")))
-    assert quality(robust, clean) > quality(plain, clean) + 2.0
+    plain, robust = (trained(spoilt, 800, *small, *loss) for loss in ((), ("loss=robust",)))
+    assert quality(robust, clean) > quality(plain, clean) + 3.0

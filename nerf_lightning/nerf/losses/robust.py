@@ -38,7 +38,7 @@ class RobustLoss(Loss):
     Args:
         of: the loss that the others count in, for all its levels.
         share: least share of the pixels that surely show the scene. Less trims more: passers-by faster, fine detail
-            later.
+            later. It must exceed the share of a plain background, whose residuals are 0 and say nothing of the scene.
         times: the threshold, in units of that quantile (squared errors: 4 is twice the distance of colours).
         patch: side of the squares in pixels.
 
