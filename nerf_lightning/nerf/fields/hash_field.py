@@ -24,6 +24,9 @@ from nerf_lightning.nerf.types.scene import Scene
 
 LARGEST_EXPONENT = 15.0
 THICK, THIN = 3.0, -1.0
+LEAST_SLOPE = 0.003
+"""Of a colour over its raw value, on the way back from black or full: what it is at a colour of 0.003 or 0.997. With
+alpha, which teaches density what is empty, there is no need, and Lego loses 0.08 dB by it."""
 
 
 class HashField(Field):
@@ -78,6 +81,7 @@ class HashField(Field):
         self.direction_encoder = direction_encoder
         self.sees_cones = isinstance(position_encoder, ConeEncoder) and position_encoder.sees_cones
         self.density_bias = density_bias
+        self.least_slope = 0.0
         self.contracted = Contracted(contraction)
         self.register_buffer("bias", torch.tensor(THIN if density_bias is None else float(density_bias)))
         self.register_buffer("aabb", torch.tensor([[-1.0] * 3, [1.0] * 3]))
@@ -105,6 +109,7 @@ class HashField(Field):
                 )
             self.codes = nn.Parameter(torch.zeros(len(scene.view_names), self.appearance))
             self.trained = torch.tensor(scene.splits["train"])
+        self.least_slope = 0.0 if scene.pixels.has_transparency else LEAST_SLOPE
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
 
@@ -128,7 +133,9 @@ class HashField(Field):
         hidden = self._through(self.density_mlp, self._encoded(points, features))
         raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
-        return FieldOutput(density=density, rgb=torch.sigmoid(raw_rgb.float()))
+        raw_rgb = raw_rgb.float()
+        rgb = _Sigmoid.apply(raw_rgb, self.least_slope) if self.least_slope else torch.sigmoid(raw_rgb)
+        return FieldOutput(density=density, rgb=rgb)
 
     def hidden_layers(self) -> list[HiddenLayer]:
         """Return the one layer of the density's MLP, and those of the colour's."""
@@ -238,3 +245,27 @@ class _TruncatedExponential(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         (raw,) = ctx.saved_tensors
         return grad * torch.exp(raw.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT))
+
+
+class _Sigmoid(torch.autograd.Function):
+    """1 / (1 + exp(-x)), with a way back from black and from full colours, where it has no slope left.
+
+    Where nearly all pixels are black, all colours are within ten steps (1e-38), and what the few pixels of the content
+    ask for would be multiplied by as little. What leads farther out keeps the true slope: as steep, it would carry the
+    weights away to no end, at a cost of 6 dB on photographs with dark corners.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, least_slope: float) -> Tensor:
+        color = torch.sigmoid(raw)
+        ctx.save_for_backward(color)
+        ctx.least_slope = least_slope
+        return color
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (color,) = ctx.saved_tensors
+        slope = color * (1.0 - color)
+        inward = grad * (color - 0.5) > 0  # a step goes against the gradient
+        return grad * torch.where(inward, slope.clamp(min=ctx.least_slope), slope), None

@@ -46,7 +46,7 @@ class RobustLoss(Loss):
         ValueError: a number out of its range.
     """
 
-    def __init__(self, of: Loss, share: int | float = 0.8, times: int | float = 4.0, patch: int = 8):
+    def __init__(self, of: Loss, share: int | float = 0.8, times: int | float = 4.0, patch: int = 4):
         super().__init__()
         require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
         self.of, self.share, self.times, self.patch = of, share, times, patch

@@ -7,7 +7,7 @@ from support.scenes import ball_scene
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField, _TruncatedExponential
+from nerf_lightning.nerf.fields.hash_field import HashField, _Sigmoid, _TruncatedExponential
 from nerf_lightning.nerf.types.points import Points
 
 
@@ -16,6 +16,12 @@ def a_field(**settings):
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40)
     torch.nn.init.normal_(encoder.table)
     return HashField(encoder, SphericalHarmonicsEncoder(3), width=16, **settings)
+
+
+def without_alpha(scene):
+    rgba = scene.pixels.rgba.clone()
+    rgba[:, 3] = 255
+    return replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
 
 
 def test_a_box_is_only_a_change_of_units():
@@ -45,6 +51,33 @@ def test_the_exponential_and_its_gradient_stay_finite():
     torch.testing.assert_close(raw.grad[1:4], raw.detach()[1:4].exp())
 
 
+def test_colours_have_the_slope_of_the_logistic_function_and_a_way_back_from_its_ends():
+    raw = torch.tensor([-90.0, -3.0, 0.0, 2.0, 60.0], requires_grad=True)
+    color = _Sigmoid.apply(raw, 0.003)
+    slope = (color * (1 - color)).detach()
+    torch.testing.assert_close(color.detach(), torch.sigmoid(raw.detach()))
+    brighter, darker = (torch.autograd.grad(sign * color.sum(), raw, retain_graph=True)[0] for sign in (-1, 1))
+    torch.testing.assert_close(brighter, -slope.where(raw > -90, 0.003))
+    torch.testing.assert_close(darker, slope.where(raw < 60, 0.003))
+
+
+def test_a_little_colour_among_much_black_is_learnt():
+    """The fault: all colours were 1e-38 after ten steps, with gradients as small, so a small thing was never seen."""
+    field, positions = a_field(density_bias=-1.0), 2 * torch.rand(1000, 3) - 1
+    field.fit_to(without_alpha(ball_scene()))
+    small = (positions - 0.5).norm(dim=-1) < 0.3
+    assert 10 < int(small.sum()) < 40
+    color = torch.where(small[:, None], torch.tensor([0.4, 0.3, 0.2]), 0.0)
+    directions = torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
+    optimizer = torch.optim.Adam(field.parameters(), lr=2e-2, betas=(0.9, 0.95), eps=1e-15)
+    for _ in range(150):
+        optimizer.zero_grad()
+        rgb = field(Points(positions, directions)).rgb
+        (rgb - color).square().mean().backward()
+        optimizer.step()
+    assert float((rgb - color).detach()[small].abs().mean()) < 0.05
+
+
 @pytest.mark.parametrize("encoder", [FrequencyEncoder(3), HashGridEncoder(num_levels=2, log2_table_size=8)])
 def test_features_that_are_known_give_the_same_result(encoder):
     field = HashField(encoder, SphericalHarmonicsEncoder(2), width=8)
@@ -62,11 +95,8 @@ def test_features_that_are_known_give_the_same_result(encoder):
 def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothing_does():
     """The fault: a dense start on a black background stays, as black fog."""
     scene = ball_scene()
-    rgba = scene.pixels.rgba.clone()
-    rgba[:, 3] = 255
-    baked = replace(scene, pixels=replace(scene.pixels, rgba=rgba, has_transparency=False))
     densities = []
-    for given in (scene, baked):
+    for given in (scene, without_alpha(scene)):
         field = a_field()
         torch.nn.init.zeros_(field.position_encoder.table)
         field.fit_to(given)
