@@ -121,11 +121,11 @@ def test_numbers_out_of_range_are_refused(setting, value):
 def test_of_a_planted_ball_most_is_left_out_and_of_what_the_scene_explains_hardly_anything():
     scene = ball_scene(num_views=4, size=64)
     planted = with_jumping_ball(scene)
-    pixels = RayBatches(planted, Progress(), 0, 4096, patch=8).pixels_at(0, 0)
+    loss = RobustLoss(MeanSquaredError())
+    pixels = RayBatches(planted, Progress(), 0, 4096, patch=loss.patch).pixels_at(0, 0)
     clean, photograph = (gather_batch(each, pixels).rgba[:, :3] for each in (scene, planted))
     # The scene is known up to noise.
     seen = clean + 0.02 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
-    loss = RobustLoss(MeanSquaredError())
     for _ in range(100):
         loss.learn(seen, photograph, torch.ones(len(pixels.x)))
     kept = kept_pixels(residuals(seen, photograph) <= loss.threshold, loss.patch)
