@@ -36,12 +36,11 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.machine import peak_memory, seconds_of
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.rays import Batch, RayBundle
+from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.build import build_step
 from nerf_lightning.training.callbacks.watcher import Watcher
@@ -238,13 +237,11 @@ def _watching(bench: Bench, config: DictConfig) -> dict[str, float]:
 
 def _render(bench: Bench, num_rays: int, plain: bool) -> None:
     places = torch.arange(num_rays, device=bench.settings.device) % bench.batch.num_rays
-    rays = bench.step.rays(bench.batch.pixels[places])
-    size = num_rays if plain else tile_rays_for(bench.step.model, bench.settings.inference_tile_points)
-    with torch.no_grad(), _plainly(bench) if plain else nullcontext():
-        for part in tiles(num_rays, size):
-            _render_tile(bench.step.model, rays[part], bench)
-
-
-def _render_tile(model: Model, rays: RayBundle, bench: Bench) -> None:
-    behind = background_colors(bench.step.background, rays.near.numel(), rays.near.device, random=None)
-    model(rays, behind, random=None)
+    model, background = bench.step.model, bench.step.background
+    with torch.no_grad():
+        rays = bench.step.rays(bench.batch.pixels[places])
+        if not plain:  # as pictures are
+            render_rays(model, rays, background, bench.settings.inference_tile_points)
+            return
+        with _plainly(bench):
+            model(rays, background_colors(background, num_rays, rays.near.device, random=None), random=None)
