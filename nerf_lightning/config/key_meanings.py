@@ -116,7 +116,8 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         budget.seconds trainer.clip_norm
         data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
         data.device_budget data.prefetch data.overfit_views data.views_per_step
-        scene.background scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution scene.variant
+        scene.background scene.cut_out scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
+        scene.variant
         scene.images scene.masks scene.masks_keep scene.file scene.frames scene.hold_every scene.train_fraction
         scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
         scene.variants scene.unseen scene.gain scene.gamma

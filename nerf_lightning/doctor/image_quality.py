@@ -123,8 +123,14 @@ def transparency(evidence: Evidence) -> Check:
 
 
 def baked_background(evidence: Evidence) -> Check:
-    """Look for a background of one colour that opaque photographs have baked in."""
+    """Look for a background of one colour that opaque photographs have, or had, baked in."""
     scene, looks, name = evidence.scene, evidence.looks, "background"
+    if color := scene.protocol.get("cut_out"):
+        message = f"plain {color}, which was made transparent (scene.cut_out)"
+        if color in COLOURS and scene.background != color:
+            cure = f"Outlines keep the colour that they were photographed before: set scene.background={color}."
+            return Check(name, "look", f"{message}; scene.background is {scene.background}", cure)
+        return Check(name, "ok", message)
     even = looks.border_even > EVEN
     if scene.pixels.has_transparency or float(even.float().mean()) < 0.8:
         return Check(name, "ok", f"{scene.background}, behind what the photographs show")

@@ -123,6 +123,13 @@ def test_a_background_that_is_baked_in_is_named():
     judged(replace(evidence, scene=replace(evidence.scene, background="white")), "background", "ok")
 
 
+def test_a_background_that_was_cut_out_is_named():
+    cut = {"background": "black", "protocol": {"cut_out": "white"}}
+    judged(with_scene(**cut), "background", "look", "plain white, which was made transparent", "scene.background=white")
+    judged(with_scene(**cut | {"background": "white"}), "background", "ok")
+    judged(with_scene(**cut | {"protocol": {"cut_out": "rgb(9, 90, 9)"}}), "background", "ok", "plain rgb(9, 90, 9)")
+
+
 def test_colours_multiplied_by_alpha_are_named():
     def fade(rgba, straight):
         alpha = torch.arange(rgba.shape[2]).float() / rgba.shape[2]

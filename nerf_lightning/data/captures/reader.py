@@ -15,6 +15,7 @@ from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
+from nerf_lightning.data.pixels.plain_background import background_like, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.escaping import listed
@@ -22,7 +23,7 @@ from nerf_lightning.files.links import is_there, require_inside
 from nerf_lightning.files.walk import walk
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
-from nerf_lightning.nerf.types.scene import Background, Scene
+from nerf_lightning.nerf.types.scene import Scene
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 
@@ -46,7 +47,9 @@ class CaptureReader(Reader):
         far: distance at which content ends; null: from the capture.
         metres_per_unit: how many metres a unit of the capture's frame is long, where it is known: then depths are told
             in metres, and GLB files have their true size. No format of captures says it. null: unknown.
-        background: what lies behind transparent pixels or the end of the scene: white, black, random or none.
+        cut_out: where opaque photographs show a thing before one plain colour, make that transparent.
+        background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null: the
+            plain colour that was cut out, where it is white or black; else black.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         verify: compare the contents of all files with what was decoded, not their times alone.
@@ -63,7 +66,8 @@ class CaptureReader(Reader):
     near: float | None = None
     far: float | None = None
     metres_per_unit: float | None = None
-    background: str = "black"
+    cut_out: bool = True
+    background: str | None = None
     cache_dir: str | None = None
     allow_outside: bool = False
     verify: bool = False
@@ -84,7 +88,7 @@ class CaptureReader(Reader):
             InputError: a setting that makes no sense, or anything wrong with the files.
         """
         self._check_settings()
-        background: Background = known_background(self.background)
+        background = None if self.background is None else known_background(self.background)
         capture = filtered(self.capture(), self.frames)
         check_capture(capture)
         splits = self._splits(capture)
@@ -101,6 +105,9 @@ class CaptureReader(Reader):
             self.verify,
             f"Reading {Path(self.root).name}",
         )
+        # Panoramas have no background, and a fisheye's picture has a dark rim.
+        has_edge = capture.lens_model in ("pinhole", "radial_tangential")
+        pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and background != "none")
         cameras = cameras_of(capture, files, pixels, self.downscale)
         names = tuple(view.name for view in capture.views)
         require_invertible(cameras, names)
@@ -122,12 +129,12 @@ class CaptureReader(Reader):
             aabb=extent.aabb,
             splits=splits,
             view_names=names,
-            background=background,
+            background=background or background_like(color) or "black",
             space=space,
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
             metres_per_unit=self.metres_per_unit,
-            protocol=self._protocol(),
+            protocol=self._protocol() | protocol_of(color),
             truth=None,
             left_out=capture.left_out,
         )

@@ -50,7 +50,6 @@ class AutoReader(CaptureReader):
 
     downscale: int | Literal["auto"] = 1  # type: ignore[assignment]
     name: str = "auto"
-    background: str | None = None  # type: ignore[assignment]
 
     def read(self) -> Scene:
         """Return the capture, as the format's own reader does.

@@ -28,6 +28,7 @@ from nerf_lightning.data.captures.checks import (
 )
 from nerf_lightning.data.captures.splits import every_kth
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
+from nerf_lightning.data.pixels.plain_background import cut_out, protocol_of
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
@@ -108,6 +109,7 @@ class BlenderReader(Reader):
         near: distance along every ray at which content may begin, scene units.
         far: distance at which content ends.
         background: what the transparent pixels lie on: white, black, random or none.
+        cut_out: where opaque pictures show a thing before one plain colour, make that transparent.
         downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
         skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; splits not named are
             taken whole.
@@ -123,6 +125,7 @@ class BlenderReader(Reader):
         near: float = 2.0,
         far: float = 6.0,
         background: str = "white",
+        cut_out: bool = True,
         downscale: int = 1,
         skip: Mapping[str, int] | None = None,
         metres_per_unit: float | None = None,
@@ -134,6 +137,7 @@ class BlenderReader(Reader):
         self.near = near
         self.far = far
         self.background = background
+        self.cut_out = cut_out
         self.downscale = downscale
         self.skip = dict(skip or {})
         self.metres_per_unit = metres_per_unit
@@ -156,6 +160,7 @@ class BlenderReader(Reader):
         splits = _splits({split: len(frames[split]) for split in SPLITS}, self.root)
         label = f"Reading {self.root.name}"
         pixels = read_pixels([frame.image for frame in views], [(width, height)] * len(views), self.downscale, label)
+        pixels, color = cut_out(pixels, self.name, self.cut_out and self.background != "none")
         return Scene(
             name=self.name,
             cameras=_cameras(views, width // self.downscale, height // self.downscale),
@@ -168,7 +173,7 @@ class BlenderReader(Reader):
             background=known_background(self.background),
             to_user=torch.eye(4),
             metres_per_unit=self.metres_per_unit,
-            protocol=self._protocol(frames),
+            protocol=self._protocol(frames) | protocol_of(color),
             truth=None,
         )
 

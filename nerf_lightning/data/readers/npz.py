@@ -25,6 +25,7 @@ from nerf_lightning.data.captures.checks import (
 )
 from nerf_lightning.data.captures.splits import every_kth, in_order
 from nerf_lightning.data.pixels.images import area_downscale
+from nerf_lightning.data.pixels.plain_background import cut_out, protocol_of
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
@@ -50,6 +51,7 @@ class NpzReader(Reader):
         near: distance along every ray at which content may begin, scene units.
         far: distance at which content ends.
         background: what lies behind the scene: white, black, random or none. The pictures have no alpha.
+        cut_out: where they show a thing before one plain colour, make that transparent.
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
         train_fraction: with `hold_every` 0, the share of the views, from the first on, to learn from.
         downscale: whole factor by which the pictures shrink (area filter); the focal length follows.
@@ -65,6 +67,7 @@ class NpzReader(Reader):
         near: float = 2.0,
         far: float = 6.0,
         background: str = "black",
+        cut_out: bool = True,
         hold_every: int = 0,
         train_fraction: float = 0.8,
         downscale: int = 1,
@@ -77,6 +80,7 @@ class NpzReader(Reader):
         self.near = near
         self.far = far
         self.background = background
+        self.cut_out = cut_out
         self.hold_every = hold_every
         self.train_fraction = train_fraction
         self.downscale = downscale
@@ -104,10 +108,12 @@ class NpzReader(Reader):
         check_divisible(width, height, self.downscale)
         train, held = self._split(len(images))
         full = pinhole_cameras(c2w, focal, width, height)
+        pixels = _pixels(images, self.downscale, self.path)
+        pixels, color = cut_out(pixels, self.name, self.cut_out and self.background != "none")
         return Scene(
             name=self.name,
             cameras=resized(full, full.width // self.downscale, full.height // self.downscale),
-            pixels=_pixels(images, self.downscale, self.path),
+            pixels=pixels,
             near=torch.full((len(images),), float(self.near)),
             far=torch.full((len(images),), float(self.far)),
             aabb=box_around_origin(self.aabb_half),
@@ -115,7 +121,7 @@ class NpzReader(Reader):
             view_names=tuple(str(view) for view in range(len(images))),
             background=known_background(self.background),
             to_user=torch.eye(4),
-            protocol=self._protocol(),
+            protocol=self._protocol() | protocol_of(color),
             truth=None,
         )
 

@@ -1,0 +1,158 @@
+"""Photographs of a thing before one plain colour, without alpha: the colour is found, and made transparent."""
+
+import hashlib
+import logging
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from torch import Tensor
+
+from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, MappedPixelStore, check_room, stored
+from nerf_lightning.data.pixels.store import NOTICEABLE, in_threads
+from nerf_lightning.escaping import for_terminal
+from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
+from nerf_lightning.nerf.types.scene import Background, PixelStore
+
+Color = tuple[int, int, int]
+
+TOLERANCE = 2
+"""Levels of 255 by which a pixel of the background may be off."""
+EDGE_SHARE, VIEW_SHARE = 0.9, 0.9
+"""So much of a photograph's edge has the colour, and so many of the photographs are such."""
+LEAST_SHARE = 0.1
+"""Of the pixels that the background has; less is a frame around the pictures."""
+ALIKE = 0.9
+"""What is transparent in all photographs over what is in any: from here on it is a frame around the pictures."""
+LOOKED_AT, THUMBNAIL = 32, 128
+
+log = logging.getLogger(__name__)
+
+
+def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Color | None]:
+    """Return the photographs with the plain background made transparent, and its colour; as they are if there is none.
+
+    Transparent is what has the colour and hangs together with the picture's edge, so that a thing of the same colour
+    within the content stays. Colours are not changed: over a background of that colour the photographs look as before,
+    wherever the outline was drawn. A store in memory is written to; of a mapped one another is made beside it.
+
+    Args:
+        pixels: of one scene.
+        name: of the scene, for messages.
+        wanted: false returns the photographs as they are.
+
+    Raises:
+        InputError: the cache folder has no room.
+    """
+    color = plain_color(pixels) if wanted else None
+    if color is None:
+        return pixels, None
+    log.info(
+        "%s: the photographs show a thing before plain %s, which is made transparent (scene.cut_out=false keeps it)",
+        for_terminal(name),
+        in_words(color),
+    )
+    if isinstance(pixels, MappedPixelStore):
+        parts = f"{pixels.path.stem} {pixels.header.checksum} {color} {TOLERANCE}"
+        base = pixels.path.with_name(hashlib.sha256(parts.encode()).hexdigest()[:24])
+        return stored(base, None, partial(_write, pixels, color)), color
+    for view in range(len(pixels.width)):
+        rgba = pixels.view(view).numpy()
+        rgba[..., 3] = _alpha(rgba, color)
+    return replace(pixels, has_transparency=True), color
+
+
+def in_words(color: Color) -> str:
+    """Return a colour as people say it, as backgrounds are called where one is meant.
+
+    >>> in_words((255, 254, 255)), in_words((90, 120, 90))
+    ('white', 'rgb(90, 120, 90)')
+    """
+    return background_like(color) or f"rgb{color}"
+
+
+def protocol_of(color: Color | None) -> dict[str, str]:
+    """Return what a measured number says of it."""
+    return {} if color is None else {"cut_out": in_words(color)}
+
+
+def background_like(color: Color | None) -> Background | None:
+    """Return the background that has a colour, if one has."""
+    if color is None:
+        return None
+    if min(color) >= 255 - TOLERANCE:
+        return "white"
+    return "black" if max(color) <= TOLERANCE else None
+
+
+def plain_color(pixels: PixelStore) -> Color | None:
+    """Return the one colour that lies behind the content of all photographs; None where there is no such thing.
+
+    It is the colour of nearly all edges. A frame that is the same in all photographs, such as a lens's dark rim or a
+    film's black bars, is no background; nor is anything in photographs that have alpha or masks, whose makers have said
+    what counts.
+    """
+    if pixels.has_transparency or pixels.mask is not None:
+        return None
+    views = evenly_spaced_subset(range(len(pixels.width)), LOOKED_AT)
+    edges = [_edge(pixels.view(view)) for view in views]
+    usual = torch.stack([edge.median(dim=0).values for edge in edges]).median(dim=0).values
+    red, green, blue = (int(level) for level in usual)
+    shares = torch.tensor([float(_near(edge.numpy(), (red, green, blue)).mean()) for edge in edges])
+    if float((shares >= EDGE_SHARE).float().mean()) < VIEW_SHARE:
+        return None
+    behind = torch.stack([_behind_thumbnail(pixels, view, (red, green, blue)) for view in views])
+    frame = behind.all(dim=0).sum() >= ALIKE * behind.any(dim=0).sum()
+    return None if frame or float(behind.float().mean()) < LEAST_SHARE else (red, green, blue)
+
+
+def _edge(rgba: UInt8[Tensor, "height width 4"]) -> UInt8[Tensor, "edge 3"]:
+    return torch.cat([rgba[0], rgba[-1], rgba[:, 0], rgba[:, -1]])[:, :3]
+
+
+def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
+    low = np.array([max(0, level - TOLERANCE) for level in color], dtype=np.uint8)
+    high = np.array([min(255, level + TOLERANCE) for level in color], dtype=np.uint8)
+    return np.asarray(((rgb >= low) & (rgb <= high)).all(axis=-1))
+
+
+def _behind(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> Bool[np.ndarray, "height width"]:
+    """Tell which pixels have the colour and reach the edge through such pixels."""
+    from scipy import ndimage
+
+    parts, count = ndimage.label(_near(rgba[..., :3], color))
+    reaches = np.zeros(count + 1, dtype=np.bool_)
+    for side in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
+        reaches[side] = True
+    reaches[0] = False
+    return np.asarray(reaches[parts])
+
+
+def _behind_thumbnail(pixels: PixelStore, view: int, color: Color) -> Bool[Tensor, "side side"]:
+    rgba = pixels.view(view)
+    rows, columns = (torch.linspace(0, side - 1, THUMBNAIL).round().long() for side in rgba.shape[:2])
+    return torch.from_numpy(_behind(rgba[rows][:, columns].numpy(), color))
+
+
+def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.ndarray, "height width"]:
+    return np.where(_behind(rgba, color), np.uint8(0), np.uint8(255))
+
+
+def _write(pixels: MappedPixelStore, color: Color, target: Path) -> Header:
+    """Write the photographs with their alpha to the file `target`."""
+    sizes = pixels.header.sizes
+    check_room(target.parent, 4 * pixels.header.num_pixels)
+    target.touch(mode=0o600)
+
+    def write(view: int) -> None:
+        rgba = pixels.view(view).numpy().copy()
+        rgba[..., 3] = _alpha(rgba, color)
+        with target.open("r+b") as file:
+            file.seek(4 * int(pixels.offset[view]))
+            file.write(rgba.data)
+
+    in_threads(write, len(sizes), "Cutting out", shown=len(sizes) > NOTICEABLE)
+    return Header(FORMAT, sizes, True, masked=False, contents=None, spots=0, checksum=0)
