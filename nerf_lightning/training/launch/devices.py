@@ -12,15 +12,18 @@ from torch import distributed
 
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.products import Linear, cpu_gains_by_bfloat16, cpu_multiplies_bfloat16
 from nerf_lightning.training.launch import xla
 
 log = logging.getLogger(__name__)
 
 Accelerator = Literal["auto", "cpu", "gpu", "mps", "tpu"]
 DeviceType = Literal["cpu", "cuda", "mps", "xla"]
-Precision = Literal["auto", "32-true", "tf32", "bf16-mixed"]
+Chosen = Literal["32-true", "tf32", "bf16-mixed"]
+Precision = Literal["auto", Chosen]
 LIGHTNING_NAMES: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu", "mps": "mps", "xla": "tpu"}
+NATIVE = "native bfloat16"
 LEAST_GPU_MEMORY = 1_000_000_000
 """Bytes of a GPU that must be free: tiles shrink to what there is, but libraries and tables need some room."""
 
@@ -86,7 +89,7 @@ def _trouble_of_gpu() -> str | None:
     return None if right else "it computes 8 times 1 wrongly"
 
 
-def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal["32-true", "tf32", "bf16-mixed"], str]:
+def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen, str]:
     """Return the precision and why it is that one; auto is bf16-mixed where the device computes it natively.
 
     NERF_LIGHTNING_PRECISION in the environment says what auto means: machines of one kind can be tried as another.
@@ -103,8 +106,7 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal
             )
         return choose_precision(cast(Precision, meant), device_type)[0], "as NERF_LIGHTNING_PRECISION says"
     if asked == "auto":
-        native = has_native_bfloat16(device_type)
-        return ("bf16-mixed" if native else "32-true"), f"{'native' if native else 'no native'} bfloat16"
+        return ("bf16-mixed", NATIVE) if has_native_bfloat16(device_type) else ("32-true", "no native bfloat16")
     if asked == "tf32" and not has_tf32(device_type):
         raise InputError(
             "trainer.precision=tf32: TensorFloat-32 products are made by NVIDIA GPUs from Ampere on (2020), and the "
@@ -113,6 +115,14 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Literal
     if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
         log.warning("trainer.precision=%s: this device has no native bfloat16 and emulates it, slowly.", asked)
     return asked, "as asked"
+
+
+def suited(precision: Chosen, reason: str, device_type: DeviceType, model: Model) -> tuple[Chosen, str]:
+    """Return what `choose_precision` has chosen, or float32 where this model is slower in bfloat16; and why."""
+    wide = any(isinstance(part, Linear) for part in model.modules())
+    if reason == NATIVE and device_type == "cpu" and wide and not cpu_gains_by_bfloat16():
+        return "32-true", "bfloat16 is native, but slower for layers as wide as this model's"
+    return precision, reason
 
 
 def has_native_bfloat16(device_type: str) -> bool:

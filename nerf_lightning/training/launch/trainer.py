@@ -25,6 +25,7 @@ from nerf_lightning.training.launch.devices import (
     choose_device,
     choose_precision,
     prepare_machine,
+    suited,
     working_device,
 )
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
@@ -49,8 +50,8 @@ class TrainerSettings:
         max_epochs: epochs in all, an epoch being every training ray once; None: no bound. The smaller bound counts.
         accelerator: the kind of device; auto takes a GPU where there is one.
         precision: of the products of the fields' weights, and of nothing else. bf16-mixed rounds their factors to
-            bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively,
-            else 32-true.
+            bfloat16, tf32 to TensorFloat-32 (NVIDIA GPUs); auto is bf16-mixed where the device computes it natively
+            and the model is not slower in it, else 32-true.
         tile_points: most points that a step sends through a field at once; auto takes the fastest of a few sizes,
             measured at the start of a run (but for one of 50 steps or fewer) and kept; None trains a batch whole. The
             result is the same up to rounding.
@@ -98,7 +99,8 @@ class TrainerSettings:
         self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
-        self.precision, self.reason = choose_precision(precision, self.device_type)
+        self._chosen = choose_precision(precision, self.device_type)
+        self.precision, self.reason = self._chosen
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
         # On XLA each size would be compiled first.
         self.measures_tile = tile_points == "auto" and self.device_type != "xla"
@@ -173,7 +175,8 @@ class TrainerSettings:
         return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
 
     def prepare(self, model: Model) -> Model:
-        """Put a model on the device, let its fields multiply in this precision, and return it."""
+        """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
+        self.precision, self.reason = suited(*self._chosen, self.device_type, model)
         model.multiply_in(PRODUCTS[self.precision])
         return model.to(self.device)
 
@@ -186,4 +189,4 @@ class TrainerSettings:
     def keep_precision(self, former: Any) -> None:
         """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
         if self.reason != "as asked":
-            self.precision, self.reason = former, "as the run began"
+            self._chosen = self.precision, self.reason = former, "as the run began"
