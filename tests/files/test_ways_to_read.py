@@ -49,6 +49,7 @@ OTHERWISE = {
     "files/numpy_files.py": ["open", "open"],
     "sfm/photograph_folder.py": ["open", "open"],
     "data/pixels/decoding.py": ["open"],
+    "data/pixels/plain_background.py": ["open"],
     "sfm/reconstruction.py": ["open"],
     "sfm/video_frames.py": ["imiter"],
     "files/atomic.py": ["open", "open"],

@@ -157,6 +157,7 @@ def test_blender_and_npz_scenes_are_cut_out_too(tmp_path):
     root = write_blender(tmp_path / "blender", {"train": 6, "test": 2}, WIDTH, HEIGHT)
     for path in root.rglob("*.png"):
         Image.fromarray(images[int(path.stem[2:])]).save(path)
-    scene = BlenderReader(str(root), background="black").read()
-    assert (scene.pixels.has_transparency, scene.protocol["cut_out"]) == (True, "black")
+    scene = BlenderReader(str(root)).read()
+    assert (scene.pixels.has_transparency, scene.protocol["cut_out"], scene.background) == (True, "black", "black")
+    assert BlenderReader(str(root), background="random").read().background == "random"
     assert not BlenderReader(str(root), cut_out=False).read().pixels.has_transparency
