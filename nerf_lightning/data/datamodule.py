@@ -14,7 +14,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.machine import free_memory, require_memory
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
 # Of a batch, at least: where its pixels lie, its rays, and what they should look like.
 RAY_BYTES = 120
@@ -174,11 +174,12 @@ def _check_background(scene: Scene) -> None:
             f"The pictures of {scene.name} have transparent pixels, so something lies behind the scene, and "
             "scene.background=none would train on colours without their alpha. Use white, black or random."
         )
-    if scene.background == "random" and not scene.pixels.has_transparency:
+    if scene.background in DRAWN and not scene.pixels.has_transparency:
         log.warning(
-            "scene.background=random: the pictures of %s have no transparent pixels, so whatever lies behind the "
+            "scene.background=%s: the pictures of %s have no transparent pixels, so whatever lies behind the "
             "scene is part of them and is learnt as matter. Give the background's colour instead "
             "(scene.background=black or white).",
+            scene.background,
             scene.name,
         )
 

@@ -7,6 +7,7 @@ from torch import Tensor
 from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.doctor.view_statistics import THUMBNAIL
+from nerf_lightning.nerf.rendering.blending import at_evaluation
 
 # Mean difference of thumbnails, in units of their contrast.
 SAME = 0.012
@@ -116,7 +117,7 @@ def transparency(evidence: Evidence) -> Check:
         message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
         return Check(name, "look", message, "See that alpha was exported, or remove these views.")
     known = looks.premultiplied
-    if float(known.min()) > 0.995 and scene.background not in ("black", "none"):
+    if float(known.min()) > 0.995 and at_evaluation(scene.background) not in ("black", "none"):
         message = "no half-transparent pixel is brighter than its alpha: colours are multiplied by alpha, it seems"
         return Check(name, "look", message, "Export straight alpha, or edges get dark seams.")
     return Check(name, "ok", f"{100 * covered:.0f} % of the pixels show the content, the rest is transparent")
@@ -127,8 +128,10 @@ def baked_background(evidence: Evidence) -> Check:
     scene, looks, name = evidence.scene, evidence.looks, "background"
     if color := scene.protocol.get("cut_out"):
         message = f"plain {color}, which was made transparent (scene.cut_out)"
-        if color in COLOURS and scene.background != color:
-            cure = f"Outlines keep the colour that they were photographed before: set scene.background={color}."
+        if color in COLOURS and at_evaluation(scene.background) != color:
+            cure = (
+                f"Outlines keep the colour that they were photographed before: set scene.background={color}_or_random."
+            )
             return Check(name, "look", f"{message}; scene.background is {scene.background}", cure)
         return Check(name, "ok", message)
     even = looks.border_even > EVEN

@@ -22,6 +22,7 @@ from nerf_lightning.config.key_meanings import meaning_of
 from nerf_lightning.config.overrides import leaves
 from nerf_lightning.cores import num_cores
 from nerf_lightning.files.yaml_files import plain_yaml
+from nerf_lightning.nerf.rendering.blending import at_evaluation
 from nerf_lightning.nerf.types.scene import Background, Scene
 
 REPOSITORY = Path(__file__).parents[2]
@@ -52,7 +53,7 @@ def measured_how(
         scene: what was measured on.
         split: train, val or test.
         views: which views of it.
-        background: what the pictures were composited over; random means white.
+        background: what the pictures were composited over; what is drawn in training means its colour at evaluation.
         quantize: the render was rounded to 8 bits.
         lpips: the backbone, None where LPIPS is not computed.
         colors: whether exposure and white balance were fitted first.
@@ -62,7 +63,7 @@ def measured_how(
         "scene": scene.name,
         "split": split,
         "split_hash": split_hash(scene, views),
-        "background": "white" if background == "random" else background,
+        "background": at_evaluation(background),
         "resolution": [list(size) for size in sizes],
         "pixels": "8-bit" if quantize else "float",
         "cameras": "refined" if scene.refined else "raw",

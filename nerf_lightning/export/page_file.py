@@ -29,14 +29,14 @@ from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
-from nerf_lightning.nerf.rendering.blending import photograph
+from nerf_lightning.nerf.rendering.blending import at_evaluation, photograph
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "path.js")
 MARK = b"<!-- nerf_lightning page 1 -->"
-BEHIND: dict[Background, str] = {"white": "#ffffff", "random": "#ffffff", "black": "#000000", "none": "#000000"}
+BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
 # Pixels of the longer side: of the still picture, of photographs.
 STILL, PHOTOGRAPH = 640, 320
 JPEG_QUALITY = 80
@@ -105,7 +105,15 @@ def page_of(
         ("grid", f"{grid}, {about['bricks']:,} bricks of 8 x 8 x 8"),
     ]
     places = [_view(record, beside, view if max_photographs else None) for view in views]
-    return Page(record.name, known, places, _still(marcher, record, views[0]), BEHIND[record.background], about, field)
+    return Page(
+        record.name,
+        known,
+        places,
+        _still(marcher, record, views[0]),
+        BEHIND[at_evaluation(record.background)],
+        about,
+        field,
+    )
 
 
 def write_page(page: Page, target: Path) -> None:

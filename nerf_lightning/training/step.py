@@ -315,7 +315,7 @@ class TrainStep:
         num_rays, device = batch.num_rays, batch.weight.device
         key = fold(self.seed, self.progress.attempt, self.progress.step)
         random = batch_random(key, num_rays, device, share.first) if self.jitter else None
-        behind = background_colors(self.background, num_rays, device, random)
+        behind = background_colors(self.background, num_rays, device, random, batch.rgba)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
         target = Target(blend(batch.rgba, behind), weight, batch.pixels)

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from nerf_lightning.data.captures.capture import Capture, cameras_of, check_capture, filtered
-from nerf_lightning.data.captures.checks import check_metres, check_step, known_background
+from nerf_lightning.data.captures.checks import check_metres, check_step
 from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
 from nerf_lightning.data.captures.splits import every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
-from nerf_lightning.data.pixels.plain_background import background_like, cut_out, protocol_of
+from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.escaping import listed
@@ -48,8 +48,8 @@ class CaptureReader(Reader):
         metres_per_unit: how many metres a unit of the capture's frame is long, where it is known: then depths are told
             in metres, and GLB files have their true size. No format of captures says it. null: unknown.
         cut_out: where opaque photographs show a thing before one plain colour, make that transparent.
-        background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null: the
-            plain colour that was cut out, where it is white or black; else black.
+        background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null:
+            black; where a plain background was cut out, white_or_random, black_or_random or random, as its colour is.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
         allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
         verify: compare the contents of all files with what was decoded, not their times alone.
@@ -88,7 +88,6 @@ class CaptureReader(Reader):
             InputError: a setting that makes no sense, or anything wrong with the files.
         """
         self._check_settings()
-        background = None if self.background is None else known_background(self.background)
         capture = filtered(self.capture(), self.frames)
         check_capture(capture)
         splits = self._splits(capture)
@@ -107,7 +106,7 @@ class CaptureReader(Reader):
         )
         # Panoramas have no background, and a fisheye's picture has a dark rim.
         has_edge = capture.lens_model in ("pinhole", "radial_tangential")
-        pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and background != "none")
+        pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and self.background != "none")
         cameras = cameras_of(capture, files, pixels, self.downscale)
         names = tuple(view.name for view in capture.views)
         require_invertible(cameras, names)
@@ -129,7 +128,7 @@ class CaptureReader(Reader):
             aabb=extent.aabb,
             splits=splits,
             view_names=names,
-            background=background or background_like(color) or "black",
+            background=background_for(self.background, color, "black"),
             space=space,
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
@@ -190,6 +189,7 @@ class CaptureReader(Reader):
             raise InputError(f"scene.space={self.space!r}: choose one of {', '.join(get_args(Spaces))}.")
         require_one_of(get_args(MaskColor), **{"scene.masks_keep": self.masks_keep})
         check_metres(self.metres_per_unit)
+        background_for(self.background, None, "black")
         near, far = self.near, self.far
         if not 0.0 <= (near or 0.0) < math.inf or not (near or 0.0) < (math.inf if far is None else far):
             raise InputError(

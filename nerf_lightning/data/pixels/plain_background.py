@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Bool, UInt8
 from torch import Tensor
 
+from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, MappedPixelStore, check_room, stored
 from nerf_lightning.data.pixels.store import NOTICEABLE, in_threads
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.types.scene import Background, PixelStore
+from nerf_lightning.nerf.types.scene import UNSURE, Background, PixelStore
 
 Color = tuple[int, int, int]
 
@@ -37,7 +38,7 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
 
     Transparent is what has the colour and hangs together with the picture's edge, so that a thing of the same colour
     within the content stays. Colours are not changed: over a background of that colour the photographs look as before,
-    wherever the outline was drawn. A store in memory is written to; of a mapped one another is made beside it.
+    to a level of 255. A store in memory is written to; of a mapped one another is made beside it.
 
     Args:
         pixels: of one scene.
@@ -56,7 +57,7 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
         in_words(color),
     )
     if isinstance(pixels, MappedPixelStore):
-        parts = f"{pixels.path.stem} {pixels.header.checksum} {color} {TOLERANCE}"
+        parts = f"{pixels.path.stem} {pixels.header.checksum} {color} {TOLERANCE} {UNSURE}"
         base = pixels.path.with_name(hashlib.sha256(parts.encode()).hexdigest()[:24])
         return stored(base, None, partial(_write, pixels, color)), color
     for view in range(len(pixels.width)):
@@ -66,12 +67,14 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
 
 
 def in_words(color: Color) -> str:
-    """Return a colour as people say it, as backgrounds are called where one is meant.
+    """Return a colour as people say it.
 
-    >>> in_words((255, 254, 255)), in_words((90, 120, 90))
-    ('white', 'rgb(90, 120, 90)')
+    >>> in_words((255, 254, 255)), in_words((0, 0, 2)), in_words((90, 120, 90))
+    ('white', 'black', 'rgb(90, 120, 90)')
     """
-    return background_like(color) or f"rgb{color}"
+    if min(color) >= 255 - TOLERANCE:
+        return "white"
+    return "black" if max(color) <= TOLERANCE else f"rgb{color}"
 
 
 def protocol_of(color: Color | None) -> dict[str, str]:
@@ -79,13 +82,21 @@ def protocol_of(color: Color | None) -> dict[str, str]:
     return {} if color is None else {"cut_out": in_words(color)}
 
 
-def background_like(color: Color | None) -> Background | None:
-    """Return the background that has a colour, if one has."""
+def background_for(asked: str | None, color: Color | None, otherwise: Background) -> Background:
+    """Return the background that was asked for; None: `otherwise`, or what suits the colour that was cut out.
+
+    Before one colour throughout, sheets of that colour may grow before the content until nothing else is left; drawn
+    anew for each ray, backgrounds forbid them.
+
+    Raises:
+        InputError: there is no such background.
+    """
+    if asked is not None:
+        return known_background(asked)
     if color is None:
-        return None
-    if min(color) >= 255 - TOLERANCE:
-        return "white"
-    return "black" if max(color) <= TOLERANCE else None
+        return otherwise
+    suited: dict[str, Background] = {"white": "white_or_random", "black": "black_or_random"}
+    return suited.get(in_words(color), "random")
 
 
 def plain_color(pixels: PixelStore) -> Color | None:
@@ -119,11 +130,11 @@ def _near(rgb: np.ndarray, color: Color) -> np.ndarray:
     return np.asarray(((rgb >= low) & (rgb <= high)).all(axis=-1))
 
 
-def _behind(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> Bool[np.ndarray, "height width"]:
-    """Tell which pixels have the colour and reach the edge through such pixels."""
+def _behind(plain: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Tell which pixels have the plain colour and reach the edge through such pixels."""
     from scipy import ndimage
 
-    parts, count = ndimage.label(_near(rgba[..., :3], color))
+    parts, count = ndimage.label(plain)
     reaches = np.zeros(count + 1, dtype=np.bool_)
     for side in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
         reaches[side] = True
@@ -134,11 +145,21 @@ def _behind(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> Bool[np.
 def _behind_thumbnail(pixels: PixelStore, view: int, color: Color) -> Bool[Tensor, "side side"]:
     rgba = pixels.view(view)
     rows, columns = (torch.linspace(0, side - 1, THUMBNAIL).round().long() for side in rgba.shape[:2])
-    return torch.from_numpy(_behind(rgba[rows][:, columns].numpy(), color))
+    return torch.from_numpy(_behind(_near(rgba[rows][:, columns, :3].numpy(), color)))
 
 
 def _alpha(rgba: UInt8[np.ndarray, "height width 4"], color: Color) -> UInt8[np.ndarray, "height width"]:
-    return np.where(_behind(rgba, color), np.uint8(0), np.uint8(255))
+    """Return alpha: 0 behind the content, 255 within it, and `UNSURE` where a pixel may have some of the background.
+
+    Of pixels along the outline that is a part; holes through the content show nothing else. Both may as well be content
+    of that colour.
+    """
+    from scipy import ndimage
+
+    plain = _near(rgba[..., :3], color)
+    alpha = np.where(ndimage.binary_dilation(plain, np.ones((3, 3))), np.uint8(UNSURE), np.uint8(255))
+    alpha[_behind(plain)] = 0
+    return alpha
 
 
 def _write(pixels: MappedPixelStore, color: Color, target: Path) -> Header:

@@ -21,14 +21,13 @@ from nerf_lightning.data.captures.checks import (
     check_present,
     check_step,
     contents,
-    known_background,
     one_size,
     pose_from_matrix,
     require_different,
 )
 from nerf_lightning.data.captures.splits import every_kth
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
-from nerf_lightning.data.pixels.plain_background import cut_out, protocol_of
+from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
@@ -108,7 +107,8 @@ class BlenderReader(Reader):
         root: the folder with the json files.
         near: distance along every ray at which content may begin, scene units.
         far: distance at which content ends.
-        background: what the transparent pixels lie on: white, black, random or none.
+        background: what the transparent pixels lie on: white, black, random or none. null: white; where a plain
+            background was cut out, white_or_random, black_or_random or random, as its colour is.
         cut_out: where opaque pictures show a thing before one plain colour, make that transparent.
         downscale: whole factor by which the pictures shrink (premultiplied area filter); the focal follows.
         skip: per split, take every k-th frame, such as {"test": 8}, the usual short test; splits not named are
@@ -124,7 +124,7 @@ class BlenderReader(Reader):
         root: str,
         near: float = 2.0,
         far: float = 6.0,
-        background: str = "white",
+        background: str | None = None,
         cut_out: bool = True,
         downscale: int = 1,
         skip: Mapping[str, int] | None = None,
@@ -170,7 +170,7 @@ class BlenderReader(Reader):
             aabb=box_around_origin(self.aabb_half),
             splits=splits,
             view_names=_names(frames),
-            background=known_background(self.background),
+            background=background_for(self.background, color, "white"),
             to_user=torch.eye(4),
             metres_per_unit=self.metres_per_unit,
             protocol=self._protocol(frames) | protocol_of(color),
@@ -186,7 +186,7 @@ class BlenderReader(Reader):
                 raise InputError(f"scene.skip names the split {split!r}; the splits are {listed(SPLITS)}.")
             check_step(f"skip.{split}", step)
         check_bounds(self.near, self.far)
-        known_background(self.background)
+        background_for(self.background, None, "white")
         box_around_origin(self.aabb_half)
 
     def _frames(self) -> dict[str, list[Frame]]:

@@ -20,12 +20,11 @@ from nerf_lightning.data.captures.checks import (
     check_bounds,
     check_divisible,
     check_step,
-    known_background,
     pose_from_matrix,
 )
 from nerf_lightning.data.captures.splits import every_kth, in_order
 from nerf_lightning.data.pixels.images import area_downscale
-from nerf_lightning.data.pixels.plain_background import cut_out, protocol_of
+from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.errors import InputError
@@ -50,7 +49,8 @@ class NpzReader(Reader):
         path: the .npz file.
         near: distance along every ray at which content may begin, scene units.
         far: distance at which content ends.
-        background: what lies behind the scene: white, black, random or none. The pictures have no alpha.
+        background: what lies behind the scene: white, black, random or none. null: black; where a plain background was
+            cut out, white_or_random, black_or_random or random, as its colour is. The pictures have no alpha.
         cut_out: where they show a thing before one plain colour, make that transparent.
         hold_every: hold out the first and every k-th view after it; 0 holds out the last ones instead.
         train_fraction: with `hold_every` 0, the share of the views, from the first on, to learn from.
@@ -66,7 +66,7 @@ class NpzReader(Reader):
         path: str,
         near: float = 2.0,
         far: float = 6.0,
-        background: str = "black",
+        background: str | None = None,
         cut_out: bool = True,
         hold_every: int = 0,
         train_fraction: float = 0.8,
@@ -119,7 +119,7 @@ class NpzReader(Reader):
             aabb=box_around_origin(self.aabb_half),
             splits={"train": train, "val": held, "test": held},
             view_names=tuple(str(view) for view in range(len(images))),
-            background=known_background(self.background),
+            background=background_for(self.background, color, "black"),
             to_user=torch.eye(4),
             protocol=self._protocol() | protocol_of(color),
             truth=None,
@@ -129,7 +129,7 @@ class NpzReader(Reader):
         """Refuse settings that make no sense before any file is read."""
         check_step("downscale", self.downscale)
         check_bounds(self.near, self.far)
-        known_background(self.background)
+        background_for(self.background, None, "black")
         if self.hold_every < 0:
             raise InputError(f"scene.hold_every is {self.hold_every}, but it must be 0 (in order) or more.")
         box_around_origin(self.aabb_half)

@@ -143,7 +143,7 @@ class _TrainingRays:
         batch = batch[batch.weight > 0]
         count = batch.num_rays
         random = RayRandom(torch.full((count,), fold("fitting", step)), torch.arange(count))
-        behind = background_colors(self.scene.background, count, torch.device("cpu"), random)
+        behind = background_colors(self.scene.background, count, torch.device("cpu"), random, batch.rgba)
         rgb = blend(batch.rgba, behind)
         origins, directions, looks, lengths, _ = marcher.in_grid(self.rays_of(batch.pixels))
         behind = torch.zeros(count, 3) if behind is None else behind

@@ -7,25 +7,48 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.types.scene import Background, Scene
+from nerf_lightning.nerf.types.scene import DRAWN, UNSURE, Background, Scene
 
 LEAST_OPACITY = 1e-2
 """Of a ray whose colour can be told from the background's: below it, divided by this, it counts for less."""
 
 
 def background_colors(
-    background: Background, num_rays: int, device: torch.device, random: RayRandom | None
+    background: Background,
+    num_rays: int,
+    device: torch.device,
+    random: RayRandom | None,
+    rgba: Float[Tensor, "rays 4"] | None = None,
 ) -> Float[Tensor, "rays 3"] | None:
     """Return the colour behind each ray, or None where the ray is closed.
 
-    `random` draws a fresh colour per ray and step while training, which teaches empty space to be empty; without
-    random numbers (evaluation, rendering) it stands for white.
+    Args:
+        background: which; those that are drawn anew are so while training alone.
+        num_rays: how many.
+        device: where the colours are wanted.
+        random: the step's numbers; None (evaluation, rendering) stands for the colour of evaluation.
+        rgba: the pixels that are trained on, of which `UNSURE` ones keep the colour of evaluation behind them.
     """
     if background == "none":
         return None
-    if background == "random" and random is not None:
-        return random.uniform("background", 3)
-    return torch.full((num_rays, 3), 0.0 if background == "black" else 1.0, device=device)
+    shown = torch.full((num_rays, 3), 0.0 if at_evaluation(background) == "black" else 1.0, device=device)
+    if background not in DRAWN or random is None:
+        return shown
+    drawn = random.uniform("background", 3)
+    if background == "random" or rgba is None:
+        return drawn
+    return torch.where((255.0 * rgba[:, 3:]).round() == UNSURE, shown, drawn)
+
+
+def at_evaluation(background: Background) -> Background:
+    """Return what lies behind the scene where nothing is drawn.
+
+    >>> at_evaluation("random"), at_evaluation("black_or_random")
+    ('white', 'black')
+    """
+    if background not in DRAWN:
+        return background
+    return "black" if background == "black_or_random" else "white"
 
 
 def blend(rgba: Float[Tensor, "*rays 4"], background: Float[Tensor, "*#rays 3"] | None) -> Float[Tensor, "*rays 3"]:

@@ -9,9 +9,19 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
-Background = Literal["white", "black", "random", "none"]
-"""What lies behind the scene. `none`: nothing. The last interval of a dense level takes all the light that is left;
-levels behind an occupancy grid have no such interval, and leave it black."""
+Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
+"""What lies behind the scene.
+
+`random`: a colour drawn anew for each ray of a step, which teaches empty space to be empty; at evaluation white.
+`white_or_random`: the same, but white behind pixels that may show some of a background that was cut out (`UNSURE`).
+`black_or_random`: the same with black, which it is at evaluation, too. `none`: nothing. The last interval of a dense
+level takes all the light that is left; levels behind an occupancy grid have no such interval, and leave it black.
+"""
+
+DRAWN: tuple[Background, ...] = ("random", "white_or_random", "black_or_random")
+
+UNSURE = 254
+"""Alpha, of 255, of pixels that may show a background which was cut out: outlines, and holes."""
 
 LensModel = Literal["pinhole", "radial_tangential", "fisheye", "equirectangular"]
 """How a lens bends what a pinhole would show; the formulas are in `geometry.lenses`, those of equirectangular

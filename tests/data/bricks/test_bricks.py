@@ -325,7 +325,10 @@ def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytes
         ({"num_train": 0}, "scene.num_train=0 views: give 1 or more"),
         ({"num_test": -1}, "scene.num_test=-1 views: give 0 or more"),
         ({"near": 6.0, "far": 2.0}, "scene.near=6.0 and scene.far=2.0: near must be 0 or more and less than far"),
-        ({"background": "pink"}, "scene.background=pink: choose one of white, black, random, none"),
+        (
+            {"background": "pink"},
+            "scene.background=pink: choose one of white, black, random, white_or_random, black_or_random, none",
+        ),
     ],
 )
 def test_wrong_arguments_are_explained(arguments: dict[str, object], message: str) -> None:

@@ -3,6 +3,7 @@ import torch
 
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.types.scene import UNSURE
 
 CPU = torch.device("cpu")
 
@@ -29,6 +30,16 @@ def test_a_random_background_is_fresh_per_ray_and_white_at_evaluation():
     assert colours.unique(dim=0).shape[0] == 500
     assert abs(float(colours.mean()) - 0.5) < 0.05
     assert torch.equal(background_colors("random", 2, CPU, None), torch.ones(2, 3))
+
+
+@pytest.mark.parametrize(("name", "value"), [("white_or_random", 1.0), ("black_or_random", 0.0)])
+def test_pixels_that_may_show_what_was_cut_out_keep_its_colour_behind_them(name, value):
+    rgba, random = torch.rand(4, 4), batch_random(3, 4)
+    rgba[:, 3] = torch.tensor([0, UNSURE - 1, UNSURE, 255]) / 255
+    colours, drawn = background_colors(name, 4, CPU, random, rgba), background_colors("random", 4, CPU, random, rgba)
+    assert (colours[2] == value).all()
+    assert torch.equal(colours[[0, 1, 3]], drawn[[0, 1, 3]])
+    assert torch.equal(background_colors(name, 4, CPU, None, rgba), torch.full((4, 3), value))
 
 
 def test_none_closes_the_ray():

@@ -28,7 +28,7 @@ from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, Rendering
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
 DEEP = 8.0
 """Rays that end so many times as far as they begin are sampled evenly in inverse distance."""
@@ -146,10 +146,10 @@ class ViewTransformer(Model):
         Raises:
             InputError: a capture of fewer photographs than views are rendered from, or a random background.
         """
-        if photographs.background == "random":
+        if photographs.background in DRAWN:
             raise InputError(
-                "model=view_transformer renders what photographs show, and of scene.background=random they show "
-                "nothing: give scene.background=white or black."
+                "model=view_transformer renders what photographs show, and of "
+                f"scene.background={photographs.background} they show nothing: give scene.background=white or black."
             )
         counts = torch.bincount(photographs.capture)
         fewest = int(counts[counts > 0].min()) if len(counts) else 0
