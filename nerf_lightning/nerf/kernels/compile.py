@@ -4,12 +4,10 @@ As a program: `python -m nerf_lightning.nerf.kernels.compile`.
 """
 
 from nerf_lightning.nerf.kernels.backends import twin
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 
 CPU_TWINS = (
     *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "bricks.contracted"),
-    *("bricks.gradients", "fusion.cpu", "texels.cpu"),
-    *(["mlp.bfloat16", "render.bfloat16"] if cpu_multiplies_bfloat16() else []),
+    *("bricks.gradients", "fusion.cpu", "texels.cpu", "mlp.cpu", "render.cpu"),
 )
 
 

@@ -135,9 +135,10 @@ class PackedLevel(Level):
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         walk = self.sampler.walk(rays)
         march, parts = walk.march(), self.field.parts()
-        kernel = whole_rays(parts, self.field.products, rays.near.device)
-        if march is not None and kernel is not None:
-            rgb, opacity, depth = kernel.render(rays, parts, *march, LEAST_ALPHA, self.sampler.opaque_below)
+        found = whole_rays(parts, self.field.products, rays.near.device)
+        if march is not None and found is not None:
+            kernels, dtype = found
+            rgb, opacity, depth = kernels.render(rays, parts, *march, LEAST_ALPHA, self.sampler.opaque_below, dtype)
             return _in_front_of(background, rays, rgb, 1.0 - opacity, depth)
         rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
         light = torch.ones_like(rays.near)  # what no sample has absorbed yet

@@ -29,7 +29,7 @@ PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 
 LEARNT = 1e4
 """Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
 CPU = torch.device("cpu")
-TORCH_ALONE = (*CPU_TWINS, "mlp.cpu")
+TORCH_ALONE = CPU_TWINS
 
 
 class Training:

@@ -1,4 +1,4 @@
-"""Whole rays in one kernel, against rendering round by round, in plain torch but for the perceptrons."""
+"""Whole rays in one kernel, against rendering round by round."""
 
 import pytest
 import torch
@@ -8,6 +8,7 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.render.whole_rays import whole_rays
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.rendering.sample_points import packed_points
@@ -18,7 +19,7 @@ needs_bfloat16 = pytest.mark.skipif(
 )
 
 
-def a_level(opaque_below=0.0, width=32, features=4, **settings):
+def a_level(opaque_below=0.0, width=32, features=4, products="float32", **settings):
     torch.manual_seed(1)
     grid = HashGridEncoder(num_levels=16 // features, features_per_level=features, log2_table_size=8, max_resolution=32)
     torch.nn.init.uniform_(grid.table, -1.0, 1.0)
@@ -26,7 +27,7 @@ def a_level(opaque_below=0.0, width=32, features=4, **settings):
     sampler = OccupancySampler(resolution=32, num_steps=100, opaque_below=opaque_below)
     level = PackedLevel(sampler, field)
     level.fit_to(ball_scene(num_views=12))
-    field.multiply_in("bfloat16")
+    field.multiply_in(products)
     sampler.grid.occupy(torch.rand(sampler.grid.cells.shape) < 0.05)
     sampler.grid.floor.zero_()
     return level
@@ -37,15 +38,16 @@ def rendered(level, rays, background=None):
         return level(rays, background, [], None)
 
 
-@needs_bfloat16
+@pytest.mark.parametrize("products", ["float32", pytest.param("bfloat16", marks=needs_bfloat16)])
 @pytest.mark.parametrize("features", [2, 4])
 @pytest.mark.parametrize("opaque_below", [0.0, 0.05])
 @pytest.mark.parametrize("bias", [1.0, 4.0])
-def test_it_sees_what_rounds_see(features, opaque_below, bias):
-    level, rays = a_level(opaque_below, features=features, density_bias=bias), some_rays(700)
+def test_it_sees_what_rounds_see(products, features, opaque_below, bias):
+    level = a_level(opaque_below, features=features, products=products, density_bias=bias)
+    rays = some_rays(700)
     background = torch.rand(700, 3)
     whole = rendered(level, rays, background)
-    with without("render.bfloat16", "march.cpu", "packed.cpu", "hash_grid.cpu"):
+    with without("render.cpu", "march.cpu", "packed.cpu", "hash_grid.cpu"):
         rounds = rendered(level, rays, background)
     assert 0.1 < float(whole.opacity.mean()) < 0.9
     for name in ("rgb", "foreground", "opacity", "depth"):
@@ -56,7 +58,6 @@ def test_it_sees_what_rounds_see(features, opaque_below, bias):
         assert float(apart.max()) < 0.02 + 4 * opaque_below
 
 
-@needs_bfloat16
 def test_a_ray_does_not_depend_on_the_others():
     level, rays = a_level(opaque_below=1e-3, density_bias=3.0), some_rays(500)
     order = torch.randperm(500)
@@ -66,7 +67,6 @@ def test_a_ray_does_not_depend_on_the_others():
         assert torch.equal(getattr(together, name)[7:9], getattr(few, name))
 
 
-@needs_bfloat16
 def test_a_ray_ends_where_too_little_light_is_left():
     level, rays = a_level(opaque_below=0.5, density_bias=3.0), some_rays(300)
     with torch.no_grad():
@@ -87,7 +87,7 @@ def test_nothing_lies_outside_of_the_fields_box():
     level.field.aabb.mul_(0.1)
     small = rendered(level, rays).opacity
     assert float((small > 0).float().mean()) < 0.2
-    with without("render.bfloat16"):
+    with without("render.cpu"):
         torch.testing.assert_close(small, rendered(level, rays).opacity, atol=1e-4, rtol=0)
 
 
@@ -106,7 +106,12 @@ def test_other_machines_and_widths_render_round_by_round():
     """Whatever the kernel does not take: the same picture, by the other way."""
     level, rays = a_level(density_bias=3.0, width=24), some_rays(200)
     narrow = rendered(level, rays)
-    with without("render.bfloat16"):
+    with without("render.cpu"):
         assert torch.equal(narrow.rgb, rendered(level, rays).rgb)
-    level.field.multiply_in("float32")
-    assert torch.isfinite(rendered(level, rays).rgb).all()
+    assert torch.isfinite(narrow.rgb).all()
+    assert whole_rays(level.field.parts(), "float32", rays.near.device) is None
+    level = a_level()
+    assert whole_rays(level.field.parts(), "float32", rays.near.device) is not None
+    assert whole_rays(level.field.parts(), "float32", torch.device("meta")) is None
+    if not cpu_multiplies_bfloat16():
+        assert whole_rays(level.field.parts(), "bfloat16", rays.near.device) is None

@@ -1,61 +1,334 @@
-"""The perceptron for the CPU: tiles of rows, one thread of ours for each of torch's, none of torch's own.
+"""The perceptron for the CPU: a few rows at a time go through all layers, in the cache.
 
-The tiles and the order of their sums are fixed, so the result does not depend on the number of threads.
+What is lost elsewhere is not arithmetic but the way between layers: a framework writes, casts and reads again what here
+stays in 128 rows of activations. Products are of float32 numbers, or, on CPUs with AVX512-BF16, of bfloat16 ones and
+exact; the weights' dtype says which. Sums are float32.
+
+The last layer's width is padded to whole vectors. Words and kinds are those of `vectors.py`.
 """
 
-import functools
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, no_type_check
 
+import llvmlite.binding as llvm
+import numba
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.mlp.vectors import (
+    LANES,
+    bytes_of,
+    multiply_block,
+    pair_rows,
+    round_positive,
+    round_vector,
+    round_where_on,
+)
 from nerf_lightning.nerf.kernels.threads import in_parallel
-from nerf_lightning.nerf.products import TILE_ROWS, few_sizes, multiply, own_precision, tiles_of_rows
+from nerf_lightning.nerf.products import cpu_multiplies_bfloat16, tiles_of_rows
 
-relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
+COMPILED_WITH = "162d45c5"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
-
-@own_precision
-def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, list[list[Tensor]]]:
-    """Return the outputs in float32, and each tile's inputs of every layer where they are to be kept."""
-    out = points.new_empty(points.shape[0], weights[-1].shape[0])
-
-    def tile(rows: slice) -> list[Tensor]:
-        hidden = few_sizes(points[rows], weights[0].dtype)
-        kept = [hidden]
-        for weight in weights[:-1]:
-            hidden = multiply(hidden, weight.t()).relu_()
-            if keep:
-                kept.append(hidden)
-        out[rows] = multiply(hidden, weights[-1].t())[: rows.stop - rows.start]
-        return kept if keep else []
-
-    return out, in_parallel(tile, tiles_of_rows(points.shape[0]))
+ROWS = 128
+"""So many go through all layers together."""
+KINDS: dict[torch.dtype, Any] = {torch.float32: np.float32(0), torch.bfloat16: np.int32(0)}
+"""What tells the kernels of which numbers words are made."""
+WIDE = not numba.config.CPU_NAME and bool(llvm.get_host_cpu_features().get("avx512f"))  # type: ignore[attr-defined]
+"""Whether there are 32 registers of a whole vector each."""
 
 
-@own_precision
+def takes(weights: Sequence[Tensor], dtype: torch.dtype) -> bool:
+    """Tell whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors."""
+    return dtype in dtypes() and all(weight.shape[1] % LANES == 0 for weight in weights)
+
+
+def dtypes() -> list[torch.dtype]:
+    """Return which numbers are multiplied here: bfloat16 where LLVM, too, knows of this CPU's instructions.
+
+    Where it does not, it would end the program.
+    """
+    if numba.config.CPU_NAME or not llvm.get_host_cpu_features().get("avx512bf16"):  # type: ignore[attr-defined]
+        return [torch.float32]
+    return [torch.float32, torch.bfloat16] if cpu_multiplies_bfloat16() else [torch.float32]
+
+
+def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, Tensor]:
+    """Return the outputs, and the inputs of all layers where they are to be kept.
+
+    Args:
+        points: inputs of the first layer.
+        weights: float32 or bfloat16, as their products are wanted.
+        keep: whether a backward pass follows.
+    """
+    points, widths, kind = points.float().contiguous(), padded_widths(weights), KINDS[weights[0].dtype]
+    rows = points.shape[0]
+    packed, dims = packed_words(weights, widths, transposed=False), np.array(widths)
+    padded = -(-rows // ROWS) * ROWS
+    out = points.new_empty(padded, weights[-1].shape[0])
+    kept = torch.empty(padded if keep else 0, words_of(sum(widths[:-1]), weights), dtype=torch.int32)
+    arrays = points.numpy(), packed, dims, out.numpy(), kept.numpy()
+    in_parallel(lambda part: _forward(kind, part.start, part.stop, keep, *arrays), tiles_of_rows(rows))
+    return out[:rows], kept
+
+
 def backward(
-    grad: Tensor, weights: Sequence[Tensor], activations: list[list[Tensor]], wants_points: bool
+    grad: Tensor, weights: Sequence[Tensor], kept: Tensor, wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:
-    """Return the gradients of the inputs and, in float32, of the weights; `activations` is what `forward` kept."""
-    grad_points = grad.new_empty(grad.shape[0], weights[0].shape[1]) if wants_points else None
+    """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
+    widths, kind = padded_widths(weights), KINDS[weights[0].dtype]
+    packed, dims = packed_words(weights, widths, transposed=True), np.array(widths)
+    rows = grad.shape[0]
+    grad_points = torch.empty(kept.shape[0] if wants_points else 0, weights[0].shape[1])
+    tiles = tiles_of_rows(rows)
+    sums = torch.zeros(len(tiles), sum(a * b for a, b in pairwise(widths)))
+    arrays = grad.float().contiguous().numpy(), packed, dims, kept.numpy(), grad_points.numpy()
 
-    def tile(rows: slice) -> list[Tensor]:
-        kept = activations[rows.start // TILE_ROWS]
-        flowing = few_sizes(grad[rows], weights[0].dtype)
-        grads: list[Tensor] = []
-        for layer in reversed(range(len(weights))):
-            grads.insert(0, multiply(flowing.t(), kept[layer]))
-            if layer == 0 and grad_points is None:
-                break
-            flowing = multiply(flowing, weights[layer])
-            if layer:
-                relu_backward_(flowing, kept[layer], grad_input=flowing)
-            elif grad_points is not None:
-                grad_points[rows] = flowing[: rows.stop - rows.start]
-        return grads
+    def tile(number: int) -> None:
+        part = tiles[number]
+        _backward(kind, part.start, part.stop, wants_points, *arrays, sums[number].numpy())
 
-    parts = in_parallel(tile, tiles_of_rows(grad.shape[0]))
-    if not parts:
-        return grad_points, [torch.zeros_like(weight, dtype=torch.float32) for weight in weights]
-    return grad_points, [torch.stack([part[layer].float() for part in parts]).sum(0) for layer in range(len(weights))]
+    in_parallel(tile, range(len(tiles)))
+    return grad_points[:rows] if wants_points else None, unpadded(sums.sum(dim=0), weights, widths)
+
+
+def unpadded(total: Tensor, weights: Sequence[Tensor], widths: Sequence[int]) -> list[Tensor]:
+    """Return the gradients of all layers' weights, which lie one after the other, without what was padded."""
+    grads, place = [], 0
+    for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
+        grads.append(total[place : place + inner * outer].view(outer, inner)[: weight.shape[0]])
+        place += inner * outer
+    return grads
+
+
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    points, weights = torch.ones(3, 16), [torch.ones(16, 16), torch.ones(3, 16)]
+    for dtype in dtypes():
+        cast = [weight.to(dtype) for weight in weights]
+        out, kept = forward(points, cast, keep=True)
+        backward(out, cast, kept, wants_points=True)
+
+
+def padded_widths(weights: Sequence[Tensor]) -> list[int]:
+    """Return the widths of all layers' inputs and of what comes out, in whole vectors."""
+    widths = [weights[0].shape[1], *(weight.shape[0] for weight in weights)]
+    return [-(-width // LANES) * LANES for width in widths]
+
+
+def words_of(numbers: int, weights: Sequence[Tensor]) -> int:
+    """Return how many words so many numbers take."""
+    return numbers // 2 if weights[0].dtype == torch.bfloat16 else numbers
+
+
+def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
+    """Return the words of all layers: rows of W^T, or of W, one layer after the other; in bfloat16 pairs of rows."""
+    out, place = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights), np.int32), 0
+    for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
+        padded = np.zeros((outer, inner), np.float32)
+        padded[: weight.shape[0], : weight.shape[1]] = weight.detach().float().numpy()
+        rows = np.ascontiguousarray(padded if transposed else padded.T)
+        end = place + words_of(rows.size, weights)
+        if weight.dtype == torch.bfloat16:
+            _pack(rows, out[place:end])
+        else:
+            out[place:end] = rows.reshape(-1).view(np.int32)
+        place = end
+    return out
+
+
+@njit
+@no_type_check
+def address(array):
+    """Return where an array lies. It lives only as long as its name is used: ask for this in the loop that needs it."""
+    return np.int64(array.ctypes.data)
+
+
+@njit
+@no_type_check
+def _multiply(kind, x, next_row, next_word, w, y, width, rows, words, adds):
+    # All rows of y, which are `width` numbers long, as w's are. As many sums at once as the registers hold.
+    row, column = 4 * width, 0
+    while WIDE and width - column >= 64:
+        for r in range(0, rows, 4):
+            from_x, into = x + r * next_row, y + r * row + 4 * column
+            multiply_block(kind, 4, 4, from_x, next_row, next_word, w + 4 * column, into, row, words, adds)
+        column += 64
+    while WIDE and width - column >= 32:
+        for r in range(0, rows, 8):
+            from_x, into = x + r * next_row, y + r * row + 4 * column
+            multiply_block(kind, 8, 2, from_x, next_row, next_word, w + 4 * column, into, row, words, adds)
+        column += 32
+    while WIDE and width - column >= 16:
+        for r in range(0, rows, 8):
+            from_x, into = x + r * next_row, y + r * row + 4 * column
+            multiply_block(kind, 8, 1, from_x, next_row, next_word, w + 4 * column, into, row, words, adds)
+        column += 16
+    while width - column >= 16:
+        for r in range(0, rows, 4):
+            from_x, into = x + r * next_row, y + r * row + 4 * column
+            multiply_block(kind, 4, 1, from_x, next_row, next_word, w + 4 * column, into, row, words, adds)
+        column += 16
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _pack(rows, out):
+    # Pairs of rows, rounded to bfloat16.
+    kind, (count, width) = np.int32(0), rows.shape
+    halves = np.empty((2, width), np.int16)
+    for r in range(0, count, 2):
+        for c in range(0, width, 16):
+            at = address(halves) + 2 * c
+            round_vector(kind, address(rows) + 4 * (r * width + c), at)
+            round_vector(kind, address(rows) + 4 * ((r + 1) * width + c), at + 2 * width)
+            pair_rows(at, at + 2 * width, address(out) + 4 * (r // 2 * width + c))
+
+
+@njit
+@no_type_check
+def round_rows(kind, source, next_source, target, next_target, rows, width):
+    """Round rows of float32 to numbers of a kind."""
+    size = bytes_of(kind)
+    for r in range(rows):
+        for c in range(0, width, 16):
+            round_vector(kind, source + r * next_source + 4 * c, target + r * next_target + size * c)
+
+
+@njit
+@no_type_check
+def _activate(kind, sums, width, target, next_target):
+    size = bytes_of(kind)
+    for r in range(ROWS):
+        for c in range(0, width, 16):
+            round_positive(kind, sums + 4 * (r * width + c), target + r * next_target + size * c)
+
+
+@njit
+@no_type_check
+def _pass_back(kind, sums, width, inputs, next_input, target):
+    size = bytes_of(kind)
+    for r in range(ROWS):
+        for c in range(0, width, 16):
+            at = r * width + c
+            round_where_on(kind, sums + 4 * at, inputs + r * next_input + size * c, target + size * at)
+
+
+@njit
+@no_type_check
+def _stack_rows(kind, source, next_row, width, target):
+    # Rows one after the other, as words that a product sums over.
+    if bytes_of(kind) == 4:
+        round_rows(kind, source, next_row, target, 4 * width, ROWS, width)
+        return
+    for r in range(0, ROWS, 2):
+        for c in range(0, width, 16):
+            at = source + r * next_row + 2 * c
+            pair_rows(at, at + next_row, target + 4 * (r // 2 * width + c))
+
+
+@njit
+@no_type_check
+def through(kind, x, stride, w, dims, y, into):
+    """Send ROWS rows through all layers: numbers at x, with room for all layers' inputs; the end goes to `into`."""
+    layers, size = len(dims) - 1, bytes_of(kind)
+    for layer in range(layers):
+        inner, outer = dims[layer], dims[layer + 1]
+        last = layer == layers - 1
+        _multiply(kind, x, stride, 4, w, into if last else y, outer, ROWS, inner * size // 4, 0)
+        x, w = x + size * inner, w + size * inner * outer
+        if not last:
+            _activate(kind, y, outer, x, stride)
+
+
+@njit
+@no_type_check
+def back_through(kind, x, stride, w, dims, dy, y, upper, lower, total, wants_inputs, into):
+    """Send gradients of ROWS rows back through all layers.
+
+    Args:
+        kind: of the words.
+        x: address of what `through` has left of the first row.
+        stride: bytes from row to row of it.
+        w: address of all layers' words, transposed.
+        dims: widths of all layers' inputs, and of what comes out.
+        dy: address of the gradients of what came out, numbers of the kind; there is room for the widest layer's, too.
+        y: address of room for the sums.
+        upper: address of room for numbers of the kind.
+        lower: address of room for as many.
+        total: address of the gradients of the weights, which are added to.
+        wants_inputs: whether the gradients of the inputs are wanted, in float32.
+        into: where.
+    """
+    size, before, numbers = bytes_of(kind), 0, 0
+    for layer in range(len(dims) - 1):
+        before, numbers = before + dims[layer], numbers + dims[layer] * dims[layer + 1]
+    for layer in range(len(dims) - 2, -1, -1):
+        inner, outer = dims[layer], dims[layer + 1]
+        before, numbers = before - inner, numbers - inner * outer
+        inputs, words = x + size * before, w + size * numbers
+        _stack_rows(kind, dy, size * outer, outer, upper)
+        _stack_rows(kind, inputs, stride, inner, lower)
+        # dW[o, i] = sum over rows of dy[row, o] x[row, i]
+        _multiply(kind, upper, 4, 4 * outer, lower, total + 4 * numbers, inner, outer, ROWS * size // 4, 1)
+        if layer:
+            _multiply(kind, dy, size * outer, 4, words, y, inner, ROWS, outer * size // 4, 0)
+            _pass_back(kind, y, inner, inputs, stride, dy)
+        elif wants_inputs:
+            _multiply(kind, dy, size * outer, 4, words, into, inner, ROWS, outer * size // 4, 0)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _forward(kind, first, last, keep, points, packed, dims, out, kept):
+    layers, words = len(dims) - 1, dims[:-1].sum() * bytes_of(kind) // 4
+    stride, whole = 4 * words, out.shape[1] == dims[layers]
+    own = np.zeros((1 if keep else ROWS, words), np.int32)
+    sums = np.empty((ROWS, dims.max()), np.float32)
+    flat = sums.reshape(-1)
+    for start in range(first, last, ROWS):
+        count = min(ROWS, last - start)
+        x = address(kept) + start * stride if keep else address(own)
+        round_rows(kind, address(points) + 4 * start * dims[0], 4 * dims[0], x, stride, count, dims[0])
+        if keep:
+            kept[start + count : start + ROWS] = 0  # the sums of the way back go over whole blocks
+        y = address(sums)
+        into = address(out) + 4 * start * dims[layers] if whole else y
+        through(kind, x, stride, address(packed), dims, y, into)
+        for r in range(0 if whole else count):
+            for c in range(out.shape[1]):
+                out[start + r, c] = flat[r * dims[layers] + c]
+
+
+@njit
+@no_type_check
+def _round_gradient(kind, grad, start, count, width, flat, target):
+    if grad.shape[1] == width and count == ROWS:
+        source = address(grad) + 4 * start * width
+    else:
+        source = address(flat)
+        flat[: ROWS * width] = 0.0
+        for r in range(count):
+            for c in range(grad.shape[1]):
+                flat[r * width + c] = grad[start + r, c]
+    round_rows(kind, source, 4 * width, target, bytes_of(kind) * width, ROWS, width)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _backward(kind, first, last, wants_points, grad, packed, dims, kept, grad_points, grads):
+    layers, size, widest = len(dims) - 1, bytes_of(kind), dims.max()
+    stride = size * dims[:-1].sum()
+    sums, room = np.empty((ROWS, widest), np.float32), np.empty((3, ROWS, widest * size // 4), np.int32)
+    flat, next_room = sums.reshape(-1), size * ROWS * widest
+    for start in range(first, last, ROWS):
+        y, dy = address(sums), address(room)
+        _round_gradient(kind, grad, start, min(ROWS, last - start), dims[layers], flat, dy)
+        x, into = address(kept) + start * stride, address(grad_points) + 4 * start * dims[0]
+        back_through(
+            kind, x, stride, address(packed), dims, dy, y, dy + next_room, dy + 2 * next_room, address(grads),
+            wants_points, into,
+        )  # fmt: skip

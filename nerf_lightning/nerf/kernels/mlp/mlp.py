@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin, is_on
-from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
-from nerf_lightning.nerf.products import Products, cpu_multiplies_bfloat16, linear
+from nerf_lightning.nerf.kernels.mlp import tiles
+from nerf_lightning.nerf.products import Products, linear
 
 
 def mlp(
@@ -40,22 +40,17 @@ def mlp_torch(
 
 
 def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> tuple[ModuleType, torch.dtype] | None:
-    """Return the device's kernels, and what they take the weights in; those for bfloat16 round by themselves."""
+    """Return the device's kernels, and what they take the weights in."""
     if points.dtype == torch.float64:
         return None
     if points.is_cuda:
-        return _own(cuda_twin("mlp.cuda", points.device), weights) if products == "bfloat16" else None
+        kernels = cuda_twin("mlp.cuda", points.device) if products == "bfloat16" else None
+        takes = kernels is not None and kernels.takes([weight.shape[1] for weight in weights])
+        return (kernels, torch.float32) if kernels is not None and takes else None  # it rounds by itself
     if not points.is_cpu or not is_on("mlp.cpu"):
         return None
-    if products != "bfloat16":
-        return mlp_cpu, points.dtype
-    own = cpu_multiplies_bfloat16() and _own(cpu_twin("mlp.bfloat16", points.device), weights)
-    return own or (mlp_cpu, torch.bfloat16)
-
-
-def _own(kernels: ModuleType | None, weights: list[Tensor]) -> tuple[ModuleType, torch.dtype] | None:
-    takes = kernels is not None and kernels.takes([weight.shape[1] for weight in weights])
-    return (kernels, torch.float32) if kernels is not None and takes else None
+    kernels, dtype = cpu_twin("mlp.cpu", points.device), torch.bfloat16 if products == "bfloat16" else points.dtype
+    return (kernels if kernels is not None and kernels.takes(weights, dtype) else tiles), dtype
 
 
 class _TiledMLP(torch.autograd.Function):

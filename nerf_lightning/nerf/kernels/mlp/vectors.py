@@ -1,8 +1,11 @@
-"""Vectors of 16 numbers for numba: products, roundings and pairs in bfloat16, by the CPU's own instructions.
+"""Vectors of 16 numbers for numba: products, and what lies between layers, in float32 or bfloat16.
 
-LLVM is handed the instructions of AVX512-BF16 as they are, so no compiler is needed; a CPU without them must not come
-here. Addresses are whole numbers of bytes; a word is an int32 that holds two bfloat16 numbers, the first in its lower
-half.
+LLVM is told of vectors, and makes of them what the CPU has; so no compiler is needed. In bfloat16 it is handed the
+instructions of AVX512-BF16 as they are, and a CPU without them must not come here.
+
+Addresses are whole numbers of bytes. A word has four bytes: one float32, or two bfloat16 numbers, the first in its
+lower half. The first argument of most functions, `kind`, is a number of numba's type for words of float32
+(np.float32(0)) or of bfloat16 (np.int32(0)): by its type alone one of two codes is chosen.
 """
 
 from typing import Any
@@ -15,8 +18,9 @@ from numba.extending import intrinsic
 llvm.initialize_native_asmparser()  # else LLVM refuses instructions that are written out
 
 LANES = 16
-WORD, FLOATS, WORDS, HALVES = (
+WORD, FLOAT, FLOATS, WORDS, HALVES = (
     ir.IntType(32),
+    ir.FloatType(),
     ir.VectorType(ir.FloatType(), LANES),
     ir.VectorType(ir.IntType(32), LANES),
     ir.VectorType(ir.IntType(16), LANES),
@@ -35,31 +39,52 @@ def _times(builder: Any, number: Any, factor: int) -> Any:
     return builder.mul(number, ir.Constant(number.type, factor))
 
 
+def _is_bfloat16(kind: Any) -> bool:
+    return isinstance(kind, types.Integer)
+
+
+@intrinsic
+def bytes_of(context: Any, kind: Any) -> Any:
+    """Return how many bytes a number has."""
+    size = 2 if _is_bfloat16(kind) else 4
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return ir.Constant(ir.IntType(64), size)
+
+    return types.int64(kind), code
+
+
 @intrinsic(prefer_literal=True)
 def multiply_block(
-    context: Any, rows: Any, blocks: Any, x: Any, next_row: Any, next_pair: Any, w: Any, y: Any, row: Any, pairs: Any,
-    adds: Any,
+    context: Any, kind: Any, rows: Any, blocks: Any, x: Any, next_row: Any, next_word: Any, w: Any, y: Any, row: Any,
+    words: Any, adds: Any,
 ) -> Any:  # fmt: skip
-    """y[r, c] = sum over k of x[r, 2k] w[2k, c] + x[r, 2k + 1] w[2k + 1, c], for some rows and 16 `blocks` columns.
+    """y[r, c] = sum over k of x[r, k] w[k, c], for some rows and 16 `blocks` columns; k goes over words.
 
     Args:
         context: numba's.
+        kind: of the words.
         rows: how many, a literal.
         blocks: of 16 columns, a literal.
         x: address of words.
         next_row: bytes from row to row of x.
-        next_pair: bytes from pair to pair of x.
-        w: address of words, each two rows of one column.
+        next_word: bytes from word to word of x.
+        w: address of words, each of one column; in bfloat16 of two rows.
         y: address of float32.
-        row: bytes from pair to pair of w, and from row to row of y.
-        pairs: how many are summed.
+        row: bytes from word to word of w, and from row to row of y.
+        words: how many are summed.
         adds: 1 adds to what stands in y, 0 overwrites it.
     """
-    count, width = rows.literal_value, blocks.literal_value
+    count, width, bfloat16 = rows.literal_value, blocks.literal_value, _is_bfloat16(kind)
+    number, numbers = (WORD, WORDS) if bfloat16 else (FLOAT, FLOATS)
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        x, next_row, next_pair, w, y, row, pairs, adds = arguments[2:]
-        dot = ir.InlineAsm(ir.FunctionType(FLOATS, [FLOATS, WORDS, WORDS]), *PRODUCT)
+        x, next_row, next_word, w, y, row, words, adds = arguments[3:]
+        if bfloat16:
+            dot = ir.InlineAsm(ir.FunctionType(FLOATS, [FLOATS, WORDS, WORDS]), *PRODUCT)
+        else:
+            three = ir.FunctionType(FLOATS, [FLOATS, FLOATS, FLOATS])
+            fused = cgutils.get_or_insert_function(builder.module, three, "llvm.fmuladd.v16f32")
         places = [
             [_at(builder, y, FLOATS, builder.add(_times(builder, row, r), row.type(64 * b))) for b in range(width)]
             for r in range(count)
@@ -69,68 +94,77 @@ def multiply_block(
         for r in range(count):
             for b in range(width):
                 builder.store(builder.select(goes_on, builder.load(places[r][b], align=4), zeros), sums[r][b])
-        undefined, lanes = ir.Constant(WORDS, ir.Undefined), ir.Constant(WORDS, [0] * LANES)
-        with cgutils.for_range(builder, pairs) as loop:
+        undefined, lanes = ir.Constant(numbers, ir.Undefined), ir.Constant(WORDS, [0] * LANES)
+        with cgutils.for_range(builder, words) as loop:
             from_w = builder.add(w, builder.mul(loop.index, row))
-            from_x = builder.add(x, builder.mul(loop.index, next_pair))
-            columns = [builder.load(_at(builder, from_w, WORDS, w.type(64 * b)), align=4) for b in range(width)]
+            from_x = builder.add(x, builder.mul(loop.index, next_word))
+            columns = [builder.load(_at(builder, from_w, numbers, w.type(64 * b)), align=4) for b in range(width)]
             for r in range(count):
-                pair = builder.load(_at(builder, from_x, WORD, _times(builder, next_row, r)), align=4)
-                spread = builder.shuffle_vector(builder.insert_element(undefined, pair, WORD(0)), undefined, lanes)
+                one = builder.load(_at(builder, from_x, number, _times(builder, next_row, r)), align=4)
+                spread = builder.shuffle_vector(builder.insert_element(undefined, one, WORD(0)), undefined, lanes)
                 for b in range(width):
-                    builder.store(builder.call(dot, [builder.load(sums[r][b]), spread, columns[b]]), sums[r][b])
+                    before = builder.load(sums[r][b])
+                    after = (
+                        builder.call(dot, [before, spread, columns[b]])
+                        if bfloat16
+                        else builder.call(fused, [spread, columns[b], before])
+                    )
+                    builder.store(after, sums[r][b])
         for r in range(count):
             for b in range(width):
                 builder.store(builder.load(sums[r][b]), places[r][b], align=4)
         return context.get_dummy_value()
 
-    return types.void(rows, blocks, *[ADDRESS] * 8), code
+    return types.void(kind, rows, blocks, *[ADDRESS] * 8), code
 
 
-def _rounded(builder: Any, numbers: Any) -> Any:
-    return builder.call(ir.InlineAsm(ir.FunctionType(HALVES, [FLOATS]), *ROUND), [numbers])
+def _write(builder: Any, kind: Any, numbers: Any, address: Any) -> None:
+    """Write 16 float32 as numbers of a kind."""
+    if _is_bfloat16(kind):
+        rounded = builder.call(ir.InlineAsm(ir.FunctionType(HALVES, [FLOATS]), *ROUND), [numbers])
+        builder.store(rounded, _at(builder, address, HALVES), align=4)
+    else:
+        builder.store(numbers, _at(builder, address, FLOATS), align=4)
 
 
 @intrinsic
-def round_vector(context: Any, source: Any, target: Any) -> Any:
-    """Round 16 float32 to bfloat16."""
+def round_vector(context: Any, kind: Any, source: Any, target: Any) -> Any:
+    """Round 16 float32 to numbers of a kind."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        numbers = builder.load(_at(builder, arguments[0], FLOATS), align=4)
-        builder.store(_rounded(builder, numbers), _at(builder, arguments[1], HALVES), align=4)
+        _write(builder, kind, builder.load(_at(builder, arguments[1], FLOATS), align=4), arguments[2])
         return context.get_dummy_value()
 
-    return types.void(ADDRESS, ADDRESS), code
+    return types.void(kind, ADDRESS, ADDRESS), code
 
 
 @intrinsic
-def round_positive(context: Any, source: Any, target: Any) -> Any:
-    """Round 16 float32 to bfloat16, the negative ones to 0."""
+def round_positive(context: Any, kind: Any, source: Any, target: Any) -> Any:
+    """Round 16 float32 to numbers of a kind, the negative ones to 0."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        numbers = builder.load(_at(builder, arguments[0], FLOATS), align=4)
+        numbers = builder.load(_at(builder, arguments[1], FLOATS), align=4)
         zeros = ir.Constant(FLOATS, [0.0] * LANES)
         negative = builder.fcmp_ordered("<", numbers, zeros)  # what is not a number stays that
-        positive = builder.select(negative, zeros, numbers)
-        builder.store(_rounded(builder, positive), _at(builder, arguments[1], HALVES), align=4)
+        _write(builder, kind, builder.select(negative, zeros, numbers), arguments[2])
         return context.get_dummy_value()
 
-    return types.void(ADDRESS, ADDRESS), code
+    return types.void(kind, ADDRESS, ADDRESS), code
 
 
 @intrinsic
-def round_where_on(context: Any, source: Any, active: Any, target: Any) -> Any:
-    """Round 16 float32 to bfloat16, those to 0 where 16 bfloat16 numbers are 0."""
+def round_where_on(context: Any, kind: Any, source: Any, active: Any, target: Any) -> Any:
+    """Round 16 float32 to numbers of a kind, those to 0 where 16 others of that kind are 0."""
+    lanes = HALVES if _is_bfloat16(kind) else WORDS
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        numbers = _rounded(builder, builder.load(_at(builder, arguments[0], FLOATS), align=4))
-        active = builder.load(_at(builder, arguments[1], HALVES), align=4)
-        none = ir.Constant(HALVES, [0] * LANES)
-        kept = builder.select(builder.icmp_unsigned("==", active, none), none, numbers)
-        builder.store(kept, _at(builder, arguments[2], HALVES), align=4)
+        numbers = builder.load(_at(builder, arguments[1], FLOATS), align=4)
+        active = builder.load(_at(builder, arguments[2], lanes), align=4)
+        off = builder.icmp_unsigned("==", active, ir.Constant(lanes, [0] * LANES))
+        _write(builder, kind, builder.select(off, ir.Constant(FLOATS, [0.0] * LANES), numbers), arguments[3])
         return context.get_dummy_value()
 
-    return types.void(ADDRESS, ADDRESS, ADDRESS), code
+    return types.void(kind, ADDRESS, ADDRESS, ADDRESS), code
 
 
 @intrinsic

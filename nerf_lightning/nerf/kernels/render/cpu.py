@@ -1,4 +1,4 @@
-"""Whole rays in one kernel, for CPUs with AVX512-BF16: march, hash grid, perceptrons and quadrature, without gradients.
+"""Whole rays in one kernel: march, hash grid, perceptrons and quadrature, without gradients.
 
 ROWS rays are under way at a time, each with one sample: where a ray ends, the next one takes its place. So nothing is
 asked about what lies behind the sample that makes a ray opaque, and of a sample nothing but its light leaves the cache.
@@ -18,20 +18,22 @@ from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells, blocks_of, leaps_over
-from nerf_lightning.nerf.kernels.mlp.bfloat16 import (
+from nerf_lightning.nerf.kernels.mlp.cpu import (
+    KINDS,
     ROWS,
     address,
+    dtypes,
     packed_words,
     padded_widths,
-    require_bfloat16,
     round_rows,
     through,
 )
+from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "f1d1e2e1"
+COMPILED_WITH = "555e0d5f"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -47,6 +49,7 @@ def render(
     grid: OccupancyCells,
     least_alpha: float,
     opaque_below: float,
+    dtype: torch.dtype,
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"]]:
     """Return, per ray, sum of w rgb, sum of w, and sum of w t, in the letters of `rendering.quadrature`.
 
@@ -58,6 +61,7 @@ def render(
         grid: which of them are asked about.
         least_alpha: less opaque samples count with their density and without their colour.
         opaque_below: a ray ends where less light than this is left.
+        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
     """
     count = rays.near.shape[0]
     out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
@@ -66,19 +70,15 @@ def render(
     table, directions = _numpy((field.table, field.encode_directions(rays.view_directions).float()))
     levels = (*level_arrays(field.layout), (0,) * table.shape[1])
     limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
-    networks = (*_network(field.density_weights), *_network(field.color_weights))
+    networks = (*_network(field.density_weights, dtype), *_network(field.color_weights, dtype))
     arrays = _numpy(march), _numpy(world), directions, table, levels, networks, limits
-    over_rows(_render, count, *arrays, _numpy(out))
+    kind = KINDS[dtype]
+    over_rows(lambda first, last: _render(kind, first, last, *arrays, _numpy(out)), count)
     return out
 
 
 def trial() -> None:
-    """Run the kernel once on next to nothing; it raises whatever its compiler raises.
-
-    Raises:
-        RuntimeError: numba compiles for a CPU without these instructions.
-    """
-    require_bfloat16()
+    """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -89,16 +89,17 @@ def trial() -> None:
         weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
         table = torch.zeros(layout.offsets[-1], features)
         field = FieldParts(aabb, table, layout, 0.0, *weights, encode_directions=lambda x: torch.ones(len(x), 16))
-        render(rays, field, state, lattice, grid, 1e-3, 1e-3)
+        for dtype in dtypes():
+            render(rays, field, state, lattice, grid, 1e-3, 1e-3, dtype)
 
 
 def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
     return tuple(each.detach().contiguous().numpy() for each in tensors)
 
 
-def _network(weights: list[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+def _network(weights: list[Tensor], dtype: torch.dtype) -> tuple[np.ndarray, np.ndarray]:
     widths = padded_widths(weights)
-    return packed_words([weight.detach() for weight in weights], widths, transposed=False), np.array(widths)
+    return packed_words([weight.detach().to(dtype) for weight in weights], widths, transposed=False), np.array(widths)
 
 
 @njit
@@ -174,10 +175,10 @@ def _inside(points, s):
 
 @njit
 @no_type_check
-def _add_colors(count, inputs, words, packed, dims, sums, owner, weight, foreground):
+def _add_colors(kind, count, inputs, words, packed, dims, sums, owner, weight, foreground):
     stride, x, y = 4 * words.shape[1], address(words), address(sums)
-    round_rows(address(inputs), 4 * dims[0], x, stride, ROWS, dims[0])
-    through(x, stride, address(packed), dims, y, y)
+    round_rows(kind, address(inputs), 4 * dims[0], x, stride, ROWS, dims[0])
+    through(kind, x, stride, address(packed), dims, y, y)
     flat, outer = sums.reshape(-1), dims[-1]
     for i in range(count):
         for c in range(3):
@@ -186,7 +187,7 @@ def _add_colors(count, inputs, words, packed, dims, sums, owner, weight, foregro
 
 @njit(nogil=True, cache=True)
 @no_type_check
-def _render(first, last, march, world, directions, table, levels, networks, limits, out):
+def _render(kind, first, last, march, world, directions, table, levels, networks, limits, out):
     resolutions, offsets, hashed, mask, lanes = levels
     density_words, dims, color_words, color_dims = networks
     bias, least_alpha, opaque_below = limits
@@ -195,11 +196,12 @@ def _render(first, last, march, world, directions, table, levels, networks, limi
     ray, place, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
     begin, stop = light.copy(), light.copy()
     points, features = np.zeros((ROWS, 3), np.float32), np.zeros((ROWS, dims[0]), np.float32)
-    words, sums = np.zeros((ROWS, dims[:-1].sum() // 2), np.int32), np.zeros((ROWS, dims.max()), np.float32)
+    size, sums = bytes_of(kind), np.zeros((ROWS, dims.max()), np.float32)
+    words = np.zeros((ROWS, dims[:-1].sum() * size // 4), np.int32)
     flat, outer = sums.reshape(-1), dims[-1]
     # Of the samples whose colours are asked for together.
     inputs, owner, weight = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.int64), light.copy()
-    between = np.zeros((ROWS, color_dims[:-1].sum() // 2), np.int32)
+    between = np.zeros((ROWS, color_dims[:-1].sum() * size // 4), np.int32)
     colors, hidden = np.zeros((ROWS, color_dims.max()), np.float32), color_dims[0] - directions.shape[1]
     live, waiting, asked = 0, first, 0
     while True:
@@ -210,8 +212,8 @@ def _render(first, last, march, world, directions, table, levels, networks, limi
         _locate(world, live, ray, begin, stop, points)
         encode(0, live, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, stride, y = address(words), 4 * words.shape[1], address(sums)
-        round_rows(address(features), 4 * dims[0], x, stride, ROWS, dims[0])
-        through(x, stride, address(density_words), dims, y, y)
+        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
+        through(kind, x, stride, address(density_words), dims, y, y)
         for s in range(live):
             if not _inside(points, s):
                 continue
@@ -227,6 +229,6 @@ def _render(first, last, march, world, directions, table, levels, networks, limi
                 owner[asked], weight[asked] = r, w
                 asked += 1
             if asked == ROWS:
-                _add_colors(asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)
+                _add_colors(kind, asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)
                 asked = 0
-    _add_colors(asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)
+    _add_colors(kind, asked, inputs, between, color_words, color_dims, colors, owner, weight, foreground)

@@ -1,7 +1,11 @@
-"""The perceptron by the CPU's own bfloat16 instructions: the same roundings in plain torch are its reference."""
+"""The perceptron that stays in the cache, in float32 and bfloat16, against the same roundings in plain torch."""
 
+import os
+import subprocess
+import sys
 from itertools import pairwise
 
+import llvmlite.binding as llvm
 import pytest
 import torch
 
@@ -9,7 +13,7 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
 from nerf_lightning.nerf.products import TILE_ROWS, cpu_multiplies_bfloat16
 
-pytestmark = pytest.mark.skipif(
+needs_bfloat16 = pytest.mark.skipif(
     not cpu_multiplies_bfloat16(), reason="this CPU, as far as torch may use it, does not multiply bfloat16 itself"
 )
 SIZES = [(32, 64, 16), (32, 64, 64, 3), (16, 16, 5), (48, 80, 128, 7), (16, 1)]
@@ -18,26 +22,31 @@ ROWS = [0, 1, 2, 127, 128, 129, TILE_ROWS + 17]
 
 @pytest.fixture
 def kernels():
-    return backends.twin("mlp.bfloat16")
+    return backends.twin("mlp.cpu")
 
 
-def rounded(x):
-    return x.bfloat16().double()
+@pytest.fixture(params=["float32", pytest.param("bfloat16", marks=needs_bfloat16)])
+def dtype(request):
+    return getattr(torch, request.param)
 
 
-def given(sizes, rows):
-    return torch.randn(rows, sizes[0]), [torch.randn(b, a) / a**0.5 for a, b in pairwise(sizes)]
+def given(sizes, rows, dtype):
+    return torch.randn(rows, sizes[0]), [(torch.randn(b, a) / a**0.5).to(dtype) for a, b in pairwise(sizes)]
 
 
 def reference(points, weights, grad):
     """Outputs and gradients in float64, of numbers rounded where the kernels round them."""
-    inputs, weights = [rounded(points)], [rounded(weight) for weight in weights]
-    for weight in weights[:-1]:
+
+    def rounded(x):
+        return x.to(weights[0].dtype).double()
+
+    inputs, exact = [rounded(points)], [weight.double() for weight in weights]
+    for weight in exact[:-1]:
         inputs.append(rounded((inputs[-1] @ weight.t()).clamp(min=0.0)))
-    out, flowing, grads = inputs[-1] @ weights[-1].t(), rounded(grad), []
+    out, flowing, grads = inputs[-1] @ exact[-1].t(), rounded(grad), []
     for number in reversed(range(len(weights))):
         grads.insert(0, flowing.t() @ inputs[number])
-        flowing = flowing @ weights[number]
+        flowing = flowing @ exact[number]
         if number:
             flowing = rounded(flowing * (inputs[number] > 0))
     return [out, flowing, *grads]
@@ -49,8 +58,8 @@ def far_apart(found, expected):
 
 @pytest.mark.parametrize("rows", ROWS)
 @pytest.mark.parametrize("sizes", SIZES)
-def test_it_is_what_the_same_roundings_give(kernels, sizes, rows):
-    points, weights = given(sizes, rows)
+def test_it_is_what_the_same_roundings_give(kernels, sizes, rows, dtype):
+    points, weights = given(sizes, rows, dtype)
     grad = torch.randn(rows, sizes[-1])
     out, kept = kernels.forward(points, weights, keep=True)
     of_points, of_weights = kernels.backward(grad, weights, kept, wants_points=True)
@@ -61,16 +70,16 @@ def test_it_is_what_the_same_roundings_give(kernels, sizes, rows):
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test_a_row_does_not_depend_on_its_neighbours_nor_on_what_is_kept(kernels, sizes):
-    points, weights = given(sizes, 300)
+def test_a_row_does_not_depend_on_its_neighbours_nor_on_what_is_kept(kernels, sizes, dtype):
+    points, weights = given(sizes, 300, dtype)
     out, _ = kernels.forward(points, weights, keep=False)
     assert torch.equal(kernels.forward(points, weights, keep=True)[0], out)
     for part in (slice(7, 8), slice(100, 229)):
         assert torch.equal(kernels.forward(points[part], weights, keep=False)[0], out[part])
 
 
-def test_gradients_of_weights_do_not_see_what_memory_held_before(kernels):
-    points, weights = given((32, 64, 3), 130)
+def test_gradients_of_weights_do_not_see_what_memory_held_before(kernels, dtype):
+    points, weights = given((32, 64, 3), 130, dtype)
     grad, results = torch.randn(130, 3), []
     for dirt in (0.0, torch.nan, 3.0):
         _ = [torch.full((256, size), dirt) for size in (48, 64, 32, 3)]  # what the next ones are likely to be given
@@ -80,14 +89,14 @@ def test_gradients_of_weights_do_not_see_what_memory_held_before(kernels):
     assert torch.equal(results[0], results[2])
 
 
-def test_the_result_does_not_depend_on_the_threads():
-    points, weights = given((32, 64, 3), 3 * TILE_ROWS)
+def test_the_result_does_not_depend_on_the_threads(dtype):
+    points, weights = given((32, 64, 3), 3 * TILE_ROWS, dtype)
     before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            leaves = [weight.clone().requires_grad_() for weight in weights]
-            mlp(points, leaves, "bfloat16").square().sum().backward()
+            leaves = [weight.float().clone().requires_grad_() for weight in weights]
+            mlp(points, leaves, "bfloat16" if dtype == torch.bfloat16 else "float32").square().sum().backward()
             results.append(torch.cat([leaf.grad.flatten() for leaf in leaves]))
     finally:
         torch.set_num_threads(before)
@@ -95,30 +104,48 @@ def test_the_result_does_not_depend_on_the_threads():
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_what_is_no_number_stays_that(kernels, value):
-    points, weights = given((16, 32, 2), 10)
+def test_what_is_no_number_stays_that(kernels, value, dtype):
+    points, weights = given((16, 32, 2), 10, dtype)
     points[3, 5] = value
     out, _ = kernels.forward(points, weights, keep=False)
     assert not out[3].isfinite().all()
     assert out[torch.arange(10) != 3].isfinite().all()
 
 
-def test_gradients_of_the_points_are_left_out_where_nobody_asks(kernels):
-    points, weights = given((32, 64, 3), 200)
+def test_gradients_of_the_points_are_left_out_where_nobody_asks(kernels, dtype):
+    points, weights = given((32, 64, 3), 200, dtype)
     out, kept = kernels.forward(points, weights, keep=True)
     assert kernels.backward(out, weights, kept, wants_points=False)[0] is None
 
 
-@pytest.mark.parametrize("switched_off", [False, True])
-def test_other_widths_and_a_kernel_that_is_switched_off_take_the_other_way(monkeypatch, kernels, switched_off):
-    points, weights = given((32, 64, 3) if switched_off else (27, 64, 3), 500)
+def test_other_widths_take_the_other_way(monkeypatch, kernels, dtype):
+    points, weights = given((27, 64, 3), 500, torch.float32)
     monkeypatch.setattr(kernels, "_forward", lambda *arguments: pytest.fail("not this way"))
-    with backends.without(*["mlp.bfloat16"] if switched_off else []):
-        assert far_apart(mlp(points, weights, "bfloat16"), mlp_torch(points, weights).double()) < 2e-2
+    products = "bfloat16" if dtype == torch.bfloat16 else "float32"
+    assert far_apart(mlp(points, weights, products), mlp_torch(points, weights).double()) < 2e-2
+
+
+@pytest.mark.skipif(
+    llvm.get_host_cpu_features().get("avx512f") is None, reason="this CPU's registers are narrow anyway"
+)
+def test_narrow_registers_give_the_same_products():
+    """As numba compiles for a CPU with AVX2 alone."""
+    program = (
+        "import torch; from nerf_lightning.nerf.kernels.mlp import cpu\n"
+        "assert (cpu.WIDE, cpu.dtypes()) == (False, [torch.float32])\n"
+        "points, weights = torch.randn(300, 32), [torch.randn(80, 32), torch.randn(3, 80)]\n"
+        "out, kept = cpu.forward(points, weights, keep=True)\n"
+        "torch.testing.assert_close(out, (points @ weights[0].t()).relu() @ weights[1].t(), rtol=1e-4, atol=1e-3)\n"
+        "of_points, of_weights = cpu.backward(out, weights, kept, True)\n"
+        "hidden = (points @ weights[0].t()).relu()\n"
+        "torch.testing.assert_close(of_weights[1], out.t() @ hidden, rtol=1e-3, atol=1)\n"
+    )
+    other = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+f16c"}
+    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | other)
 
 
 def test_a_compiler_that_does_not_know_the_instructions_is_not_asked(monkeypatch, kernels):
     """LLVM would end the program."""
     monkeypatch.setattr(kernels.llvm, "get_host_cpu_features", lambda: {"avx512f": True})
-    with pytest.raises(RuntimeError, match="numba does not know that this CPU multiplies bfloat16"):
-        kernels.trial()
+    assert kernels.dtypes() == [torch.float32]
+    assert not kernels.takes([torch.ones(16, 16)], torch.bfloat16)
