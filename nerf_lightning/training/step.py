@@ -121,6 +121,7 @@ class TrainStep:
         self.sample_budget, self.jitter = sample_budget, jitter
         self.start_weights = start_weights
         self.guard = StepGuard()
+        model.keep_weights(loss.needs_weights)
         if tile_points is not None and model.needs_whole_batch:
             raise InputError(
                 "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "

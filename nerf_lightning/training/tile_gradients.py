@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, hold_back
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, add_all, hold_back
 from nerf_lightning.nerf.kernels.threads import in_parallel
 
 Backward = Callable[[Tensor], None]
@@ -87,6 +87,5 @@ class _Found(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor | None, ...]:
-        for each in ctx.held:
-            each.add(float(scale))
+        add_all(ctx.held, float(scale))
         return None, None, None, *(None if found is None else found * scale for found in ctx.sums)

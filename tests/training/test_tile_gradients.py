@@ -12,7 +12,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.hybrid import HybridEncoder
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import hold_back, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, hold_back, interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 
@@ -87,9 +87,7 @@ def test_the_gradients_of_a_table_can_be_held_back_and_added_later():
     with hold_back() as held:
         interpolate(table, points, layout).square().sum().backward()
     assert table.grad is None
-    for each in held:
-        each.add()
+    add_all(held)
     assert torch.equal(table.grad, wanted)
-    for each in held:
-        each.add(scale=2.0)
-    torch.testing.assert_close(table.grad, 3.0 * wanted)
+    add_all([*held, *held], scale=2.0)
+    torch.testing.assert_close(table.grad, 5.0 * wanted)

@@ -153,11 +153,13 @@ class HashField(Field):
 
     def parts(self) -> FieldParts | None:
         """Return table and weights, of a field over a box whose colours are the same for all photographs."""
-        grid = self.position_encoder.grid()
-        if grid is None or self.contracted.is_on() or self.appearance:
+        grid, directions = self.position_encoder.grid(), self.direction_encoder
+        if type(self) is not HashField:  # which may compute something else
+            return None
+        if grid is None or self.contracted.is_on() or self.appearance or list(directions.parameters()):
             return None
         density, color = list(self.density_mlp), list(self.color_mlp)
-        return FieldParts(self.aabb, *grid, float(self.bias), density, color, self.direction_encoder)
+        return FieldParts(self.aabb, *grid, float(self.bias), density, color, directions, self.least_slope)
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -7,7 +7,7 @@ from nerf_lightning.nerf.kernels.backends import twin
 
 CPU_TWINS = (
     *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "bricks.cpu", "bricks.contracted"),
-    *("bricks.gradients", "fusion.cpu", "texels.cpu", "mlp.cpu", "render.cpu"),
+    *("bricks.gradients", "fusion.cpu", "texels.cpu", "mlp.cpu", "render.cpu", "render.gradients"),
 )
 
 

@@ -51,13 +51,13 @@ def over_rows(kernel: Callable[..., Any], rows: int, *arrays: Any) -> None:
     in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, torch.get_num_threads()))
 
 
-def parts_of(rows: int, threads: int) -> list[tuple[int, int]]:
-    """Return the parts that rows are shared out in; for one thread a single one.
+def parts_of(rows: int, threads: int, fewest: int = FEWEST_ROWS) -> list[tuple[int, int]]:
+    """Return the parts that rows are shared out in, of no fewer than `fewest`; for one thread a single one.
 
     >>> parts_of(4096, 1), parts_of(1200, 8)
     ([(0, 4096)], [(0, 600), (600, 1200)])
     """
-    count = 1 if threads == 1 else max(1, min(PARTS_PER_THREAD * threads, rows // FEWEST_ROWS))
+    count = 1 if threads == 1 else max(1, min(PARTS_PER_THREAD * threads, rows // fewest))
     return [(rows * part // count, rows * (part + 1) // count) for part in range(count)]
 
 

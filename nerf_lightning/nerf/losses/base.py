@@ -19,6 +19,9 @@ class Loss(nn.Module, ABC):
     patch: int = 1
     """Side in pixels of the squares that it wants to see whole: batches hold one after the other, row by row."""
 
+    needs_weights: bool = False
+    """Whether it looks at the weights and samples of renderings, which levels may leave out otherwise."""
+
     @abstractmethod
     def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
         """Return one number per level, first level first; training minimises their sum.

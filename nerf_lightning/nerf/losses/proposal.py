@@ -26,6 +26,8 @@ class ProposalLoss(Loss):
         distortion: factor on the distortion loss; larger values remove fog and floaters, too large ones detail.
     """
 
+    needs_weights = True
+
     def __init__(self, interlevel: float = 1.0, distortion: float = 1e-3):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion

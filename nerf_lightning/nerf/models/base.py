@@ -84,6 +84,9 @@ class Model(nn.Module, ABC):
     def multiply_in(self, products: Products) -> None:
         """Set the precision of the products with the fields' weights; everything else is float32 always."""
 
+    def keep_weights(self, wanted: bool) -> None:
+        """Set whether renderings in training have weights and samples where they could do without (`Loss`)."""
+
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 

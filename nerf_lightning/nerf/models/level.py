@@ -31,6 +31,9 @@ class Level(nn.Module):
     sampler_kind: type[Sampler] = Sampler
     """What it can sample with."""
 
+    keeps_weights: bool = True
+    """Whether renderings in training have weights and samples, for a loss that looks at them (`Loss.needs_weights`)."""
+
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
 

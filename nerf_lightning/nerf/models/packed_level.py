@@ -107,15 +107,38 @@ class PackedLevel(Level):
         """Render rays; without random numbers round by round, until each ray is opaque or has left the scene."""
         if random is None and not torch.is_grad_enabled():
             return self._render(rays, background)
+        whole = self._whole_rays(rays, background, random)
+        if whole is not None:
+            return whole
         samples, features = self.visible_samples(rays, random)
         capacity = self.sampler.capacity_on(rays.near.device)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
-        count = torch.full_like(samples.found, rays.near.shape[0])
-        counted = torch.stack([samples.found, count, torch.zeros_like(count) + dropped])
-        with COUNTING:
-            self.tally += counted
+        self._count(samples.found, rays, torch.zeros_like(samples.found) + dropped)
         output = self.field(packed_points(rays, samples, random, self.field.sees_cones), features)
         return composite_packed(output, samples, rays, background)
+
+    def _count(self, samples: Tensor, rays: RayBundle, dropped: Tensor) -> None:
+        counted = torch.stack([samples, torch.full_like(samples, rays.near.shape[0]), dropped])
+        with COUNTING:
+            self.tally += counted
+
+    def _whole_rays(
+        self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None
+    ) -> Rendering | None:
+        """Render with gradients, in one kernel for whole rays, where there is one; it keeps no weights."""
+        # Where cameras are learnt, rays have gradients, which that kernel does not know.
+        if self.keeps_weights or not torch.is_grad_enabled() or rays.origins.requires_grad:
+            return None
+        parts = self.field.parts()
+        found = whole_rays(parts, self.field.products, rays.near.device, gradients=True)
+        march = None if found is None else self.sampler.march(rays, random)
+        if march is None or parts is None or found is None:
+            return None
+        kernels, dtype = found
+        expected = self.points_per_ray(1.0, training=True)
+        rgb, opacity, depth, asked = kernels.render(rays, parts, *march, self.sampler.opaque_below, dtype, expected)
+        self._count(torch.tensor(asked), rays, torch.tensor(0))
+        return _in_front_of(background, rays, rgb, 1.0 - opacity, depth)
 
     def visible_samples(
         self, rays: RayBundle, random: RayRandom | None

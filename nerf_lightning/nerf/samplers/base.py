@@ -98,6 +98,12 @@ class PackedSampler(Sampler, ABC):
         """Return the size of the arrays of samples where no size may be read on the host; None elsewhere."""
         return None
 
+    def march(
+        self, rays: RayBundle, random: RayRandom | None
+    ) -> tuple[March, Float[Tensor, "edges"], OccupancyCells] | None:
+        """Return the march that `forward` takes, for kernels that do all of it; None where there is none."""
+        return None
+
     def walk(self, rays: RayBundle) -> Walk:
         """Begin to render rays; who does not say otherwise takes all samples at once."""
         return _AllAtOnce(self, rays)

@@ -151,9 +151,12 @@ class OccupancySampler(PackedSampler):
 
     def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
         """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
-        capacity, grid = self.capacity_on(rays.near.device), self.grid.occupied()
         rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
-        return march(rays, self.start(rays, random), self.lattice, grid, capacity=capacity)[0]
+        return march(rays, *self.march(rays, random), capacity=self.capacity_on(rays.near.device))[0]
+
+    def march(self, rays: RayBundle, random: RayRandom | None) -> tuple[March, Float[Tensor, "edges"], OccupancyCells]:
+        """Return where each ray stands, and through what it goes."""
+        return self.start(rays, random), self.lattice, self.grid.occupied()
 
     def walk(self, rays: RayBundle) -> Walk:
         """Begin to render rays: each march goes on where it stopped."""

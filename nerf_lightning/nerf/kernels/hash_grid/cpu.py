@@ -3,6 +3,7 @@
 `lanes` is a tuple of F zeros: its length is part of the compiled signature, so the loops over features become vectors.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
@@ -45,9 +46,28 @@ def add_table_gradient(
     layout: "HashGridLayout",
 ) -> None:
     """Add the gradient with respect to the table to `into`."""
-    given = (into.numpy(), points.numpy(), grad.numpy(), *level_arrays(layout), (0,) * into.shape[1])
+    add_table_gradients(into, [(points, grad)], layout)
+
+
+def add_table_gradients(
+    into: Float[Tensor, "entries features"], found: Sequence[tuple[Tensor, Tensor]], layout: "HashGridLayout"
+) -> None:
+    """Add several gradients with respect to the table, one after the other.
+
+    Args:
+        into: as large as the table.
+        found: sets of points, `points 3`, each with the gradients of their features, `points out`.
+        layout: where the levels' entries lie.
+    """
+    table, of_layout = into.numpy(), (*level_arrays(layout), (0,) * into.shape[1])
+    arrays = [(points.numpy(), grad.numpy()) for points, grad in found]
+
+    def add(level: int) -> None:
+        for points, grad in arrays:
+            _add_table_gradient(level, table, points, grad, *of_layout)
+
     # Fine levels take longest: they come first.
-    in_parallel(lambda level: _add_table_gradient(level, *given), range(len(layout.resolutions))[::-1])
+    in_parallel(add, range(len(layout.resolutions))[::-1])
 
 
 def point_gradient(

@@ -53,12 +53,43 @@ class TableGradient:
     layout: HashGridLayout
     kernels: ModuleType
 
-    def add(self, scale: float = 1.0) -> None:
-        """Add it."""
-        if self.table.grad is None:
-            self.table.grad = torch.zeros_like(self.table)
-        grad = self.grad if scale == 1.0 else self.grad * scale
-        self.kernels.add_table_gradient(self.table.grad, self.points, grad, self.layout)
+
+def add_all(held: Sequence[TableGradient], scale: float = 1.0) -> None:
+    """Add what was held back, the gradients of one table together: threads are not woken for each."""
+    for same in {(id(each.table), each.layout): each for each in held}.values():
+        table, layout = same.table, same.layout
+        if table.grad is None:
+            table.grad = torch.zeros_like(table)
+        alike = [each for each in held if each.table is table and each.layout == layout]
+        found = [(each.points, each.grad if scale == 1.0 else each.grad * scale) for each in alike]
+        same.kernels.add_table_gradients(table.grad, found, layout)
+
+
+def table_gradient(
+    table: Float[Tensor, "entries features"],
+    points: Float[Tensor, "points 3"],
+    grad: Float[Tensor, "points out"],
+    layout: HashGridLayout,
+    kernels: ModuleType,
+) -> Float[Tensor, "entries features"] | None:
+    """Return a table's gradient in a backward pass; None where it is held back, or was added in place.
+
+    Args:
+        table: as autograd knows it.
+        points: in the unit cube.
+        grad: of their features.
+        layout: where the levels' entries lie.
+        kernels: with `add_table_gradient`.
+    """
+    if _held.gradients is not None:
+        _held.gradients.append(TableGradient(table, points, grad, layout, kernels))
+        return None
+    # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh table of
+    # zeros for each tile costs more than the gradients themselves.
+    kept = table.grad if getattr(table, "grad_in_place", False) else None
+    into = torch.zeros_like(table, dtype=torch.float32) if kept is None else kept
+    kernels.add_table_gradient(into, points, grad, layout)
+    return into if kept is None else None
 
 
 @contextmanager
@@ -97,16 +128,6 @@ class _Interpolate(torch.autograd.Function):
         layout, twin = ctx.layout, ctx.twin  # type: ignore[attr-defined]
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad = grad.float().contiguous()
-        grad_table = None
-        if wants_table and _held.gradients is not None:
-            _held.gradients.append(TableGradient(table, points, grad, layout, twin))
-            wants_table = False
-        if wants_table:
-            # An optimizer that keeps its gradients allocated says so: then they are added in place, since a fresh
-            # table of zeros for each tile costs more than the gradients themselves.
-            kept = table.grad if getattr(table, "grad_in_place", False) else None
-            into = torch.zeros_like(table, dtype=torch.float32) if kept is None else kept
-            twin.add_table_gradient(into, points, grad, layout)
-            grad_table = into if kept is None else None
+        grad_table = table_gradient(table, points, grad, layout, twin) if wants_table else None
         grad_points = twin.point_gradient(table.detach(), points, grad, layout) if wants_points else None
         return grad_table, grad_points, None, None, None

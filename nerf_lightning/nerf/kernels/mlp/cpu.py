@@ -69,7 +69,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     packed, dims = packed_words(weights, widths, transposed=False), np.array(widths)
     padded = -(-rows // ROWS) * ROWS
     out = points.new_empty(padded, weights[-1].shape[0])
-    kept = torch.empty(padded if keep else 0, words_of(sum(widths[:-1]), weights), dtype=torch.int32)
+    kept = torch.empty(padded if keep else 0, words_of(sum(widths[:-1]), weights[0].dtype), dtype=torch.int32)
     arrays = points.numpy(), packed, dims, out.numpy(), kept.numpy()
     in_parallel(lambda part: _forward(kind, part.start, part.stop, keep, *arrays), tiles_of_rows(rows))
     return out[:rows], kept
@@ -119,19 +119,19 @@ def padded_widths(weights: Sequence[Tensor]) -> list[int]:
     return [-(-width // LANES) * LANES for width in widths]
 
 
-def words_of(numbers: int, weights: Sequence[Tensor]) -> int:
+def words_of(numbers: int, dtype: torch.dtype) -> int:
     """Return how many words so many numbers take."""
-    return numbers // 2 if weights[0].dtype == torch.bfloat16 else numbers
+    return numbers // 2 if dtype == torch.bfloat16 else numbers
 
 
 def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
     """Return the words of all layers: rows of W^T, or of W, one layer after the other; in bfloat16 pairs of rows."""
-    out, place = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights), np.int32), 0
+    out, place = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights[0].dtype), np.int32), 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         padded = np.zeros((outer, inner), np.float32)
         padded[: weight.shape[0], : weight.shape[1]] = weight.detach().float().numpy()
         rows = np.ascontiguousarray(padded if transposed else padded.T)
-        end = place + words_of(rows.size, weights)
+        end = place + words_of(rows.size, weight.dtype)
         if weight.dtype == torch.bfloat16:
             _pack(rows, out[place:end])
         else:

@@ -6,6 +6,7 @@ What comes out for a ray does not depend on the others.
 """
 
 import math
+from collections.abc import Iterator
 from typing import no_type_check
 
 import numpy as np
@@ -33,7 +34,7 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "555e0d5f"
+COMPILED_WITH = "16c3c471"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -79,6 +80,13 @@ def render(
 
 def trial() -> None:
     """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
+    for rays, field, state, lattice, grid in trial_arguments():
+        for dtype in dtypes():
+            render(rays, field, state, lattice, grid, 1e-3, 1e-3, dtype)
+
+
+def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, OccupancyCells]]:
+    """Yield a ray, a field, and what the ray marches through, for the widths that conf/model uses."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -89,8 +97,7 @@ def trial() -> None:
         weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
         table = torch.zeros(layout.offsets[-1], features)
         field = FieldParts(aabb, table, layout, 0.0, *weights, encode_directions=lambda x: torch.ones(len(x), 16))
-        for dtype in dtypes():
-            render(rays, field, state, lattice, grid, 1e-3, 1e-3, dtype)
+        yield rays, field, state, lattice, grid
 
 
 def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:

@@ -23,6 +23,8 @@ class FieldParts:
     color_weights: list[Tensor]
     """Of the colour's; its inputs are the density's outputs and the features of the direction."""
     encode_directions: Callable[[Float[Tensor, "rays 3"]], Float[Tensor, "rays features"]]
+    least_slope: float = 0.0
+    """Of a colour over its raw value on the way back from black or full, in training."""
 
     @property
     def weights(self) -> tuple[list[Tensor], list[Tensor]]:

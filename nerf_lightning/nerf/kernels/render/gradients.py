@@ -1,0 +1,468 @@
+"""Whole rays in one kernel per pass, with gradients: march, hash grid, perceptrons, quadrature, and the way back.
+
+As in `cpu.py` ROWS samples are taken at a time; here a ray that has a block almost for itself takes several at once.
+What the way back needs is kept block by block. It takes the blocks from the last to the first, so that of each ray
+those samples come first that lie farthest, and sums up what lies behind each.
+
+Letters as in `kernels.packed.integrate`. Where the samples lie has no gradient.
+"""
+
+import threading
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
+from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
+from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.kernels.mlp.cpu import (
+    KINDS,
+    ROWS,
+    address,
+    back_through,
+    dtypes,
+    packed_words,
+    padded_widths,
+    round_rows,
+    through,
+    unpadded,
+    words_of,
+)
+from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
+from nerf_lightning.nerf.kernels.render.cpu import trial_arguments
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
+from nerf_lightning.nerf.types.rays import RayBundle
+
+COMPILED_WITH = "16c3c471"
+"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
+
+HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+LARGEST_RAW, LARGEST_SLOPE = np.float32(30.0), np.float32(15.0)
+"""The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.hash_field`)."""
+SLOTS = 64
+"""So many rays are under way at a time: more would take fewer samples in a row, which lie close in the tables."""
+SPARE_BLOCKS, FEWEST_RAYS = 8, 64
+NUMBERS = 8
+"""Of each sample: length, distance, light behind it, weight, slope of the density, three colours."""
+
+
+@dataclass
+class Room:
+    """What the way back needs of some blocks of samples; steps take it from one another, since fresh memory is slow."""
+
+    owners: Tensor
+    """Number of each sample's ray; negative: none."""
+    numbers: Tensor
+    points: Tensor
+    """In the unit cube."""
+    density_words: Tensor
+    """Inputs of all layers of the density's perceptron."""
+    color_words: Tensor
+
+    @classmethod
+    def of(cls, blocks: int, density_words: int, color_words: int) -> "Room":
+        """Return room for so many blocks."""
+        rows = blocks * ROWS
+        return cls(
+            torch.empty(rows, dtype=torch.int32),
+            torch.empty(rows, NUMBERS),
+            torch.empty(rows, 3),
+            torch.empty(rows, density_words, dtype=torch.int32),
+            torch.empty(rows, color_words, dtype=torch.int32),
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Words per sample: rooms of one size may take each other's place."""
+        return self.density_words.shape[1], self.color_words.shape[1]
+
+    @property
+    def blocks(self) -> int:
+        """How many there is room for."""
+        return self.owners.shape[0] // ROWS
+
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Return what the kernels take."""
+        return _numpy((self.owners, self.numbers, self.points, self.density_words, self.color_words))
+
+
+_spare: list[Room] = []
+_spare_lock = threading.Lock()
+
+
+def _take_room(blocks: int, size: tuple[int, int]) -> Room:
+    with _spare_lock:
+        for number, room in enumerate(_spare):
+            if room.size == size and room.blocks >= blocks:
+                return _spare.pop(number)
+        _spare.clear()  # of another field, or too small
+    return Room.of(blocks, *size)
+
+
+def _give_back(rooms: list[Room]) -> None:
+    with _spare_lock:
+        _spare.extend(rooms)
+
+
+def render(
+    rays: RayBundle,
+    field: FieldParts,
+    state: March,
+    lattice: Float[Tensor, "edges"],
+    grid: OccupancyCells,
+    opaque_below: float,
+    dtype: torch.dtype,
+    samples_per_ray: float,
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], int]:
+    """Return, per ray, sum of w rgb, sum of w, and sum of w t; and how many samples were asked about.
+
+    Gradients go to the field's table and weights. The arguments are those of `cpu.render`; every sample counts with its
+    colour.
+
+    Args:
+        rays: unit directions, scene units.
+        field: what is asked about the samples.
+        state: where each ray's march begins.
+        lattice: the intervals (`kernels.march`).
+        grid: which of them are asked about.
+        opaque_below: a ray ends where less light than this is left.
+        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
+        samples_per_ray: about how many there will be.
+    """
+    given = _Given(rays, field, state, lattice, grid, opaque_below, dtype, samples_per_ray)
+    out = _WholeRays.apply(given, field.table, *field.density_weights, *field.color_weights)
+    return *out, given.asked
+
+
+def trial() -> None:
+    """Run the kernels once on next to nothing; it raises whatever their compiler raises."""
+    for rays, field, state, lattice, grid in trial_arguments():
+        for dtype in dtypes():
+            field.table.requires_grad_()
+            light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtype, 1.0)
+            (light.sum() + opacity.sum() + depth.sum()).backward()
+
+
+class _Given:
+    """All that a pass needs besides what has gradients."""
+
+    def __init__(
+        self,
+        rays: RayBundle,
+        field: FieldParts,
+        state: March,
+        lattice: Tensor,
+        grid: OccupancyCells,
+        opaque_below: float,
+        dtype: torch.dtype,
+        samples_per_ray: float,
+    ):
+        self.field, self.kind, self.dtype = field, KINDS[dtype], dtype
+        march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
+        self.march = _numpy(march)
+        self.world = _numpy((rays.origins, rays.directions, field.aabb))
+        (self.directions,) = _numpy((field.encode_directions(rays.view_directions).float(),))
+        self.limits = np.float32(field.bias), np.float32(opaque_below)
+        self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
+        self.parts = parts_of(self.rays, torch.get_num_threads(), FEWEST_RAYS)
+        self.rooms: list[Room] = []
+        self.used: list[int] = []
+
+    def networks(self, density: list[Tensor], color: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
+        """Return the words and widths of both perceptrons."""
+        return (*self._network(density, transposed), *self._network(color, transposed))
+
+    def _network(self, weights: list[Tensor], transposed: bool) -> tuple[np.ndarray, np.ndarray]:
+        widths = padded_widths(weights)
+        return packed_words([w.detach().to(self.dtype) for w in weights], widths, transposed), np.array(widths)
+
+    def see(self, table: Tensor, density: list[Tensor], color: list[Tensor], out: tuple[Tensor, ...]) -> None:
+        """Render, and keep what the way back needs."""
+        of_field = _numpy((table,))[0], (*level_arrays(self.field.layout), (0,) * table.shape[1])
+        given = self.march, self.world, self.directions, *of_field, self.networks(density, color, False), self.limits
+        of_density, of_color = (words_of(sum(padded_widths(weights)[:-1]), self.dtype) for weights in (density, color))
+
+        def part(bounds: tuple[int, int]) -> tuple[Room, int, int]:
+            blocks = SPARE_BLOCKS + int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS
+            while True:
+                room = _take_room(blocks, (of_density, of_color))
+                used, asked = _see(self.kind, *bounds, *given, room.arrays(), _numpy(out))
+                if used <= room.blocks:
+                    return room, used, asked
+                blocks = 2 * room.blocks
+                for each in out:
+                    each[bounds[0] : bounds[1]] = 0.0
+
+        found = in_parallel(part, self.parts)
+        self.rooms, self.used = [room for room, _, _ in found], [used for _, used, _ in found]
+        self.asked = sum(asked for _, _, asked in found)
+
+    def go_back(
+        self, density: list[Tensor], color: list[Tensor], grads: tuple[Tensor, ...]
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Return the gradients of the weights; and all points, with the gradients of their features."""
+        networks, arrays = self.networks(density, color, True), _numpy(grads)
+        widths = padded_widths(density), padded_widths(color)
+        counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
+        sums, ends = torch.zeros(len(self.parts), sum(counts)), np.cumsum(self.used) * ROWS
+        points, features = torch.empty(int(ends[-1]), 3), torch.empty(int(ends[-1]), widths[0][0])
+
+        def part(number: int) -> None:
+            room, end, count = self.rooms[number], int(ends[number]), self.used[number] * ROWS
+            totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
+            slope = np.float32(self.field.least_slope)
+            hidden = widths[1][0] - self.directions.shape[1]
+            given = self.parts[number], self.used[number], hidden, networks, slope, arrays, room.arrays()
+            _go_back(self.kind, *given, features[end - count : end].numpy(), *totals)
+            points[end - count : end] = room.points[:count]
+
+        in_parallel(part, range(len(self.parts)))
+        total = sums.sum(dim=0)
+        of_density = unpadded(total[: counts[0]], density, widths[0])
+        of_color = unpadded(total[counts[0] :], color, widths[1])
+        _give_back(self.rooms)
+        self.rooms = []
+        return [*of_density, *of_color], points, features
+
+
+class _WholeRays(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, given: _Given, table: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        layers = len(given.field.density_weights)
+        out = torch.zeros(given.rays, 3), torch.zeros(given.rays), torch.zeros(given.rays)
+        given.see(table, list(weights[:layers]), list(weights[layers:]), out)
+        ctx.given, ctx.layers = given, layers
+        ctx.save_for_backward(table, *weights)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
+        table, *weights = ctx.saved_tensors
+        of_weights, points, features = ctx.given.go_back(weights[: ctx.layers], weights[ctx.layers :], grads)
+        of_table = None
+        if ctx.needs_input_grad[1]:
+            of_table = table_gradient(table, points, features, ctx.given.field.layout, hash_grid)
+        return None, of_table, *of_weights
+
+
+def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+    return tuple(each.detach().contiguous().numpy() for each in tensors)
+
+
+@njit
+@no_type_check
+def _next(march, r, k):
+    # The first interval of a ray from k on that may hold something; the lattice's end if none.
+    o, d, _, leave, jitters, lattice, cells, leaps = march
+    found, _, _, _, _ = next_occupied(
+        *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
+    )
+    return found
+
+
+@njit
+@no_type_check
+def _start(march, live, waiting, last, ray, place, light):
+    # Fills the free places with rays that meet something; returns how many are under way, and which ray comes next.
+    enter, leave, jitters, lattice = march[2:6]
+    while live < SLOTS and waiting < last:
+        r = waiting
+        waiting += 1
+        if enter[r] < leave[r]:
+            k = _next(march, r, first_from(lattice, jitters[r], 0, enter[r]))
+            if k < lattice.shape[0] - 2:
+                ray[live], place[live], light[live] = r, k, ONE
+                live += 1
+    return live, waiting
+
+
+@njit
+@no_type_check
+def _take(march, world, live, ray, place, slots, owners, numbers, points):
+    # Gives each ray under way its next samples, as many as there is room for; returns how many samples there are.
+    origins, directions, aabb = world
+    jitters, lattice = march[4:6]
+    each, end, count = ROWS // live, lattice.shape[0] - 2, 0
+    for s in range(live):
+        r, k = ray[s], place[s]
+        for _ in range(each):
+            if k >= end:
+                break
+            begin, stop = edge(lattice, jitters[r], k), edge(lattice, jitters[r], k + 1)
+            t = HALF * (begin + stop)
+            for axis in range(3):
+                at = origins[r, axis] + t * directions[r, axis]
+                points[count, axis] = (at - aabb[0, axis]) / (aabb[1, axis] - aabb[0, axis])
+            slots[count], owners[count] = s, r
+            numbers[count, 0], numbers[count, 1] = stop - begin, t
+            count += 1
+            k = _next(march, r, k + 1)
+        place[s] = k
+    return count
+
+
+@njit
+@no_type_check
+def _inside(points, s):
+    x, y, z = points[s, 0], points[s, 1], points[s, 2]
+    return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
+
+
+@njit
+@no_type_check
+def _weigh(count, raw, outer, bias, opaque_below, slots, light, owners, numbers, points, opacity, depth):
+    # From raw densities to weights, ray by ray from front to back; samples behind an opaque one get no owner.
+    asked = 0
+    for i in range(count):
+        s = slots[i]
+        if light[s] <= opaque_below:
+            owners[i] = -1
+            continue
+        asked += 1
+        density = slope = ZERO
+        if _inside(points, i):
+            biased = raw[i * outer] + bias
+            density = np.float32(np.exp(min(biased, LARGEST_RAW)))
+            slope = np.float32(np.exp(min(max(biased, -LARGEST_SLOPE), LARGEST_SLOPE)))
+        thickness = density * numbers[i, 0]
+        w = light[s] * np.float32(-np.expm1(-thickness))
+        light[s] *= np.float32(np.exp(-thickness))
+        numbers[i, 2], numbers[i, 3], numbers[i, 4] = light[s], w, slope
+        opacity[owners[i]] += w
+        depth[owners[i]] += w * numbers[i, 1]
+    return asked
+
+
+@njit
+@no_type_check
+def _color(count, raw, outer, owners, numbers, foreground):
+    for i in range(count):
+        r = owners[i]
+        if r >= 0:
+            for c in range(3):
+                shade = ONE / (ONE + np.float32(np.exp(-raw[i * outer + c])))
+                numbers[i, 5 + c] = shade
+                foreground[r, c] += numbers[i, 3] * shade
+
+
+@njit
+@no_type_check
+def _end(live, end, opaque_below, ray, place, light):
+    # Leaves the rays out that are opaque or have no samples left; returns how many go on.
+    s = 0
+    while s < live:
+        if light[s] > opaque_below and place[s] < end:
+            s += 1
+        else:
+            live -= 1
+            ray[s], place[s], light[s] = ray[live], place[live], light[live]
+    return live
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _see(kind, first, last, march, world, directions, table, levels, networks, limits, room, out):
+    resolutions, offsets, hashed, mask, lanes = levels
+    density_words, dims, color_words, color_dims = networks
+    bias, opaque_below = limits
+    foreground, opacity, depth = out
+    all_owners, all_numbers, all_points, density_kept, color_kept = room
+    ray, place, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
+    slots, features = np.zeros(ROWS, np.int64), np.zeros((ROWS, dims[0]), np.float32)
+    inputs = np.zeros((ROWS, color_dims[0]), np.float32)
+    sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
+    flat, hidden = sums.reshape(-1), color_dims[0] - directions.shape[1]
+    stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
+    live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
+    while True:
+        live, waiting = _start(march, live, waiting, last, ray, place, light)
+        if live == 0:
+            return block, asked
+        if (block + 1) * ROWS > all_owners.shape[0]:
+            return block + 1, asked
+        rows = slice(block * ROWS, (block + 1) * ROWS)
+        owners, numbers, points = all_owners[rows], all_numbers[rows], all_points[rows]
+        count = _take(march, world, live, ray, place, slots, owners, numbers, points)
+        owners[count:], points[count:] = -1, HALF
+        encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
+        x, y = address(density_kept) + block * ROWS * stride, address(sums)
+        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
+        through(kind, x, stride, address(density_words), dims, y, y)
+        asked += _weigh(
+            count, flat, dims[-1], bias, opaque_below, slots, light, owners, numbers, points, opacity, depth
+        )
+        for i in range(count):
+            inputs[i, :hidden] = flat[i * dims[-1] : i * dims[-1] + hidden]
+            inputs[i, hidden:] = directions[ray[slots[i]]]
+        x = address(color_kept) + block * ROWS * color_stride
+        round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
+        through(kind, x, color_stride, address(color_words), color_dims, y, y)
+        _color(count, flat, color_dims[-1], owners, numbers, foreground)
+        live = _end(live, end, opaque_below, ray, place, light)
+        block += 1
+
+
+@njit
+@no_type_check
+def _part(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
+    # Gradients of a block's raw colours, side by side in `flat`, and of its raw densities; from back to front.
+    of_light, of_opacity, of_depth = grads
+    flat[: ROWS * outer] = ZERO
+    for i in range(ROWS - 1, -1, -1):
+        r = owners[i]
+        of_density[i] = ZERO
+        if r < 0:
+            continue
+        w = numbers[i, 3]
+        g = of_opacity[r] + of_depth[r] * numbers[i, 1]
+        for c in range(3):
+            shade, toward = numbers[i, 5 + c], of_light[r, c] * w
+            g += of_light[r, c] * shade
+            slope = shade * (ONE - shade)
+            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
+                slope = max(slope, least_slope)
+            flat[i * outer + c] = toward * slope
+        of_density[i] = numbers[i, 0] * (numbers[i, 2] * g - behind[r - first]) * numbers[i, 4]
+        behind[r - first] += w * g
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, features, of_density, of_color):
+    density_words, dims, color_words, color_dims = networks
+    owners, numbers, _, density_kept, color_kept = room
+    size, widest = bytes_of(kind), max(dims.max(), color_dims.max())
+    stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
+    sums, words = np.zeros((ROWS, widest), np.float32), np.zeros((3, ROWS, widest * size // 4), np.int32)
+    passed, raw = np.zeros((ROWS, color_dims[0]), np.float32), np.zeros(ROWS, np.float32)
+    behind = np.zeros(bounds[1] - bounds[0], np.float32)
+    flat, next_room, outer, color_outer = sums.reshape(-1), size * ROWS * widest, dims[-1], color_dims[-1]
+    for block in range(blocks - 1, -1, -1):
+        rows = slice(block * ROWS, (block + 1) * ROWS)
+        _part(owners[rows], numbers[rows], bounds[0], least_slope, grads, behind, color_outer, flat, raw)
+        y, dy = address(sums), address(words)
+        round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
+        back_through(
+            kind, address(color_kept) + block * ROWS * color_stride, color_stride, address(color_words), color_dims, dy,
+            y, dy + next_room, dy + 2 * next_room, address(of_color), True, address(passed),
+        )  # fmt: skip
+        for i in range(ROWS):
+            for c in range(outer):
+                flat[i * outer + c] = passed[i, c] if c < hidden else ZERO
+            flat[i * outer] += raw[i]
+        round_rows(kind, y, 4 * outer, dy, size * outer, ROWS, outer)
+        back_through(
+            kind, address(density_kept) + block * ROWS * stride, stride, address(density_words), dims, dy,
+            y, dy + next_room, dy + 2 * next_room, address(of_density), True,
+            address(features) + 4 * block * ROWS * dims[0],
+        )  # fmt: skip
