@@ -126,8 +126,10 @@ class PackedLevel(Level):
         self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None
     ) -> Rendering | None:
         """Render with gradients, in one kernel for whole rays, where there is one; it keeps no weights."""
-        # Where cameras are learnt, rays have gradients, which that kernel does not know.
-        if self.keeps_weights or not torch.is_grad_enabled() or rays.origins.requires_grad:
+        # Where cameras are learnt, rays have gradients, which that kernel does not know. It is the CPU's; on other
+        # devices the field's parts would be read on the host.
+        learns = torch.is_grad_enabled() and not rays.origins.requires_grad
+        if self.keeps_weights or not learns or rays.near.device.type != "cpu":
             return None
         parts = self.field.parts()
         found = whole_rays(parts, self.field.products, rays.near.device, gradients=True)
