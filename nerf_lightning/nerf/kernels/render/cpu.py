@@ -68,13 +68,13 @@ def render(
     out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
     march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
     world = (rays.origins, rays.directions, field.aabb)
-    table, directions = _numpy((field.table, field.encode_directions(rays.view_directions).float()))
+    table, directions = arrays_of((field.table, field.encode_directions(rays.view_directions).float()))
     levels = (*level_arrays(field.layout), (0,) * table.shape[1])
     limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
-    networks = (*_network(field.density_weights, dtype), *_network(field.color_weights, dtype))
-    arrays = _numpy(march), _numpy(world), directions, table, levels, networks, limits
+    networks = (*network(field.density_weights, dtype), *network(field.color_weights, dtype))
+    arrays = arrays_of(march), arrays_of(world), directions, table, levels, networks, limits
     kind = KINDS[dtype]
-    over_rows(lambda first, last: _render(kind, first, last, *arrays, _numpy(out)), count)
+    over_rows(lambda first, last: _render(kind, first, last, *arrays, arrays_of(out)), count)
     return out
 
 
@@ -100,19 +100,21 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, Oc
         yield rays, field, state, lattice, grid
 
 
-def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+def arrays_of(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+    """Return what kernels take of tensors."""
     return tuple(each.detach().contiguous().numpy() for each in tensors)
 
 
-def _network(weights: list[Tensor], dtype: torch.dtype) -> tuple[np.ndarray, np.ndarray]:
+def network(weights: list[Tensor], dtype: torch.dtype, transposed: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return a perceptron's words, for the way there or back, and its widths."""
     widths = padded_widths(weights)
-    return packed_words([weight.detach().to(dtype) for weight in weights], widths, transposed=False), np.array(widths)
+    return packed_words([weight.detach().to(dtype) for weight in weights], widths, transposed), np.array(widths)
 
 
 @njit
 @no_type_check
-def _next(march, r, k):
-    # The first interval of a ray from k on that may hold something; the lattice's end if none.
+def next_sample(march, r, k):
+    """Return the first interval of a ray from k on that may hold something; the lattice's end if there is none."""
     o, d, _, leave, jitters, lattice, cells, leaps = march
     found, _, _, _, _ = next_occupied(
         *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
@@ -133,7 +135,7 @@ def _go_on(march, live, ray, place, light, begin, stop, opaque_below):
     # Ends the rays that are opaque or have no samples left, and takes the others to their next; returns how many go on.
     end, s = march[5].shape[0] - 2, 0
     while s < live:
-        k = _next(march, ray[s], place[s] + 1) if light[s] > opaque_below else end
+        k = next_sample(march, ray[s], place[s] + 1) if light[s] > opaque_below else end
         if k < end:
             place[s] = k
             begin[s], stop[s] = _interval(march, ray[s], k)
@@ -153,7 +155,7 @@ def _start(march, live, waiting, last, ray, place, light, begin, stop):
         r = waiting
         waiting += 1
         if enter[r] < leave[r]:
-            k = _next(march, r, first_from(lattice, jitters[r], 0, enter[r]))
+            k = next_sample(march, r, first_from(lattice, jitters[r], 0, enter[r]))
             if k < lattice.shape[0] - 2:
                 ray[live], place[live], light[live] = r, k, ONE
                 begin[live], stop[live] = _interval(march, r, k)
@@ -175,7 +177,8 @@ def _locate(world, live, ray, begin, stop, points):
 
 @njit
 @no_type_check
-def _inside(points, s):
+def is_inside(points, s):
+    """Tell whether a sample lies in the unit cube, outside of which there is nothing."""
     x, y, z = points[s, 0], points[s, 1], points[s, 2]
     return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
 
@@ -222,7 +225,7 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
         through(kind, x, stride, address(density_words), dims, y, y)
         for s in range(live):
-            if not _inside(points, s):
+            if not is_inside(points, s):
                 continue
             r, density = ray[s], math.exp(min(flat[s * outer] + bias, LARGEST_RAW))
             alpha = -math.expm1(-density * (stop[s] - begin[s]))

@@ -21,7 +21,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
-from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
+from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box
 from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
@@ -29,7 +29,6 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     address,
     back_through,
     dtypes,
-    packed_words,
     padded_widths,
     round_rows,
     through,
@@ -37,12 +36,12 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     words_of,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
-from nerf_lightning.nerf.kernels.render.cpu import trial_arguments
+from nerf_lightning.nerf.kernels.render.cpu import arrays_of, is_inside, network, next_sample, trial_arguments
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "16c3c471"
+COMPILED_WITH = "7626a1ea"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -92,7 +91,7 @@ class Room:
 
     def arrays(self) -> tuple[np.ndarray, ...]:
         """Return what the kernels take."""
-        return _numpy((self.owners, self.numbers, self.points, self.density_words, self.color_words))
+        return arrays_of((self.owners, self.numbers, self.points, self.density_words, self.color_words))
 
 
 _spare: list[Room] = []
@@ -168,9 +167,9 @@ class _Given:
     ):
         self.field, self.kind, self.dtype = field, KINDS[dtype], dtype
         march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
-        self.march = _numpy(march)
-        self.world = _numpy((rays.origins, rays.directions, field.aabb))
-        (self.directions,) = _numpy((field.encode_directions(rays.view_directions).float(),))
+        self.march = arrays_of(march)
+        self.world = arrays_of((rays.origins, rays.directions, field.aabb))
+        (self.directions,) = arrays_of((field.encode_directions(rays.view_directions).float(),))
         self.limits = np.float32(field.bias), np.float32(opaque_below)
         self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
         self.parts = parts_of(self.rays, torch.get_num_threads(), FEWEST_RAYS)
@@ -179,15 +178,11 @@ class _Given:
 
     def networks(self, density: list[Tensor], color: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
         """Return the words and widths of both perceptrons."""
-        return (*self._network(density, transposed), *self._network(color, transposed))
-
-    def _network(self, weights: list[Tensor], transposed: bool) -> tuple[np.ndarray, np.ndarray]:
-        widths = padded_widths(weights)
-        return packed_words([w.detach().to(self.dtype) for w in weights], widths, transposed), np.array(widths)
+        return (*network(density, self.dtype, transposed), *network(color, self.dtype, transposed))
 
     def see(self, table: Tensor, density: list[Tensor], color: list[Tensor], out: tuple[Tensor, ...]) -> None:
         """Render, and keep what the way back needs."""
-        of_field = _numpy((table,))[0], (*level_arrays(self.field.layout), (0,) * table.shape[1])
+        of_field = arrays_of((table,))[0], (*level_arrays(self.field.layout), (0,) * table.shape[1])
         given = self.march, self.world, self.directions, *of_field, self.networks(density, color, False), self.limits
         of_density, of_color = (words_of(sum(padded_widths(weights)[:-1]), self.dtype) for weights in (density, color))
 
@@ -195,7 +190,7 @@ class _Given:
             blocks = SPARE_BLOCKS + int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS
             while True:
                 room = _take_room(blocks, (of_density, of_color))
-                used, asked = _see(self.kind, *bounds, *given, room.arrays(), _numpy(out))
+                used, asked = _see(self.kind, *bounds, *given, room.arrays(), arrays_of(out))
                 if used <= room.blocks:
                     return room, used, asked
                 blocks = 2 * room.blocks
@@ -210,7 +205,7 @@ class _Given:
         self, density: list[Tensor], color: list[Tensor], grads: tuple[Tensor, ...]
     ) -> tuple[list[Tensor], Tensor, Tensor]:
         """Return the gradients of the weights; and all points, with the gradients of their features."""
-        networks, arrays = self.networks(density, color, True), _numpy(grads)
+        networks, arrays = self.networks(density, color, True), arrays_of(grads)
         widths = padded_widths(density), padded_widths(color)
         counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
         sums, ends = torch.zeros(len(self.parts), sum(counts)), np.cumsum(self.used) * ROWS
@@ -255,21 +250,6 @@ class _WholeRays(torch.autograd.Function):
         return None, of_table, *of_weights
 
 
-def _numpy(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
-    return tuple(each.detach().contiguous().numpy() for each in tensors)
-
-
-@njit
-@no_type_check
-def _next(march, r, k):
-    # The first interval of a ray from k on that may hold something; the lattice's end if none.
-    o, d, _, leave, jitters, lattice, cells, leaps = march
-    found, _, _, _, _ = next_occupied(
-        *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
-    )
-    return found
-
-
 @njit
 @no_type_check
 def _start(march, live, waiting, last, ray, place, light):
@@ -279,7 +259,7 @@ def _start(march, live, waiting, last, ray, place, light):
         r = waiting
         waiting += 1
         if enter[r] < leave[r]:
-            k = _next(march, r, first_from(lattice, jitters[r], 0, enter[r]))
+            k = next_sample(march, r, first_from(lattice, jitters[r], 0, enter[r]))
             if k < lattice.shape[0] - 2:
                 ray[live], place[live], light[live] = r, k, ONE
                 live += 1
@@ -306,16 +286,9 @@ def _take(march, world, live, ray, place, slots, owners, numbers, points):
             slots[count], owners[count] = s, r
             numbers[count, 0], numbers[count, 1] = stop - begin, t
             count += 1
-            k = _next(march, r, k + 1)
+            k = next_sample(march, r, k + 1)
         place[s] = k
     return count
-
-
-@njit
-@no_type_check
-def _inside(points, s):
-    x, y, z = points[s, 0], points[s, 1], points[s, 2]
-    return ZERO <= x <= ONE and ZERO <= y <= ONE and ZERO <= z <= ONE
 
 
 @njit
@@ -330,7 +303,7 @@ def _weigh(count, raw, outer, bias, opaque_below, slots, light, owners, numbers,
             continue
         asked += 1
         density = slope = ZERO
-        if _inside(points, i):
+        if is_inside(points, i):
             biased = raw[i * outer] + bias
             density = np.float32(np.exp(min(biased, LARGEST_RAW)))
             slope = np.float32(np.exp(min(max(biased, -LARGEST_SLOPE), LARGEST_SLOPE)))
