@@ -20,7 +20,10 @@ VALIDATION_RAYS = 8192
 
 
 def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimizer) -> dict[str, float]:
-    """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing."""
+    """Return the seconds of marching, screening, the rest both ways, and the update of a packed model; else nothing.
+
+    Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest.
+    """
     level = next((part for part in step.model.modules() if isinstance(part, PackedLevel)), None)
     if level is None:
         return {}
@@ -28,7 +31,8 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     optimizer.zero_grad()
     whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
-
+    if level.takes_whole_rays(rays):
+        return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
         points = packed_points(rays, sampler(rays, None), None)
         walking, screening = seconds_of(lambda: sampler(rays, None)), seconds_of(lambda: level.field.density(points))

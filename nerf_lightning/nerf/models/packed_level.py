@@ -1,6 +1,7 @@
 """A level whose samples are packed: only where its sampler says that there may be something is anything computed."""
 
 from threading import Lock
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.render.whole_rays import whole_rays
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
@@ -126,13 +128,10 @@ class PackedLevel(Level):
         self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None
     ) -> Rendering | None:
         """Render with gradients, in one kernel for whole rays, where there is one; it keeps no weights."""
-        # Where cameras are learnt, rays have gradients, which that kernel does not know. It is the CPU's; on other
-        # devices the field's parts would be read on the host.
-        learns = torch.is_grad_enabled() and not rays.origins.requires_grad
-        if self.keeps_weights or not learns or rays.near.device.type != "cpu":
+        # Where cameras are learnt, rays have gradients, which that kernel does not know.
+        if not torch.is_grad_enabled() or rays.origins.requires_grad:
             return None
-        parts = self.field.parts()
-        found = whole_rays(parts, self.field.products, rays.near.device, gradients=True)
+        parts, found = self._learning_kernels()
         march = None if found is None else self.sampler.march(rays, random)
         if march is None or parts is None or found is None:
             return None
@@ -141,6 +140,16 @@ class PackedLevel(Level):
         rgb, opacity, depth, asked = kernels.render(rays, parts, *march, self.sampler.opaque_below, dtype, expected)
         self._count(torch.tensor(asked), rays, torch.tensor(0))
         return _in_front_of(background, rays, rgb, 1.0 - opacity, depth)
+
+    def _learning_kernels(self) -> tuple[FieldParts | None, tuple[ModuleType, torch.dtype] | None]:
+        # They are the CPU's; on other devices the field's parts would be read on the host.
+        device = self.tally.device
+        parts = None if self.keeps_weights or device.type != "cpu" else self.field.parts()
+        return parts, whole_rays(parts, self.field.products, device, gradients=True)
+
+    def takes_whole_rays(self, rays: RayBundle) -> bool:
+        """Tell whether training renders rays in one kernel, where cameras are not learnt."""
+        return self._learning_kernels()[1] is not None and self.sampler.march(rays, None) is not None
 
     def visible_samples(
         self, rays: RayBundle, random: RayRandom | None

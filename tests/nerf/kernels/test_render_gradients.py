@@ -90,7 +90,9 @@ def test_many_rays_are_shared_out_and_nothing_changes(threads):
 def test_it_goes_the_other_way_where_something_else_is_wanted():
     level, rays = a_level(density_bias=3.0), some_rays(50)
     assert isinstance(level(rays, None, [], None), PackedRendering)  # as a notebook wants it
+    assert not level.takes_whole_rays(rays)
     level.keeps_weights = False
+    assert level.takes_whole_rays(rays)
     assert not isinstance(level(rays, None, [], None), PackedRendering)
     with torch.no_grad():
         assert isinstance(level(rays, None, [], batch_random(0, 50)), PackedRendering)
