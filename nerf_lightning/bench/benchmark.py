@@ -203,7 +203,7 @@ def _plainly(bench: Bench) -> Iterator[None]:
     for sampler in samplers:
         sampler.opaque_below = 0.0
     _release_gradients(bench)
-    with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu", "render.cpu"):
+    with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"):
         yield
     bench.settings.prepare(bench.step.model)
     for sampler, value in zip(samplers, former, strict=True):

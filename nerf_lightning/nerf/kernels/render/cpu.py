@@ -66,13 +66,11 @@ def render(
     """
     count = rays.near.shape[0]
     out = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
-    world = (rays.origins, rays.directions, field.aabb)
-    table, directions = arrays_of((field.table, field.encode_directions(rays.view_directions).float()))
+    (table,) = arrays_of((field.table,))
     levels = (*level_arrays(field.layout), (0,) * table.shape[1])
     limits = np.float32(field.bias), np.float32(least_alpha), np.float32(opaque_below)
     networks = (*network(field.density_weights, dtype), *network(field.color_weights, dtype))
-    arrays = arrays_of(march), arrays_of(world), directions, table, levels, networks, limits
+    arrays = *along(rays, field, state, lattice, grid), table, levels, networks, limits
     kind = KINDS[dtype]
     over_rows(lambda first, last: _render(kind, first, last, *arrays, arrays_of(out)), count)
     return out
@@ -100,6 +98,15 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, Oc
         yield rays, field, state, lattice, grid
 
 
+def along(
+    rays: RayBundle, field: FieldParts, state: March, lattice: Tensor, grid: OccupancyCells
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
+    """Return what kernels take of rays: the march, where they run through the world, and features of directions."""
+    march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
+    world, directions = (rays.origins, rays.directions, field.aabb), field.encode_directions(rays.view_directions)
+    return arrays_of(march), arrays_of(world), arrays_of((directions.float(),))[0]
+
+
 def arrays_of(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
     """Return what kernels take of tensors."""
     return tuple(each.detach().contiguous().numpy() for each in tensors)
@@ -124,21 +131,21 @@ def next_sample(march, r, k):
 
 @njit
 @no_type_check
-def _interval(march, r, k):
+def interval(march, r, k):
+    """Return where an interval of a ray begins and ends."""
     lattice, jitter = march[5], march[4][r]
     return edge(lattice, jitter, k), edge(lattice, jitter, k + 1)
 
 
 @njit
 @no_type_check
-def _go_on(march, live, ray, place, light, begin, stop, opaque_below):
+def _go_on(march, live, ray, place, light, opaque_below):
     # Ends the rays that are opaque or have no samples left, and takes the others to their next; returns how many go on.
     end, s = march[5].shape[0] - 2, 0
     while s < live:
         k = next_sample(march, ray[s], place[s] + 1) if light[s] > opaque_below else end
         if k < end:
             place[s] = k
-            begin[s], stop[s] = _interval(march, ray[s], k)
             s += 1
         else:
             live -= 1
@@ -148,31 +155,28 @@ def _go_on(march, live, ray, place, light, begin, stop, opaque_below):
 
 @njit
 @no_type_check
-def _start(march, live, waiting, last, ray, place, light, begin, stop):
-    # Fills the free places with rays that meet something; returns how many are under way, and which ray comes next.
+def start(march, most, live, waiting, last, ray, place, light):
+    """Fill free places, up to `most`, with rays that meet something; return how many are taken, and the next ray."""
     enter, leave, jitters, lattice = march[2:6]
-    while live < ROWS and waiting < last:
+    while live < most and waiting < last:
         r = waiting
         waiting += 1
         if enter[r] < leave[r]:
             k = next_sample(march, r, first_from(lattice, jitters[r], 0, enter[r]))
             if k < lattice.shape[0] - 2:
                 ray[live], place[live], light[live] = r, k, ONE
-                begin[live], stop[live] = _interval(march, r, k)
                 live += 1
     return live, waiting
 
 
 @njit
 @no_type_check
-def _locate(world, live, ray, begin, stop, points):
-    # Where the samples lie in the field's box, as the unit cube.
+def locate(world, r, t, points, s):
+    """Write where a ray is at a distance, in the field's box as the unit cube."""
     origins, directions, aabb = world
-    for s in range(live):
-        r, t = ray[s], HALF * (begin[s] + stop[s])
-        for axis in range(3):
-            at = origins[r, axis] + t * directions[r, axis]
-            points[s, axis] = (at - aabb[0, axis]) / (aabb[1, axis] - aabb[0, axis])
+    for axis in range(3):
+        at = origins[r, axis] + t * directions[r, axis]
+        points[s, axis] = (at - aabb[0, axis]) / (aabb[1, axis] - aabb[0, axis])
 
 
 @njit
@@ -215,11 +219,13 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
     colors, hidden = np.zeros((ROWS, color_dims.max()), np.float32), color_dims[0] - directions.shape[1]
     live, waiting, asked = 0, first, 0
     while True:
-        live = _go_on(march, live, ray, place, light, begin, stop, opaque_below)
-        live, waiting = _start(march, live, waiting, last, ray, place, light, begin, stop)
+        live = _go_on(march, live, ray, place, light, opaque_below)
+        live, waiting = start(march, ROWS, live, waiting, last, ray, place, light)
         if live == 0:
             break
-        _locate(world, live, ray, begin, stop, points)
+        for s in range(live):
+            begin[s], stop[s] = interval(march, ray[s], place[s])
+            locate(world, ray[s], HALF * (begin[s] + stop[s]), points, s)
         encode(0, live, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, stride, y = address(words), 4 * words.shape[1], address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])

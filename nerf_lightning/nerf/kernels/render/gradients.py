@@ -1,6 +1,6 @@
 """Whole rays in one kernel per pass, with gradients: march, hash grid, perceptrons, quadrature, and the way back.
 
-As in `cpu.py` ROWS samples are taken at a time; here a ray that has a block almost for itself takes several at once.
+As in `cpu.py` ROWS samples are taken at a time, but of fewer rays: each takes some in a row, more where few are left.
 What the way back needs is kept block by block. It takes the blocks from the last to the first, so that of each ray
 those samples come first that lie farthest, and sums up what lies behind each.
 
@@ -21,7 +21,6 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
-from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box
 from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
@@ -36,19 +35,30 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     words_of,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
-from nerf_lightning.nerf.kernels.render.cpu import arrays_of, is_inside, network, next_sample, trial_arguments
+from nerf_lightning.nerf.kernels.render.cpu import (
+    along,
+    arrays_of,
+    interval,
+    is_inside,
+    locate,
+    network,
+    next_sample,
+    start,
+    trial_arguments,
+)
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "7626a1ea"
+COMPILED_WITH = "b5049b53"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW, LARGEST_SLOPE = np.float32(30.0), np.float32(15.0)
 """The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.hash_field`)."""
 SLOTS = 64
-"""So many rays are under way at a time: more would take fewer samples in a row, which lie close in the tables."""
+"""So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
+asked about in vain."""
 SPARE_BLOCKS, FEWEST_RAYS = 8, 64
 NUMBERS = 8
 """Of each sample: length, distance, light behind it, weight, slope of the density, three colours."""
@@ -166,10 +176,7 @@ class _Given:
         samples_per_ray: float,
     ):
         self.field, self.kind, self.dtype = field, KINDS[dtype], dtype
-        march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
-        self.march = arrays_of(march)
-        self.world = arrays_of((rays.origins, rays.directions, field.aabb))
-        (self.directions,) = arrays_of((field.encode_directions(rays.view_directions).float(),))
+        self.march, self.world, self.directions = along(rays, field, state, lattice, grid)
         self.limits = np.float32(field.bias), np.float32(opaque_below)
         self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
         self.parts = parts_of(self.rays, torch.get_num_threads(), FEWEST_RAYS)
@@ -252,37 +259,17 @@ class _WholeRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _start(march, live, waiting, last, ray, place, light):
-    # Fills the free places with rays that meet something; returns how many are under way, and which ray comes next.
-    enter, leave, jitters, lattice = march[2:6]
-    while live < SLOTS and waiting < last:
-        r = waiting
-        waiting += 1
-        if enter[r] < leave[r]:
-            k = next_sample(march, r, first_from(lattice, jitters[r], 0, enter[r]))
-            if k < lattice.shape[0] - 2:
-                ray[live], place[live], light[live] = r, k, ONE
-                live += 1
-    return live, waiting
-
-
-@njit
-@no_type_check
 def _take(march, world, live, ray, place, slots, owners, numbers, points):
     # Gives each ray under way its next samples, as many as there is room for; returns how many samples there are.
-    origins, directions, aabb = world
-    jitters, lattice = march[4:6]
-    each, end, count = ROWS // live, lattice.shape[0] - 2, 0
+    each, end, count = ROWS // live, march[5].shape[0] - 2, 0
     for s in range(live):
         r, k = ray[s], place[s]
         for _ in range(each):
             if k >= end:
                 break
-            begin, stop = edge(lattice, jitters[r], k), edge(lattice, jitters[r], k + 1)
+            begin, stop = interval(march, r, k)
             t = HALF * (begin + stop)
-            for axis in range(3):
-                at = origins[r, axis] + t * directions[r, axis]
-                points[count, axis] = (at - aabb[0, axis]) / (aabb[1, axis] - aabb[0, axis])
+            locate(world, r, t, points, count)
             slots[count], owners[count] = s, r
             numbers[count, 0], numbers[count, 1] = stop - begin, t
             count += 1
@@ -358,7 +345,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
     live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
     while True:
-        live, waiting = _start(march, live, waiting, last, ray, place, light)
+        live, waiting = start(march, SLOTS, live, waiting, last, ray, place, light)
         if live == 0:
             return block, asked
         if (block + 1) * ROWS > all_owners.shape[0]:
@@ -387,7 +374,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
 
 @njit
 @no_type_check
-def _part(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
+def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, flat, of_density):
     # Gradients of a block's raw colours, side by side in `flat`, and of its raw densities; from back to front.
     of_light, of_opacity, of_depth = grads
     flat[: ROWS * outer] = ZERO
@@ -422,7 +409,7 @@ def _go_back(kind, bounds, blocks, hidden, networks, least_slope, grads, room, f
     flat, next_room, outer, color_outer = sums.reshape(-1), size * ROWS * widest, dims[-1], color_dims[-1]
     for block in range(blocks - 1, -1, -1):
         rows = slice(block * ROWS, (block + 1) * ROWS)
-        _part(owners[rows], numbers[rows], bounds[0], least_slope, grads, behind, color_outer, flat, raw)
+        _composite_back(owners[rows], numbers[rows], bounds[0], least_slope, grads, behind, color_outer, flat, raw)
         y, dy = address(sums), address(words)
         round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
         back_through(
