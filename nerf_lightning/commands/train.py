@@ -129,6 +129,8 @@ def _fit(parts: Parts, folder: Path, former: ResumePoint | None, loggers: list[L
         announce_memory(parts.settings, step, parts.data)
     if parts.settings.compile:
         log.info("compiled levels: %s", ", ".join(parts.system.model.compile_fields()) or "none has static shapes")
+    if parts.settings.cuda_graph:
+        step.record_gradients()
     trainer = parts.settings.build(folder, parts.num_steps, parts.callbacks, loggers)
     _announce(parts, folder, former)
     if former is None and parts.config.resume == "auto":

@@ -133,7 +133,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         MACHINE,
         """
         trainer.accelerator trainer.devices trainer.launched_by trainer.precision trainer.num_threads
-        trainer.tile_points trainer.compile trainer.deterministic
+        trainer.tile_points trainer.compile trainer.cuda_graph trainer.deterministic
         """,
     ),
     (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),

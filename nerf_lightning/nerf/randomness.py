@@ -98,10 +98,12 @@ class PointRandom(TensorStruct):
         return radius * torch.cos(2.0 * torch.pi * self.uniform(purpose + ".angle"))
 
 
-def batch_random(key: int, num_rays: int, device: torch.device | str = "cpu", first: int = 0) -> RayRandom:
+def batch_random(
+    key: int | Int[Tensor, ""], num_rays: int, device: torch.device | str = "cpu", first: int = 0
+) -> RayRandom:
     """Return the random numbers of a batch, or of its rays from slot `first` on; `key` comes from `fold`."""
     slots = torch.arange(first, first + num_rays, device=device)
-    return RayRandom(key=torch.full_like(slots, key), slots=slots)
+    return RayRandom(key=key.expand_as(slots) if isinstance(key, Tensor) else torch.full_like(slots, key), slots=slots)
 
 
 def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int[Tensor, "*n"]:

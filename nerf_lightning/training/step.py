@@ -34,6 +34,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
+from nerf_lightning.training.recorded_gradients import RecordedGradients, Recorder, cuda_graph
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
 from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
 
@@ -121,6 +122,7 @@ class TrainStep:
         self.sample_budget, self.jitter = sample_budget, jitter
         self.start_weights = start_weights
         self.guard = StepGuard()
+        self._recorded: RecordedGradients | None = None
         model.keep_weights(loss.needs_weights)
         if tile_points is not None and model.needs_whole_batch:
             raise InputError(
@@ -138,6 +140,29 @@ class TrainStep:
         if self.start_weights is not None:
             self.model.load_state_dict(self.start_weights)
         self.loss.forget()
+        self._forget_recordings()
+
+    def record_gradients(self, record: Recorder = cuda_graph) -> None:
+        """Record the way forward and back of batches, whole, and replay it from now on.
+
+        Raises:
+            InputError: something here decides on the host what a step computes, and a recording would not follow.
+        """
+        decides = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
+        decides += ["loss"] if list(self.loss.buffers()) else []
+        decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
+        if not self.model.replays or decides:
+            cause = f"and here are: {', '.join(decides)}" if decides else "and this model has others"
+            raise InputError(
+                "trainer.cuda_graph=true replays the same kernels in each step: it is for models with an occupancy "
+                "grid (model=fast), without refinement, correction, encoder.blend_in, and losses that learn, "
+                f"{cause}. Leave it out."
+            )
+
+        def compute(batch: Batch, weight: Tensor, key: Tensor) -> dict[str, Tensor]:
+            return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
+
+        self._recorded = RecordedGradients(compute, self._parameters(), self.model.counts(), record)
 
     @property
     def rays_together(self) -> int:
@@ -175,6 +200,7 @@ class TrainStep:
             skipped: steps that were left out before.
         """
         self.progress.attempt, self.progress.rollbacks = former.attempt + 1, former.rollbacks + 1
+        self._forget_recordings()
         self.guard.restore([skipped, 0], self.device)
 
     def new_optimizer(self) -> Optimizer:
@@ -222,11 +248,13 @@ class TrainStep:
             key = fold(self.seed, progress.attempt, progress.step, "correction")
             tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
             self.correction.follow(progress.step / self.num_steps, self.model, self.rays, tile_points, key)
-        self.model.update(progress.step, fold(self.seed, progress.attempt, progress.step))
+        self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
-        first = ranks.share(num_rays // self.rays_together).start * self.rays_together
-        share = Share(first, num_rays, ranks.total(batch.weight.sum()))
-        seen = self.gradients(batch, backward, share)
+        share = self._share(ranks.total(batch.weight.sum()))
+        if self._recorded is None:
+            seen = self.gradients(batch, backward, share)
+        else:
+            seen = self._recorded(batch, share.weight, torch.full((), self._key, device=batch.weight.device))
         ranks.add_up([seen["losses"], seen["color_errors"]])
         ranks.add_up_gradients(self._parameters())
         norms: dict[str, Tensor] = {}
@@ -261,7 +289,8 @@ class TrainStep:
         counts = [count.clone() for count in self.model.counts()]
         while True:
             try:
-                seen = self._in_tiles(batch, backward, share)
+                tile_rays = self._tile_rays(batch.num_rays, training=True)
+                seen = self._in_tiles(batch, backward, share, self._key, tile_rays)
                 break
             except RuntimeError as error:
                 if not is_out_of_memory(error):
@@ -302,6 +331,21 @@ class TrainStep:
         """Return the first module whose weights are not all finite; a finite loss may have had bad gradients."""
         return first_not_finite(self._named_parameters())
 
+    @property
+    def _key(self) -> int:
+        return fold(self.seed, self.progress.attempt, self.progress.step)
+
+    def _share(self, weight: Tensor) -> Share:
+        """Return this process's part of the batch, given the sum of the weights of all of it."""
+        num_rays = self.progress.batch_rays
+        first = ranks.share(num_rays // self.rays_together).start * self.rays_together
+        return Share(first, num_rays, weight)
+
+    def _forget_recordings(self) -> None:
+        # What was taken up may lie elsewhere in memory.
+        if self._recorded is not None:
+            self._recorded.recordings.clear()
+
     def _beside_the_model(self) -> list[LearntPart]:
         return [part for part in self.parts.values() if part is not self.model]
 
@@ -312,9 +356,10 @@ class TrainStep:
         for name, part in self.parts.items():
             yield from part.named_parameters(prefix="" if part is self.model else name)
 
-    def _in_tiles(self, batch: Batch, backward: Backward, share: Share) -> dict[str, Tensor]:
+    def _in_tiles(
+        self, batch: Batch, backward: Backward, share: Share, key: int | Tensor, tile_rays: int
+    ) -> dict[str, Tensor]:
         num_rays, device = batch.num_rays, batch.weight.device
-        key = fold(self.seed, self.progress.attempt, self.progress.step)
         random = batch_random(key, num_rays, device, share.first) if self.jitter else None
         behind = background_colors(self.background, num_rays, device, random, batch.rgba)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
@@ -334,7 +379,7 @@ class TrainStep:
                 errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
             return TileLoss(levels * part, errors * part, renderings[-1].foreground, shown[-1].rgb)
 
-        tile_rays, together = self._tile_rays(num_rays, training=True), self.rays_together
+        together = self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
         if threads > 1:
             parts = list(tiles(num_rays, tile_rays, together, multiple=threads))

@@ -69,6 +69,11 @@ def test_what_is_trained_here_is_what_the_cpu_trains(ball, trainer, tmp_path):
     assert abs(psnr(tmp_path / "here") - psnr(tmp_path / "cpu")) < 0.5
 
 
+def test_replayed_steps_train(ball, trainer, cuda, tmp_path):
+    finished(train(ball, trainer, tmp_path / "run", "trainer.cuda_graph=true"))
+    assert psnr(tmp_path / "run") > 8
+
+
 def test_compiled_fields_train(ball, trainer, cuda, tmp_path):
     output = finished(train(ball, trainer, tmp_path / "run", "trainer.compile=true", model="nerf_tiny"))
     assert "compiled levels: coarse, fine" in output

@@ -56,6 +56,17 @@ def test_compiled_fields_compute_the_same(products, cuda):
     assert row.outcome == "ok", row
 
 
+@pytest.mark.parametrize("model", ["fast", "fast_small", "fast_large"])
+def test_replayed_steps_learn_what_steps_learn(model, cuda):
+    """But for the order of sums, which a GPU leaves to chance."""
+    runs = [step_by_step(model, cuda) for _ in range(2)]
+    runs[1].training.record_gradients()
+    for run in runs:
+        for _ in range(STEPS):
+            run.step()
+    torch.testing.assert_close(runs[1].all_losses(), runs[0].all_losses(), rtol=1e-2, atol=0)
+
+
 def test_tf32_is_really_used_and_float32_is_not_lowered(cuda):
     from nerf_lightning.nerf.products import linear
 

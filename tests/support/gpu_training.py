@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 from support.configs import composed
+from support.scenes import ball_scene as many_views
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
@@ -45,7 +46,7 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
     config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     looks = model.startswith("view_transformer")  # at up to ten photographs for each view
-    scene, progress = ball_scene(24) if looks else ball_scene(), Progress()
+    scene, progress = many_views(24) if looks else ball_scene(), Progress()
     training = build_step(config, settings, scene, progress).to(device)
     training.num_steps = 1000
     for level in training.model.modules():

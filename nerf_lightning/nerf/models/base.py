@@ -26,6 +26,10 @@ class Model(nn.Module, ABC):
     needs_photographs: bool = False
     """True where it renders a scene from photographs: `look_at` is called before the first rays."""
 
+    replays: bool = False
+    """True where a training step's kernels are the same in each step, so that a recording of them may be replayed: what
+    the host decides between two steps would stay as it was. Then `counts` are all that a step changes."""
+
     def __init__(self) -> None:
         super().__init__()
         self.most_rays: int | None = None

@@ -37,6 +37,9 @@ class Level(nn.Module):
     has_static_shapes: bool = True
     """False where what is computed depends on how much is found along the rays; compilers like XLA's refuse that."""
 
+    replays: bool = False
+    """True where a training step's kernels are the same in each step on a GPU (`Model.replays`)."""
+
     def __init__(self, sampler: Sampler, field: Field):
         super().__init__()
         if not isinstance(sampler, self.sampler_kind):

@@ -37,6 +37,7 @@ class PackedLevel(Level):
     sampler: PackedSampler
     sampler_kind = PackedSampler
     has_static_shapes = False
+    replays = True  # with arrays of a capacity, which no size is read for
     tally: Tensor
     measured: Tensor
 

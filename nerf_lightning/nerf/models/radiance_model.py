@@ -49,6 +49,11 @@ class RadianceModel(Model):
         """Whether no level's shapes depend on what it finds."""
         return all(level.has_static_shapes for level in self._in_order())
 
+    @property
+    def replays(self) -> bool:  # type: ignore[override]
+        """Whether every level does."""
+        return all(level.replays for level in self._in_order())
+
     def points_per_ray(self, training: bool) -> float:
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
         counts = [0.0]

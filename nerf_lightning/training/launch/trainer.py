@@ -59,6 +59,8 @@ class TrainerSettings:
         val_every_steps: steps between two looks at the validation rays.
         num_threads: torch's threads on the CPU; None: one per core of ours.
         compile: compile the levels that have static shapes (torch.compile).
+        cuda_graph: record a step's kernels on an NVIDIA GPU and replay them, which saves the time of asking for each;
+            for models with an occupancy grid. Not yet run on a GPU.
         deterministic: refuse operations of GPUs whose sums depend on chance; the CPU's never do.
         devices: processes on this machine, one per device; auto: every GPU. They divide each batch among them. On a
             TPU the cores, of one process.
@@ -78,6 +80,7 @@ class TrainerSettings:
         val_every_steps: int = 500,
         num_threads: int | None = None,
         compile: bool = False,
+        cuda_graph: bool = False,
         deterministic: bool = False,
         devices: int | Literal["auto"] = 1,
         launched_by: Launcher = "nerf",
@@ -99,6 +102,12 @@ class TrainerSettings:
         self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
+        if cuda_graph and self.device_type != "cuda":
+            raise InputError(
+                f"trainer.cuda_graph=true is for NVIDIA GPUs, and this run computes on {self.device_type} "
+                f"({self.device_reason}). Leave it out."
+            )
+        self.cuda_graph = cuda_graph
         self._chosen = choose_precision(precision, self.device_type)
         self.precision, self.reason = self._chosen
         default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS

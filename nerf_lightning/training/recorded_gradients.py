@@ -1,0 +1,111 @@
+"""A batch's way forward and back, recorded once as a CUDA graph and replayed for each batch of its size.
+
+A step of a small model asks for hundreds of kernels that each take a few microseconds, and Python takes longer to ask
+than the GPU to compute. A replayed graph asks once (https://pytorch.org/blog/accelerating-pytorch-with-cuda-graphs/).
+
+What is recorded is what the kernels did, not why: a number that Python computed (the key of random numbers, the weight
+of a batch) would stay as it was. So all that changes from step to step comes in by tensors whose memory stays, and a
+model that decides anything on the host between two steps is not recorded (`Model.replays`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import Parameter
+
+from nerf_lightning.nerf.types.rays import Batch
+
+# The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
+WARM_UPS = 3
+
+Seen = dict[str, Tensor]
+Gradients = Callable[[Batch, Tensor, Tensor], Seen]
+"""Takes a batch, the sum of the weights of all of its shares, and the step's key; leaves gradients in parameters."""
+Recorder = Callable[[Callable[[], Seen]], tuple[Callable[[], None], Seen]]
+"""Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
+
+
+def cuda_graph(work: Callable[[], Seen]) -> tuple[Callable[[], None], Seen]:
+    """Record work as a CUDA graph, after a few rounds of it on a stream of their own."""
+    graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(WARM_UPS):
+            work()
+    torch.cuda.current_stream().wait_stream(side)
+    with torch.cuda.graph(graph):
+        seen = work()
+    return graph.replay, seen
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """One size of batches."""
+
+    batch: Batch
+    weight: Tensor
+    key: Tensor
+    replay: Callable[[], None]
+    seen: Seen
+    gradients: list[Tensor | None]
+
+
+class RecordedGradients:
+    """Compute the gradients of batches by replaying the first of their size.
+
+    Args:
+        compute: the work.
+        parameters: all that learn.
+        counts: buffers that the work adds to, put back after it was tried.
+        record: makes a recording.
+    """
+
+    def __init__(
+        self,
+        compute: Gradients,
+        parameters: Sequence[Parameter],
+        counts: Sequence[Tensor],
+        record: Recorder = cuda_graph,
+    ):
+        self.compute, self.parameters, self.counts, self.record = compute, parameters, counts, record
+        self.recordings: dict[int, _Recording] = {}
+
+    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: Int[Tensor, ""]) -> Seen:
+        """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones."""
+        if batch.num_rays not in self.recordings:
+            self.recordings[batch.num_rays] = self._recorded(batch, weight, key)
+        kept = self.recordings[batch.num_rays]
+        for inside, given in zip(_tensors(kept.batch), _tensors(batch), strict=True):
+            inside.copy_(given)
+        kept.weight.copy_(weight)
+        kept.key.copy_(key)
+        kept.replay()
+        for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
+            parameter.grad = gradient
+        # The next replay writes over what it has returned.
+        return {name: value.clone() for name, value in kept.seen.items()}
+
+    def _recorded(self, batch: Batch, weight: Tensor, key: Tensor) -> _Recording:
+        batch, weight, key = batch.map(Tensor.clone), weight.clone(), key.clone()
+        for parameter in self.parameters:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        before = [count.clone() for count in self.counts]
+
+        def work() -> Seen:
+            for parameter in self.parameters:
+                if parameter.grad is not None:
+                    parameter.grad.zero_()
+            return self.compute(batch, weight, key)
+
+        replay, seen = self.record(work)
+        for count, former in zip(self.counts, before, strict=True):
+            count.copy_(former)
+        return _Recording(batch, weight, key, replay, seen, [parameter.grad for parameter in self.parameters])
+
+
+def _tensors(batch: Batch) -> list[Tensor]:
+    return [batch.pixels.view, batch.pixels.x, batch.pixels.y, batch.rgba, batch.weight]

@@ -1,0 +1,102 @@
+"""A recorded step is the step: `tests/support/tape.py` stands for CUDA graphs, with the torch twins of the kernels."""
+
+import pytest
+import torch
+from support.gpu_training import step_by_step
+from support.tape import tape
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.losses.robust import RobustLoss
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.training.launch.trainer import TrainerSettings
+
+CPU = torch.device("cpu")
+KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "packed.cpu")
+SETTING = "trainer.cuda_graph=true"
+
+
+@pytest.fixture(autouse=True)
+def as_on_a_gpu(monkeypatch):
+    """Arrays of samples have a capacity, and torch does what numba would."""
+    monkeypatch.setattr(OccupancySampler, "capacity_on", lambda sampler, device: 8192)
+    with without(*KERNELS):
+        yield
+
+
+def trained(sizes, record, model="fast_small"):
+    """Take a step of each size, and return the run."""
+    run = step_by_step(model, CPU)
+    run.training.model.keep_weights(True)  # so that no kernel takes whole rays
+    if record:
+        run.training.record_gradients(record=tape)
+    for size in sizes:
+        run.training.progress.batch_rays = size
+        run.step()
+    return run
+
+
+def assert_same(run, other):
+    torch.testing.assert_close(run.all_losses(), other.all_losses(), rtol=0, atol=0)
+    for name, value in run.training.model.state_dict().items():
+        torch.testing.assert_close(value, other.training.model.state_dict()[name], rtol=0, atol=0, msg=name)
+
+
+def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid():
+    sizes = [48] * 20
+    run = trained(sizes, record=True)
+    assert_same(run, trained(sizes, record=False))
+    assert list(run.training._recorded.recordings) == [48]
+    assert run.training.model.statistics()["train/dropped_samples"] == 0
+    assert run.all_losses().unique().numel() == 20
+
+
+def test_each_size_of_batches_has_its_recording():
+    sizes = [32, 48, 32, 48, 48, 32]
+    run = trained(sizes, record=True)
+    assert_same(run, trained(sizes, record=False))
+    assert sorted(run.training._recorded.recordings) == [32, 48]
+
+
+def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere():
+    run, other = trained([48] * 3, record=True), trained([48] * 3, record=False)
+    for each in (run, other):
+        each.training.restart(each.optimizer)
+        assert each is other or not each.training._recorded.recordings
+        for _ in range(3):
+            each.step()
+    assert_same(run, other)
+
+
+def test_what_asks_the_host_cannot_be_recorded(monkeypatch):
+    monkeypatch.setattr(OccupancySampler, "capacity_on", lambda sampler, device: None)
+    with pytest.raises(AssertionError, match="asks the host"):
+        trained([48], record=True)
+
+
+def test_what_the_host_decides_is_refused_by_name():
+    run = step_by_step("fast_small", CPU)
+    run.training.loss = RobustLoss(run.training.loss)
+    encoder = next(each for each in run.training.model.modules() if isinstance(each, HashGridEncoder))
+    encoder.blend_in = 0.5
+    with pytest.raises(InputError, match=rf"{SETTING}.*here are: loss, encoder\.blend_in\. Leave it out"):
+        run.training.record_gradients(record=tape)
+
+
+def test_cameras_that_learn_are_refused():
+    run = step_by_step("fast_small", CPU)
+    run.training.rays.moved = torch.nn.Parameter(torch.zeros(3))
+    with pytest.raises(InputError, match="here are: rays"):
+        run.training.record_gradients(record=tape)
+
+
+@pytest.mark.parametrize("model", ["fast_proposal", "nerf_tiny"])
+def test_models_without_an_occupancy_grid_are_refused(model):
+    with pytest.raises(InputError, match=rf"{SETTING}.*this model has others"):
+        step_by_step(model, CPU).training.record_gradients(record=tape)
+
+
+def test_other_devices_are_refused():
+    with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
+        TrainerSettings(accelerator="cpu", cuda_graph=True)
