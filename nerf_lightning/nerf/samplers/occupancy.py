@@ -72,7 +72,7 @@ class OccupancySampler(PackedSampler):
         self,
         resolution: int = 128,
         num_cascades: int | None = None,
-        num_steps: int = 256,
+        num_steps: int = 384,
         cone_angle: float | None = None,
         update_every: int = 16,
         warmup_steps: int = 256,
