@@ -26,6 +26,7 @@ from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.randomness import batch_random, fold
@@ -124,6 +125,12 @@ class TrainStep:
         self.guard = StepGuard()
         self._recorded: RecordedGradients | None = None
         model.keep_weights(loss.needs_weights)
+        if model.subpixels.side > 1 and loss.needs_weights:
+            raise InputError(
+                f"model.subpixels={model.subpixels.side} compares the mean of several rays with a photograph's pixel, "
+                f"and the loss {type(loss).__name__} looks at the samples of single rays, as model=fast_proposal wants "
+                "it. Leave model.subpixels out, or choose another loss or model."
+            )
         if tile_points is not None and model.needs_whole_batch:
             raise InputError(
                 "field.batch_norm=true normalises over the whole batch, so the step cannot be cut into tiles: "
@@ -150,13 +157,14 @@ class TrainStep:
         """
         decides = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
         decides += ["loss"] if list(self.loss.buffers()) else []
+        decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
         if not self.model.replays or decides:
             cause = f"and here are: {', '.join(decides)}" if decides else "and this model has others"
             raise InputError(
                 "trainer.cuda_graph=true replays the same kernels in each step: it is for models with an occupancy "
-                "grid (model=fast), without refinement, correction, encoder.blend_in, and losses that learn, "
-                f"{cause}. Leave it out."
+                "grid (model=fast), without refinement, correction, model.subpixels, encoder.blend_in, and losses that "
+                f"learn, {cause}. Leave it out."
             )
 
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> dict[str, Tensor]:
@@ -244,6 +252,7 @@ class TrainStep:
         optimizer.zero_grad()
         if self.num_steps is not None:
             follow_run(self.model, progress.step / self.num_steps)
+            self.model.subpixels.follow(progress.step / self.num_steps)
             self.rays.follow(progress.step / self.num_steps)
             key = fold(self.seed, progress.attempt, progress.step, "correction")
             tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
@@ -308,11 +317,12 @@ class TrainStep:
     def validate(self, batch: Batch, errors: RayErrors) -> Tensor:
         """Collect and average the squared error of rays that no mask leaves out; backgrounds as at evaluation."""
         background = background_colors(self.background, batch.num_rays, batch.weight.device, None)
-        target, rays = blend(batch.rgba, background), self.rays(batch.pixels)
+        target, several = blend(batch.rgba, background), self.model.subpixels
         rgb = torch.empty_like(target)
         for tile in tiles(batch.num_rays, self._tile_rays(batch.num_rays)):
-            behind = None if background is None else background[tile]
-            rgb[tile] = self.model(rays[tile], behind, random=None)[-1].rgb
+            rays = self.rays.of_pixels(batch.pixels[tile], several)
+            behind = None if background is None else for_each_ray(background[tile], several.per_pixel)
+            rgb[tile] = mean_over_pixels(self.model(rays, behind, random=None)[-1], several.per_pixel).rgb
         errors.add(rgb, target, batch.weight)
         error = (rgb - target).square().mean(dim=-1)
         return (error * batch.weight).sum() / batch.weight.sum().clamp(min=1.0)
@@ -364,14 +374,16 @@ class TrainStep:
         behind = background_colors(self.background, num_rays, device, random, batch.rgba)
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
-        target = Target(blend(batch.rgba, behind), weight, batch.pixels)
+        target, several = Target(blend(batch.rgba, behind), weight, batch.pixels), self.model.subpixels
 
         def lose(tile: slice) -> TileLoss:
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.
             pixels = batch.pixels[tile]
-            rays = replace(self.rays(pixels), photograph=pixels.view)
-            numbers = None if random is None else random[tile]
-            renderings = self.model(rays, None if behind is None else behind[tile], numbers)
+            rays = self.rays.of_pixels(pixels, several)
+            rays = replace(rays, photograph=for_each_ray(pixels.view, several.per_pixel))
+            numbers = None if random is None else random_of_rays(random[tile], several.per_pixel)
+            background = None if behind is None else for_each_ray(behind[tile], several.per_pixel)
+            renderings = [mean_over_pixels(each, several.per_pixel) for each in self.model(rays, background, numbers)]
             shown = [self.correction.photographed(each, pixels) for each in renderings]
             levels = torch.stack(list(self.loss(shown, target[tile]))) + _penalties(renderings)
             part = (tile.stop - tile.start) / share.num_rays
@@ -405,7 +417,10 @@ class TrainStep:
         )
 
     def _tile_rays(self, num_rays: int, training: bool = False) -> int:
-        return num_rays if self.tile_points is None else tile_rays_for(self.model, self.tile_points, training)
+        """Return how many of so many pixels are rendered at once."""
+        if self.tile_points is None:
+            return num_rays
+        return max(1, tile_rays_for(self.model, self.tile_points, training) // self.model.subpixels.per_pixel)
 
     def _update(self, optimizer: Any) -> None:
         if self.clip_norm is not None:

@@ -73,15 +73,27 @@ def rays_through_pixels(
     pixels: PixelIndex,
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
+    place: Float[Tensor, "*#rays 2"] | None = None,
+    per_side: int = 1,
 ) -> RayBundle:
-    """Return the rays through the centres of pixels; near and far are given per view (scene units).
+    """Return the rays through pixels; near and far are given per view (scene units).
 
     The direction in camera axes is ((x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -1), undistorted by the lens where the
     camera has one, rotated into the world and brought to unit length. Where the cameras say so, the ray is then bent
     into normalised device coordinates, and near and far with it.
+
+    Args:
+        cameras: one per view.
+        pixels: which.
+        near: where the rays of each view begin.
+        far: where they end.
+        place: where in its pixel each ray goes through, in pixels from the centre (x, y); None: there.
+        per_side: so many rays share each side of a pixel.
     """
     view = pixels.view
     at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
+    if place is not None:
+        at = at + place
     plane = (at - cameras.center[view]) / cameras.focal[view]
     if cameras.lens_model == "pinhole":
         local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
@@ -90,7 +102,7 @@ def rays_through_pixels(
     c2w = cameras.c2w[view]
     directions = (c2w[..., :3] @ local[..., None])[..., 0]
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    side = pixel_side(cameras, view, _turned(local))
+    side = pixel_side(cameras, view, _turned(local)) / per_side
     rays = RayBundle(c2w[..., 3], directions, near[view], far[view], view_directions=directions, pixel_side=side)
     return rays if cameras.ndc is None else ndc_rays(rays, cameras.ndc[view])
 

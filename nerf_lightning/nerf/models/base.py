@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
+from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
@@ -32,6 +33,8 @@ class Model(nn.Module, ABC):
 
     def __init__(self) -> None:
         super().__init__()
+        self.subpixels = Subpixels()
+        """How many rays go through each pixel, in training and in pictures."""
         self.most_rays: int | None = None
         """So many rays at once have found room in memory while rendering; None: no more were tried in vain."""
         self.register_load_state_dict_post_hook(_look_at_what_was_loaded)

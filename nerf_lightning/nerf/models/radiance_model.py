@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.models.base import Model, norm_of_gradients
 from nerf_lightning.nerf.models.level import Level
+from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.points import Points
@@ -21,10 +22,14 @@ class RadianceModel(Model):
 
     Args:
         levels: name -> level, in order.
+        subpixels: rays along each side of a pixel, whose mean is compared with its photograph, in the last part of the
+            run, and in pictures; 1: one ray through the centre.
+        subpixels_from: share of the run before that part.
     """
 
-    def __init__(self, levels: dict[str, Level]):
+    def __init__(self, levels: dict[str, Level], subpixels: int = 1, subpixels_from: float = 0.8):
         super().__init__()
+        self.subpixels = Subpixels(subpixels, subpixels_from)
         self.levels = nn.ModuleDict(levels)
         self.points_per_ray(training=False)  # levels that do not fit each other are refused here
 
@@ -142,6 +147,7 @@ class RadianceModel(Model):
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
+        self.subpixels.reset()
         for level in self._in_order():
             level.reset_parameters()
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.refinements.carry import carry_along
 from nerf_lightning.nerf.refinements.none import NoRefinement
@@ -81,12 +82,28 @@ class RayGenerator(LearntPart):
         """The cameras as they were before anything was learnt."""
         return Cameras(lens_model=self.lens_model, **{name: getattr(self, name) for name in MOVED})
 
-    def forward(self, pixels: PixelIndex) -> RayBundle:
-        """Return the rays through the centres of pixels, in the world or in normalised device coordinates."""
-        rays = rays_through_pixels(self.cameras, pixels, self.near, self.far)
+    def forward(
+        self, pixels: PixelIndex, place: Float[Tensor, "*#rays 2"] | None = None, per_side: int = 1
+    ) -> RayBundle:
+        """Return the rays through pixels, in the world or in normalised device coordinates.
+
+        Args:
+            pixels: which.
+            place: where in its pixel each ray goes through, in pixels from the centre; None: there.
+            per_side: so many rays share each side of a pixel.
+        """
+        rays = rays_through_pixels(self.cameras, pixels, self.near, self.far, place, per_side)
         if self.capture_of is not None:
             rays = replace(rays, capture=self.capture_of[pixels.view])
         return replace(rays, photograph=pixels.view) if self.names_photographs else rays
+
+    def of_pixels(self, pixels: PixelIndex, subpixels: Subpixels) -> RayBundle:
+        """Return the rays of pixels in a row, as many for each as a model wants, those of one pixel after the other."""
+        if subpixels.per_pixel == 1:
+            return self(pixels)
+        place = subpixels.places(pixels.x.device).repeat(pixels.x.numel(), 1)
+        each = pixels.map(lambda of_pixel: for_each_ray(of_pixel, subpixels.per_pixel))
+        return self(each, place, subpixels.per_side)
 
     def follow(self, share: float) -> None:
         """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
@@ -111,6 +128,6 @@ class RayGenerator(LearntPart):
         with torch.no_grad():
             return carry_along(self.given.to("cpu"), self.cameras.to("cpu"), trained)
 
-    def through_world(self, pixels: PixelIndex) -> RayBundle:
+    def through_world(self, pixels: PixelIndex, place: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
         """Return the rays through the world, wherever those of `forward` run."""
-        return rays_through_pixels(replace(self.cameras, ndc=None), pixels, self.near, self.far)
+        return rays_through_pixels(replace(self.cameras, ndc=None), pixels, self.near, self.far, place)

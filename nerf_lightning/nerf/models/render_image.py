@@ -44,7 +44,7 @@ def render_picture(
     clip: Clip | None = None,
     seen_from: RayGenerator | None = None,
 ) -> Picture:
-    """Render one view with the last level, as at evaluation (no jitter).
+    """Render one view with the last level, as at evaluation (no jitter): the mean of each pixel's rays.
 
     Args:
         model: in evaluation mode.
@@ -55,25 +55,37 @@ def render_picture(
         clip: what of the scene is shown; None: all.
         seen_from: other cameras, from whose directions the colour is looked up, in place of the view's own.
     """
-    rays, straight = view_rays(rays_of, view, clip)
-    if seen_from is not None:
-        rays = replace(rays, view_directions=view_rays(seen_from, view)[1].view_directions)
-    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
-    shape = rays.near.shape
-    rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
-    if rays_of.cameras.ndc is not None:
-        whole = rays.far if clip is None else view_rays(rays_of, view)[0].far
-        depth = world_distance(straight, depth / whole)
-    return Picture(rgb, depth, opacity, *first)
+    parts = [
+        _render_through(place, model, rays_of, view, background, tile_points, clip, seen_from)
+        for place in model.subpixels.places()
+    ]
+    if len(parts) == 1:
+        return Picture(*parts[0])
+    return Picture(*(torch.stack(columns).mean(dim=0) for columns in zip(*parts, strict=True)))
 
 
 @torch.no_grad()
-def view_rays(rays_of: RayGenerator, view: int, clip: Clip | None = None) -> tuple[RayBundle, RayBundle]:
-    """Return a picture of rays as the model takes them, and the same rays through the world; both on the CPU."""
+def view_rays(
+    rays_of: RayGenerator,
+    view: int,
+    clip: Clip | None = None,
+    place: Float[Tensor, "2"] | None = None,
+    per_side: int = 1,
+) -> tuple[RayBundle, RayBundle]:
+    """Return a picture of rays as the model takes them, and the same rays through the world; both on the CPU.
+
+    Args:
+        rays_of: the cameras.
+        view: which.
+        clip: what of the scene is shown; None: all.
+        place: where in each pixel its ray goes through, in pixels from the centre; None: there.
+        per_side: so many rays share each side of a pixel.
+    """
     cameras = rays_of.cameras
     pixels = all_pixels(cameras, view)
-    rays = rays_of(pixels).to("cpu")
-    straight = rays if cameras.ndc is None else rays_of.through_world(pixels).to("cpu")
+    place = None if place is None else place.to(pixels.x.device)
+    rays = rays_of(pixels, place, per_side).to("cpu")
+    straight = rays if cameras.ndc is None else rays_of.through_world(pixels, place).to("cpu")
     if clip is not None:
         rays = clip(rays, straight, ndc=cameras.ndc is not None)
     return rays, straight
@@ -98,6 +110,30 @@ def surface_points(
         return rays.origins + depth[:, None] * rays.directions, opacity
     straight = rays_of.through_world(pixels).to("cpu")
     return straight.origins + world_distance(straight, depth / rays.far)[:, None] * straight.directions, opacity
+
+
+def _render_through(
+    place: Float[Tensor, "2"],
+    model: Model,
+    rays_of: RayGenerator,
+    view: int,
+    background: Background,
+    tile_points: int,
+    clip: Clip | None,
+    seen_from: RayGenerator | None,
+) -> list[Tensor]:
+    """Return a picture's colour, depth, opacity and first colour, by rays through one place of each pixel."""
+    at = (place, model.subpixels.per_side)
+    rays, straight = view_rays(rays_of, view, clip, *at)
+    if seen_from is not None:
+        rays = replace(rays, view_directions=view_rays(seen_from, view, None, *at)[1].view_directions)
+    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
+    shape = rays.near.shape
+    rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
+    if rays_of.cameras.ndc is not None:
+        whole = rays.far if clip is None else view_rays(rays_of, view, None, *at)[0].far
+        depth = world_distance(straight, depth / whole)
+    return [rgb, depth, opacity, *first]
 
 
 def _flat(picture: Tensor) -> Tensor:
