@@ -51,19 +51,20 @@ def flat(value, path=""):
 @pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("quiet", [QUIET, pytest.param(with_hybrid(QUIET), marks=pytest.mark.exhaustive, id="hybrid")])
 def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads, quiet):
-    """Weights, moments, occupancy grid, rays per step: all of it."""
-    shared = f"trainer.num_threads={threads}"
-    code, output = finished(start(*arguments(capture, tmp_path / "whole", shared, quiet=quiet)))
+    """Weights, moments, occupancy grid, rays per step and per pixel: all of it."""
+    # Several rays a pixel from step 21 on: between the two places at which it is stopped.
+    shared = (f"trainer.num_threads={threads}", "model.subpixels=2", "model.subpixels_from=0.3")
+    code, output = finished(start(*arguments(capture, tmp_path / "whole", *shared, quiet=quiet)))
     assert code == 0, output
     folder = tmp_path / "stopped"
     for how, after in ((signal.SIGKILL, 10), (signal.SIGTERM, 25)):
-        process = start(*arguments(capture, folder, shared, quiet=quiet))
+        process = start(*arguments(capture, folder, *shared, quiet=quiet))
         while process.poll() is None and saved(folder)["global_step"] < after:
             time.sleep(0.02)
         process.send_signal(how)
         code, output = finished(process)
         assert code in (-how, 128 + how), output
-    code, output = finished(start(*arguments(capture, folder, shared, quiet=quiet)))
+    code, output = finished(start(*arguments(capture, folder, *shared, quiet=quiet)))
     assert code == 0, output
     assert "going on from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")

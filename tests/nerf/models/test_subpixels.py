@@ -1,4 +1,4 @@
-"""Several rays a pixel: a picture is the mean of one twice as large, and a step compares that mean with the photograph."""
+"""Several rays a pixel: a picture is the mean of a larger one, and a step compares that mean with the photograph."""
 
 from dataclasses import replace
 
