@@ -59,7 +59,7 @@ class RecordedGradients:
     Args:
         compute: the work.
         parameters: all that learn.
-        counts: buffers that the work adds to, put back after it was tried.
+        counts: returns the buffers that the work adds to, which are put back after it was tried.
         record: makes a recording.
     """
 
@@ -67,7 +67,7 @@ class RecordedGradients:
         self,
         compute: Gradients,
         parameters: Sequence[Parameter],
-        counts: Sequence[Tensor],
+        counts: Callable[[], Sequence[Tensor]],
         record: Recorder = cuda_graph,
     ):
         self.compute, self.parameters, self.counts, self.record = compute, parameters, counts, record
@@ -93,7 +93,7 @@ class RecordedGradients:
         for parameter in self.parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-        before = [count.clone() for count in self.counts]
+        before = [count.clone() for count in self.counts()]
 
         def work() -> Seen:
             for parameter in self.parameters:
@@ -102,7 +102,7 @@ class RecordedGradients:
             return self.compute(batch, weight, key)
 
         replay, seen = self.record(work)
-        for count, former in zip(self.counts, before, strict=True):
+        for count, former in zip(self.counts(), before, strict=True):
             count.copy_(former)
         return _Recording(batch, weight, key, replay, seen, [parameter.grad for parameter in self.parameters])
 

@@ -170,7 +170,7 @@ class TrainStep:
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> dict[str, Tensor]:
             return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
 
-        self._recorded = RecordedGradients(compute, self._parameters(), self.model.counts(), record)
+        self._recorded = RecordedGradients(compute, self._parameters(), self.model.counts, record)
 
     @property
     def rays_together(self) -> int:
