@@ -78,7 +78,7 @@ class RecordedGradients:
         if batch.num_rays not in self.recordings:
             self.recordings[batch.num_rays] = self._recorded(batch, weight, key)
         kept = self.recordings[batch.num_rays]
-        for inside, given in zip(_tensors(kept.batch), _tensors(batch), strict=True):
+        for inside, given in zip(kept.batch.tensors(), batch.tensors(), strict=True):
             inside.copy_(given)
         kept.weight.copy_(weight)
         kept.key.copy_(key)
@@ -105,7 +105,3 @@ class RecordedGradients:
         for count, former in zip(self.counts(), before, strict=True):
             count.copy_(former)
         return _Recording(batch, weight, key, replay, seen, [parameter.grad for parameter in self.parameters])
-
-
-def _tensors(batch: Batch) -> list[Tensor]:
-    return [batch.pixels.view, batch.pixels.x, batch.pixels.y, batch.rgba, batch.weight]

@@ -251,12 +251,13 @@ class TrainStep:
         progress = self.progress
         optimizer.zero_grad()
         if self.num_steps is not None:
-            follow_run(self.model, progress.step / self.num_steps)
-            self.model.subpixels.follow(progress.step / self.num_steps)
-            self.rays.follow(progress.step / self.num_steps)
+            taken = progress.step / self.num_steps
+            follow_run(self.model, taken)
+            self.model.subpixels.follow(taken)
+            self.rays.follow(taken)
             key = fold(self.seed, progress.attempt, progress.step, "correction")
             tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
-            self.correction.follow(progress.step / self.num_steps, self.model, self.rays, tile_points, key)
+            self.correction.follow(taken, self.model, self.rays, tile_points, key)
         self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
         share = self._share(ranks.total(batch.weight.sum()))

@@ -5,7 +5,7 @@ side, so that other views are less sharp than those that taught it (Sec. 1, arXi
 rays is the plain cure; it costs as many times the samples, so it is for the end of a run.
 """
 
-from typing import Any
+from dataclasses import fields
 
 import torch
 from jaxtyping import Float, Shaped
@@ -102,8 +102,5 @@ def mean_over_pixels(rendering: Rendering, per_pixel: int) -> Rendering:
     """Return what pixels show: the means over their rays, and no samples."""
     if per_pixel == 1:
         return rendering
-    seen: dict[str, Any] = {}
-    for name in ("rgb", "foreground", "opacity", "depth", "penalty"):
-        value = getattr(rendering, name)
-        seen[name] = None if value is None else value.unflatten(0, (-1, per_pixel)).mean(dim=1)
-    return Rendering(**seen)
+    plain = Rendering(**{each.name: getattr(rendering, each.name) for each in fields(Rendering)})
+    return plain.map(lambda of_rays: of_rays.unflatten(0, (-1, per_pixel)).mean(dim=1))

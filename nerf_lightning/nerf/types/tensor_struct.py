@@ -25,6 +25,17 @@ class TensorStruct:
                 changed[each.name] = value.map(fn)
         return replace(self, **changed)  # type: ignore[type-var]
 
+    def tensors(self) -> list[Tensor]:
+        """Return every tensor, in the order of the fields."""
+        found: list[Tensor] = []
+
+        def note(tensor: Tensor) -> Tensor:
+            found.append(tensor)
+            return tensor
+
+        self.map(note)
+        return found
+
     def to(self: Struct, device: torch.device | str, non_blocking: bool = False) -> Struct:
         """Return a copy on `device`."""
         return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
