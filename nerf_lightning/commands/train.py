@@ -106,9 +106,10 @@ def _take_folder(
     config: DictConfig, asked: DictConfig, num_steps: int, held: list[RunFolder]
 ) -> tuple[Path, ResumePoint | None]:
     """Let one process choose and hold the folder for all; return it, and where training goes on."""
-    folder = open_run(config, num_steps, job_folder(), asked)
+    hydra_config = HydraConfig.get()
+    folder = open_run(config, num_steps, job_folder(), asked, hydra_config.overrides.task)
     held.append(folder)
-    write_config(folder.path, config, HydraConfig.get())
+    write_config(folder.path, config, hydra_config)
     return folder.path, folder.resume_point()
 
 

@@ -6,9 +6,10 @@ A run folder has `run.json` (its config's fingerprint, and what it came to), `.h
 
 import contextlib
 import itertools
+import logging
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -32,6 +33,8 @@ from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 from nerf_lightning.slurm import slurm_job, was_requeued
 from nerf_lightning.training.callbacks.folder_guard import require_run
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,13 @@ class RunFolder:
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
 
 
-def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked: DictConfig | None = None) -> RunFolder:
+def open_run(
+    config: DictConfig,
+    num_steps: int,
+    job_folder: Path | None,
+    asked: DictConfig | None = None,
+    typed: Sequence[str] = (),
+) -> RunFolder:
     """Choose the run's folder, refuse it or take hold of it, and write down the config.
 
     Args:
@@ -118,12 +127,13 @@ def open_run(config: DictConfig, num_steps: int, job_folder: Path | None, asked:
         job_folder: the folder that a sweep gives this job, or None for a single run.
         asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand;
             None: nothing was.
+        typed: the overrides of the command line.
 
     Raises:
         InputError: the folder is in use, is occupied by another run, or cannot be written.
     """
     identity = run_identity(config)
-    folder = _choose(config, identity, num_steps, job_folder)
+    folder = _choose(config, identity, num_steps, job_folder, {each.lstrip("+").partition("=")[0] for each in typed})
     require_no_way_out(folder)
     try:
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
@@ -190,10 +200,12 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
             OmegaConf.save(content, part)
 
 
-def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> Path:
+def _choose(
+    config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None, typed: set[str]
+) -> Path:
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
-        return _to_resume(Path(required_path("resume", resume)), identity)
+        return _to_resume(Path(required_path("resume", resume)), identity, typed)
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()
@@ -202,11 +214,11 @@ def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_fo
         return _fresh(Path(config.paths.root_dir) / config.scene.name)
     if (folder / "run.json").exists():
         resuming = resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
-        _refuse_other_run(folder, identity, resuming)
+        _refuse_other_run(folder, identity, typed, resuming)
     return folder
 
 
-def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
+def _to_resume(path: Path, identity: dict[str, Any], typed: set[str]) -> Path:
     folder = path.parent.parent if path.suffix == ".ckpt" else path
     if path.suffix == ".ckpt" and not path.is_file():
         raise InputError(f"resume={path}: there is no such checkpoint. A run keeps last.ckpt and best.ckpt.")
@@ -215,11 +227,11 @@ def _to_resume(path: Path, identity: dict[str, Any]) -> Path:
             f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
             "resume=auto for the newest unfinished run of this config."
         )
-    _refuse_other_run(folder, identity, resuming=True)
+    _refuse_other_run(folder, identity, typed, resuming=True)
     return folder
 
 
-def _refuse_other_run(folder: Path, identity: dict[str, Any], resuming: bool) -> None:
+def _refuse_other_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
     if read_note(folder).get("fingerprint") == fingerprint(identity):
         if resuming:
             return
@@ -227,13 +239,28 @@ def _refuse_other_run(folder: Path, identity: dict[str, Any], resuming: bool) ->
             f"{folder} already holds a run of this very config. Add resume=auto to go on with it, or give another "
             "folder with paths.output_dir=DIR."
         )
+    other = _former_identity(folder)
+    newer = _newer_settings(folder, identity, other) if isinstance(other, dict) and resuming else []
+    if newer and not typed & set(newer):
+        shown = ", ".join(f"{key}={identity[key]}" for key in newer)
+        log.warning("The run in %s was begun before there were these settings, and goes on with %s.", folder, shown)
+        return
+    difference = _difference(identity, other) if isinstance(other, dict) else other
     raise InputError(
-        f"{folder} is occupied by a run of another config ({_difference(folder, identity)}). Give the settings that it "
-        "was started with (.hydra/overrides.yaml), or another folder with paths.output_dir=DIR."
+        f"{folder} is occupied by a run of another config ({difference}). Give the settings that it was started with "
+        "(.hydra/overrides.yaml), or another folder with paths.output_dir=DIR."
     )
 
 
-def _difference(folder: Path, identity: dict[str, Any]) -> str:
+def _newer_settings(folder: Path, identity: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Return the settings that came into the program after a run was begun; none where anything else differs."""
+    known = {key: value for key, value in identity.items() if key in other}
+    as_begun = read_note(folder).get("fingerprint") == fingerprint(other)
+    return sorted(identity.keys() - other.keys()) if known == other and as_begun else []
+
+
+def _former_identity(folder: Path) -> dict[str, Any] | str:
+    """Return what the run in a folder is, by the config that it was begun with, or why that is not known."""
     saved = folder / ".hydra" / "config.yaml"
     if not saved.is_file():
         return "its config was not kept"
@@ -241,11 +268,17 @@ def _difference(folder: Path, identity: dict[str, Any]) -> str:
     if not isinstance(content, dict):
         return "its config is damaged"
     try:
-        other = run_identity(OmegaConf.create(content))
+        return run_identity(OmegaConf.create(content))
     except OmegaConfBaseException:
         return "its config is damaged"
-    keys = sorted(key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
-    shown = ", ".join(f"{key}: there {other.get(key)}, here {identity.get(key)}" for key in keys[:4])
+
+
+def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
+    differing = (key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
+    keys = sorted(differing, key=lambda key: (key not in other, key))  # what came after the run began is told last
+    shown = ", ".join(
+        f"{key}: there {other.get(key, 'unknown')}, here {identity.get(key, 'unknown')}" for key in keys[:4]
+    )
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 

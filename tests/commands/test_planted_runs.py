@@ -11,7 +11,7 @@ from support.running import FAST, said
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.links import require_no_way_out
-from nerf_lightning.runs.folder import RunFolder, _difference, _newest_unfinished, open_run
+from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, to_give_again
 from nerf_lightning.runs.summary import read_note
 
@@ -290,4 +290,4 @@ def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
 
 def test_a_config_with_half_an_interpolation_is_called_damaged(run):
     (run / ".hydra" / "config.yaml").write_text('a: "${"')
-    assert _difference(run, {"a": 1}) == "its config is damaged"
+    assert _former_identity(run) == "its config is damaged"

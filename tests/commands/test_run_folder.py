@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
 from support.configs import composed
 from support.running import FAST
 from support.scenes import ball_scene
@@ -16,6 +16,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.protocol import config_hash
 from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
 
+HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}
+
 
 def config(tmp_path, *overrides):
     return composed("train", f"paths.root_dir={tmp_path}", *overrides)
@@ -23,8 +25,7 @@ def config(tmp_path, *overrides):
 
 def begin(cfg, steps=100, job_folder=None):
     run = open_run(cfg, steps, job_folder)
-    hydra = OmegaConf.create({"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}})
-    write_config(run.path, cfg, hydra)
+    write_config(run.path, cfg, OmegaConf.create(HYDRA))
     return run
 
 
@@ -75,6 +76,43 @@ def test_a_folder_of_another_config_is_refused_and_the_difference_named(tmp_path
     with pytest.raises(InputError, match=r"already holds a run of this very config. Add resume=auto"):
         open_run(config(tmp_path, f"paths.output_dir={tmp_path}/here"), 100, None)
     assert json.loads((tmp_path / "here/run.json").read_text()) == before
+
+
+def without(config, *names):
+    """The config of a program that does not know these settings yet."""
+    with open_dict(config):
+        for name in names:
+            section, _, key = name.rpartition(".")
+            del OmegaConf.select(config, section)[key]
+    return config
+
+
+def test_a_run_that_is_older_than_a_setting_goes_on_with_its_default(tmp_path, caplog):
+    here = f"paths.output_dir={tmp_path}/here"
+    begin(without(config(tmp_path, here), "model.subpixels", "trainer.cuda_graph")).release()
+    resumed = config(tmp_path, f"resume={tmp_path}/here")
+    with pytest.raises(InputError, match=r"another config \(model.subpixels: there unknown, here 1,"):
+        open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here", "model.subpixels=1"])
+    with pytest.raises(InputError, match=r"another config \(seed: there 0, here 3,"):
+        open_run(config(tmp_path, f"resume={tmp_path}/here", "seed=3"), 100, None)
+    open_run(resumed, 100, None, typed=[f"resume={tmp_path}/here"]).release()
+    assert "goes on with model.subpixels=1, trainer.cuda_graph=False." in caplog.text
+    assert begin(config(tmp_path, here, "resume=auto")).path == tmp_path / "here"
+
+
+def test_a_config_that_lost_settings_since_the_run_began_is_another_one(tmp_path):
+    run = begin(config(tmp_path, f"paths.output_dir={tmp_path}/here", "model.subpixels=2"))
+    write_config(run.path, without(config(tmp_path), "model.subpixels"), OmegaConf.create(HYDRA))
+    run.release()
+    with pytest.raises(InputError, match="occupied by a run of another config"):
+        open_run(config(tmp_path, f"resume={tmp_path}/here"), 100, None)
+
+
+def test_a_setting_that_a_run_had_and_the_program_lost_is_another_config(tmp_path):
+    here = f"paths.output_dir={tmp_path}/here"
+    begin(config(tmp_path, here)).release()
+    with pytest.raises(InputError, match=r"another config \(model.subpixels: there 1, here unknown\)"):
+        open_run(without(config(tmp_path, f"resume={tmp_path}/here"), "model.subpixels"), 100, None)
 
 
 @pytest.mark.parametrize(
