@@ -49,6 +49,15 @@ def to_type(key: str, text: str) -> str:
     return shlex.quote(override)
 
 
+def key_of(override: str) -> str:
+    """Return the key that an override sets, adds or takes away.
+
+    >>> key_of("++trainer.lightning.profiler=simple"), key_of("~callbacks.film")
+    ('trainer.lightning.profiler', 'callbacks.film')
+    """
+    return override.lstrip("+~").partition("=")[0]
+
+
 def open_sections(overrides: Iterable[str]) -> list[str]:
     """Return overrides that Hydra takes for sections whose keys it does not know, without a + from the user.
 

@@ -25,6 +25,7 @@ from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_c
 from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.instantiate import required_path
+from nerf_lightning.config.overrides import key_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
@@ -35,6 +36,9 @@ from nerf_lightning.slurm import slurm_job, was_requeued
 from nerf_lightning.training.callbacks.folder_guard import require_run
 
 log = logging.getLogger(__name__)
+
+UNKNOWN = "unknown"
+"""What stands for the value of a setting where a config does not have it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,9 @@ def open_run(
         InputError: the folder is in use, is occupied by another run, or cannot be written.
     """
     identity = run_identity(config)
-    folder = _choose(config, identity, num_steps, job_folder, {each.lstrip("+").partition("=")[0] for each in typed})
+    folder, resuming = _choose(config, identity, num_steps, job_folder)
+    if (folder / "run.json").exists():
+        _require_same_run(folder, identity, set(map(key_of, typed)), resuming)
     require_no_way_out(folder)
     try:
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
@@ -201,24 +207,22 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
 
 
 def _choose(
-    config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None, typed: set[str]
-) -> Path:
+    config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None
+) -> tuple[Path, bool]:
+    """Return the folder, and whether what is there is to be gone on with."""
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
-        return _to_resume(Path(required_path("resume", resume)), identity, typed)
+        return _to_resume(Path(required_path("resume", resume))), True
     folder = job_folder or (Path(given) if given else None)
     if folder is None and (resume == "auto" or was_requeued()):
         of_job = None if resume == "auto" else slurm_job()
         folder = _newest_unfinished(Path(config.paths.root_dir), fingerprint(identity), num_steps, of_job)
     if folder is None:
-        return _fresh(Path(config.paths.root_dir) / config.scene.name)
-    if (folder / "run.json").exists():
-        resuming = resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
-        _refuse_other_run(folder, identity, typed, resuming)
-    return folder
+        return _fresh(Path(config.paths.root_dir) / config.scene.name), False
+    return folder, resume == "auto" or config.sweep.resume or was_requeued() or "preempted" in read_note(folder)
 
 
-def _to_resume(path: Path, identity: dict[str, Any], typed: set[str]) -> Path:
+def _to_resume(path: Path) -> Path:
     folder = path.parent.parent if path.suffix == ".ckpt" else path
     if path.suffix == ".ckpt" and not path.is_file():
         raise InputError(f"resume={path}: there is no such checkpoint. A run keeps last.ckpt and best.ckpt.")
@@ -227,11 +231,10 @@ def _to_resume(path: Path, identity: dict[str, Any], typed: set[str]) -> Path:
             f"resume={path}: there is no run in {folder} (no run.json). Give a run folder, a checkpoint in one, or "
             "resume=auto for the newest unfinished run of this config."
         )
-    _refuse_other_run(folder, identity, typed, resuming=True)
     return folder
 
 
-def _refuse_other_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
+def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
     if read_note(folder).get("fingerprint") == fingerprint(identity):
         if resuming:
             return
@@ -274,11 +277,10 @@ def _former_identity(folder: Path) -> dict[str, Any] | str:
 
 
 def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
-    differing = (key for key in identity.keys() | other.keys() if identity.get(key) != other.get(key))
+    pairs = {key: (other.get(key, UNKNOWN), identity.get(key, UNKNOWN)) for key in identity.keys() | other.keys()}
+    differing = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
     keys = sorted(differing, key=lambda key: (key not in other, key))  # what came after the run began is told last
-    shown = ", ".join(
-        f"{key}: there {other.get(key, 'unknown')}, here {identity.get(key, 'unknown')}" for key in keys[:4]
-    )
+    shown = ", ".join("{}: there {}, here {}".format(key, *differing[key]) for key in keys[:4])
     return shown + (f", and {len(keys) - 4} more" if len(keys) > 4 else "")
 
 

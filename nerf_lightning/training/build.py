@@ -15,6 +15,7 @@ from nerf_lightning.checkpoints.reading import Checkpoint, make_record, read_che
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
+from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import require_sound
@@ -115,7 +116,7 @@ def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = N
 
 def _refuse_settings_of_the_trainer(overrides: Sequence[str]) -> None:
     for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
+        key = key_of(override)
         for setting, instead in OF_LIGHTNINGS_TRAINER.items():
             if key == setting or key.startswith((f"{setting}.", f"{setting}@")):
                 raise InputError(f"{override}: this is for Lightning's Trainer to say here: {instead}.")

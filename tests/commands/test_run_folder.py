@@ -113,6 +113,8 @@ def test_a_setting_that_a_run_had_and_the_program_lost_is_another_config(tmp_pat
     begin(config(tmp_path, here)).release()
     with pytest.raises(InputError, match=r"another config \(model.subpixels: there 1, here unknown\)"):
         open_run(without(config(tmp_path, f"resume={tmp_path}/here"), "model.subpixels"), 100, None)
+    with pytest.raises(InputError, match=r"another config \(trainer.clip_norm: there None, here unknown\)"):
+        open_run(without(config(tmp_path, f"resume={tmp_path}/here"), "trainer.clip_norm"), 100, None)
 
 
 @pytest.mark.parametrize(
