@@ -259,6 +259,7 @@ class OccupancySampler(PackedSampler):
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
             grid.learn(cells, density(grid.positions(cells, part)).float(), self.decay)
+        grid.look_around()
         if step >= self.prune_after:
             mean = grid.density.sum() / grid.possible.sum()
             shortest = (grid.aabb[1] - grid.aabb[0]).norm().double() / self.num_steps

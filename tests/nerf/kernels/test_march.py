@@ -3,9 +3,17 @@
 import pytest
 import torch
 from support.scenes import some_rays
+from torch.nn import functional
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.kernels.march.grid import FARTHEST, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import (
+    FARTHEST,
+    March,
+    OccupancyCells,
+    blocks_of,
+    leaps_over,
+    least_around,
+)
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 
@@ -60,6 +68,13 @@ def test_leaps_are_distances_to_the_next_occupied_block():
     assert torch.equal(leaps_over(blocks).flatten().long(), expected)
     nested = leaps_over(blocks.expand(2, -1, -1, -1))
     assert torch.equal(nested, 1 - blocks.expand(2, -1, -1, -1))
+
+
+def test_the_least_around_is_the_smallest_of_27_cells_and_nothing_at_the_faces():
+    floor = torch.rand(2, 8, 12, 4)
+    padded = functional.pad(floor, (1, 1) * 3)
+    expected = -functional.max_pool3d(-padded, 3, stride=1)
+    assert torch.equal(least_around(floor), expected)
 
 
 def _of_rays(samples, chosen):

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, Occupan
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
-COMPILED_WITH = "a901015c"
+COMPILED_WITH = "06fa24fd"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
