@@ -87,7 +87,7 @@ def test_what_the_host_decides_is_refused_by_name():
 def test_cameras_that_learn_are_refused():
     run = step_by_step("fast_small", CPU)
     run.training.rays.moved = torch.nn.Parameter(torch.zeros(3))
-    with pytest.raises(InputError, match="here are: rays"):
+    with pytest.raises(InputError, match="here are: refinement"):
         run.training.record_gradients(record=tape)
 
 
