@@ -49,7 +49,7 @@ def quality(step, scene):
 
 
 def test_cameras_that_are_a_little_wrong_find_their_place():
-    """Of 1 degree and 1 % of the distance on each of 100 cameras, 0.15 degrees and 0.23 % were left."""
+    """Of 1 degree and 1 % of the distance on each of 100 cameras, 0.15 degrees and 0.21 % were left."""
     true = bricks(128, views=100)
     scene = with_noise(true, degrees=1.0, share=0.01)
     step = trained(scene, 2000, "data.batch_rays=2048", "refinement=se3", "encoder.blend_in=0.5")
@@ -58,7 +58,7 @@ def test_cameras_that_are_a_little_wrong_find_their_place():
         for each in (scene.cameras.c2w, step.rays.cameras.c2w)
     )
     assert after[1] < before[1] / 5, "degrees"
-    assert after[0] < before[0] / 3.5, "centres"
+    assert after[0] < before[0] / 4, "centres"
 
 
 def test_exposures_are_told_from_the_scene():

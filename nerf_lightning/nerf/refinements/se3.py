@@ -54,7 +54,7 @@ class SmallMotions(Refinement):
         poses: bool = True,
         focal: bool = False,
         lens: bool = False,
-        learning_rate: float = 1e-3,
+        learning_rate: float = 3e-4,
         hold: float = 0.1,
         weight: float = 1e-2,
     ) -> None:
