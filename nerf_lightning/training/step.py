@@ -155,8 +155,8 @@ class TrainStep:
         Raises:
             InputError: something here decides on the host what a step computes, and a recording would not follow.
         """
-        beside = {"refinement": self.rays, "correction": self.correction}
-        decides = [name for name, part in beside.items() if list(part.parameters())]
+        learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
+        decides = ["refinement" if name == "rays" else name for name in learnt]
         decides += ["loss"] if list(self.loss.buffers()) else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
