@@ -30,6 +30,8 @@ from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
+OUTLIVED = ".sampler.grid.floor"
+"""How the names of weights end that earlier versions kept, and nothing reads now."""
 
 log = logging.getLogger(__name__)
 
@@ -122,6 +124,8 @@ def _unpacked(record: dict[str, Any], path: Path) -> dict[str, Tensor]:
 def read_content(path: Path, resumable: bool) -> dict[str, Any]:
     """Return a checkpoint as it lies in its file, of which everything is as `format.checkpoint` says.
 
+    What earlier versions kept and nothing reads now is left out.
+
     Args:
         path: the file.
         resumable: whether it must have what training goes on from.
@@ -131,6 +135,9 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
     """
     content = _load(path)
     require_ours(content, path, resumable)
+    for weights in (content["state_dict"], content[KEY].get("packed", {}).get("rows", {})):
+        for name in [name for name in weights if name.endswith(OUTLIVED)]:
+            del weights[name]
     return content
 
 

@@ -13,7 +13,7 @@ from nerf_lightning.nerf.pruning.reach import reached_entries
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 
 LARGEST_FLOAT16 = 65504.0
-DENSITIES, SWITCHES = ("density", "floor"), ("possible", "cells", "blocks")
+SWITCHES = ("possible", "cells", "blocks")
 """Of an occupancy grid."""
 
 
@@ -49,7 +49,7 @@ def packed_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[s
         rows[f"model.{name}.table"] = pack_rows(encoder.table, tables, starts, reached.get(name))
     for name, grid in grids.items() if drop_empty else ():
         kept = grid.cells.flatten().bool()
-        rows |= {f"model.{name}.{each}": pack_rows(getattr(grid, each), "float32", kept=kept) for each in DENSITIES}
+        rows[f"model.{name}.density"] = pack_rows(grid.density, "float32", kept=kept)
         switches |= {f"model.{name}.{each}": pack_switches(getattr(grid, each)) for each in SWITCHES}
     return {"rows": rows, "switches": switches}
 

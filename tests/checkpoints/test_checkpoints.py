@@ -9,6 +9,7 @@ from support.planted import write_checkpoint
 from support.running import refused
 from support.scenes import ball_scene
 
+from nerf_lightning.checkpoints.packing import pack_rows
 from nerf_lightning.checkpoints.reading import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.errors import InputError
@@ -54,6 +55,16 @@ def keep_two(folder, bad_steps=(0, 0)):
         state = {"state_dict": {"model.weight": torch.full((1000,), float(step))}, "global_step": step}
         torch.save(state | {"nerf_lightning": record | {"bad_steps": [in_row, in_row]}}, folder / f"{name}.ckpt")
     return folder / "last.ckpt"
+
+
+def test_what_earlier_versions_kept_of_an_occupancy_grid_is_left_out(tmp_path):
+    grid, path = "model.levels.fine.sampler.grid", tmp_path / "last.ckpt"
+    record = make_record(ball_scene(), config="", choices={}) | {"precision": "32-true", "tile_points": None}
+    packed = {"rows": {f"{grid}.floor": pack_rows(torch.ones(2, 4, 4, 4), "float32")}, "switches": {}}
+    state = {f"{grid}.{name}": torch.ones(1, 4, 4, 4) for name in ("density", "floor")}
+    for more in ({}, {"packed": packed}):
+        torch.save({"state_dict": state, "global_step": 0, "nerf_lightning": record | more}, path)
+        assert list(read_checkpoint(path).weights) == ["levels.fine.sampler.grid.density"]
 
 
 def change_a_weight(path):

@@ -26,5 +26,4 @@ def a_level(opaque_below=0.0, width=32, features=4, products="float32", **settin
     level.fit_to(ball_scene(num_views=12))
     field.multiply_in(products)
     sampler.grid.occupy(torch.rand(sampler.grid.cells.shape) < 0.05)
-    sampler.grid.floor.zero_()
     return level

@@ -18,6 +18,7 @@ from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.base import PackedSampler, Sampler
+from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering, Rendering
 
@@ -25,7 +26,7 @@ from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering, R
 MOST_SAMPLES = 1 << 12
 # In rendering, samples less opaque than this keep their density and lose their colour.
 LEAST_ALPHA = 1e-3
-# Samples that a ray takes in one round of rendering; more where few rays are left.
+# Samples of a ray that are asked about in one round; more where few rays are left.
 ROUND_SAMPLES, MOST_ROUND_SAMPLES = 6, 64
 # Tiles of a step may be taken by threads beside each other.
 COUNTING = Lock()
@@ -163,9 +164,30 @@ class PackedLevel(Level):
         if self.sampler.capacity_on(rays.near.device) is not None or self.sampler.opaque_below == 0:
             return samples, None
         with torch.no_grad():
-            density, features = self.field.density(packed_points(rays, samples, random, self.field.sees_cones))
-            kept = first_of_each_ray(samples, num_visible(density.float(), samples, self.sampler.opaque_below))
+            points = packed_points(rays, samples, random, self.field.sees_cones)
+            counts, features = self._until_opaque(points, samples)
+            kept = first_of_each_ray(samples, counts)
             return samples.at(*kept), None if features is None else features.index_select(0, kept[0])
+
+    def _until_opaque(self, points: Points, samples: PackedSamples) -> tuple[Tensor, Tensor | None]:
+        """Return how many samples of each ray are visible, and the features of all that were asked about.
+
+        Rays are asked round by round, so that most of what lies behind opaque samples never is.
+        """
+        density, features = torch.zeros_like(samples.starts), None
+        place, counts, asked = samples.place, samples.bounds.diff(), 0
+        while rays_left := int((counts > asked).sum()):
+            until = asked + _samples_in_round(counts.shape[0], rays_left)
+            goes_on = (counts > asked).index_select(0, samples.ray_index)
+            part = (goes_on & (place >= asked) & (place < until)).nonzero()[:, 0]
+            found, computed = self.field.density(points[part])
+            density[part] = found.float()
+            if computed is not None:
+                features = computed.new_empty(*place.shape, computed.shape[1]) if features is None else features
+                features[part] = computed
+            counts = num_visible(density, samples, self.sampler.opaque_below)
+            asked = until
+        return counts, features
 
     def _render(self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None) -> Rendering:
         walk = self.sampler.walk(rays)
@@ -179,9 +201,8 @@ class PackedLevel(Level):
         light = torch.ones_like(rays.near)  # what no sample has absorbed yet
         alive = torch.arange(rays.near.shape[0], device=rays.near.device)
         while alive.numel():
-            limit = min(MOST_ROUND_SAMPLES, ROUND_SAMPLES * rays.near.shape[0] // alive.numel())
             left = rays[alive]
-            samples, more = walk.take(alive, limit)
+            samples, more = walk.take(alive, _samples_in_round(rays.near.shape[0], alive.numel()))
             part: PackedRendering = composite_packed(self._colors(left, samples), samples, left, None)
             before = light[alive]
             rgb[alive] += before[:, None] * part.foreground
@@ -200,6 +221,10 @@ class PackedLevel(Level):
         seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
         rgb[seen] = self.field(points[seen], features[seen]).rgb
         return FieldOutput(density=density, rgb=rgb)
+
+
+def _samples_in_round(rays: int, rays_left: int) -> int:
+    return min(MOST_ROUND_SAMPLES, ROUND_SAMPLES * rays // rays_left)
 
 
 def _in_front_of(

@@ -14,7 +14,7 @@ from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells
 from nerf_lightning.nerf.kernels.march.march import march
-from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
+from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, Walk
@@ -184,7 +184,7 @@ class OccupancySampler(PackedSampler):
 
     def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
-        kept = (floor_of_cells(positions, self.grid.occupied()) >= 0).nonzero()[:, 0]
+        kept = in_occupied(positions, self.grid.occupied()).nonzero()[:, 0]
         reached = torch.zeros_like(positions[:, 0])
         if kept.numel():
             reached[kept] = density(positions[kept]).float()
@@ -259,7 +259,6 @@ class OccupancySampler(PackedSampler):
         within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
         for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
             grid.learn(cells, density(grid.positions(cells, part)).float(), self.decay)
-        grid.look_around()
         if step >= self.prune_after:
             mean = grid.density.sum() / grid.possible.sum()
             shortest = (grid.aabb[1] - grid.aabb[0]).norm().double() / self.num_steps

@@ -8,12 +8,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over, least_around
-
-# The floor of a cell's density follows what is found down at once and at most doubles on the way up: only where one
-# random point after the other lay in dense matter is it high. Densities differ by so many orders of magnitude that a
-# mean of any kind would be the largest of them.
-RISE = 2.0
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over
 
 
 class OccupancyGrid(nn.Module):
@@ -25,10 +20,6 @@ class OccupancyGrid(nn.Module):
     """Near and far of the scene."""
     density: Tensor
     """A decaying maximum of what was found in each cell."""
-    floor: Tensor
-    """About the smallest density in each cell."""
-    floor_around: Tensor
-    """The smallest floor of each cell and its neighbours."""
     possible: Tensor
     """Which cells may ever hold something."""
     cells: Tensor
@@ -50,8 +41,6 @@ class OccupancyGrid(nn.Module):
         blocks = (num_cascades, *(resolution // BLOCK,) * 3)
         device = self.aabb.device
         self.register_buffer("density", torch.zeros(side, device=device))
-        self.register_buffer("floor", torch.zeros(side, device=device))
-        self.register_buffer("floor_around", torch.zeros(side, device=device), persistent=False)
         self.register_buffer("possible", torch.ones(side, dtype=torch.bool, device=device))
         self.register_buffer("cells", torch.ones(side, dtype=torch.uint8, device=device))
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
@@ -74,29 +63,17 @@ class OccupancyGrid(nn.Module):
         leaps = self.leaps  # threads may ask at once: each takes what it sees
         if leaps is None:
             leaps = self.leaps = leaps_over(self.blocks)
-        return OccupancyCells(self.aabb, self.cells, leaps, self.floor_around)
+        return OccupancyCells(self.aabb, self.cells, leaps)
 
     def reset(self) -> None:
         """Forget what was learnt: every possible cell is occupied."""
         self.density.zero_()
-        self.floor.zero_()
-        self.floor_around.zero_()
         self.occupy(self.possible)
 
     def learn(self, number: Int[Tensor, "cells"], found: Float[Tensor, "cells"], decay: float) -> None:
         """Take note of the densities that were found in some cells; older ones decay."""
-        density, floor = self.density.view(-1), self.floor.view(-1)
+        density = self.density.view(-1)
         density[number] = torch.maximum(decay * density[number], found)
-        faint = 1.0 / (self.aabb[1] - self.aabb[0]).norm()  # would dim a ray across the box by e
-        floor[number] = torch.minimum(found, RISE * floor[number] + faint)
-
-    def look_around(self) -> None:
-        """Compare the floor of each cell with its neighbours', after all have learnt.
-
-        A ray that clips the empty corner of a cell whose other points are dense must not end there: only matter with
-        matter around it ends a march.
-        """
-        self.floor_around.copy_(least_around(self.floor))  # in place: recorded steps read it where it is
 
     def occupy(self, occupied: Tensor) -> None:
         """Say which cells rays may not pass over."""
@@ -107,7 +84,6 @@ class OccupancyGrid(nn.Module):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self.leaps = None
-        self.look_around()
 
     def positions(self, number: Int[Tensor, "cells"], within: Float[Tensor, "#cells 3"]) -> Float[Tensor, "cells 3"]:
         """Return points in cells; `within` is where in each, from 0 to 1 along its sides."""

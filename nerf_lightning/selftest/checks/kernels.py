@@ -171,7 +171,7 @@ def _march(device: torch.device, capacity: int | None) -> float:
     enter, leave = distances_in_box(rays, 2.0 * box)
     state = March(enter, leave, torch.rand(RAYS, generator=random), whole)
     cells = (torch.rand(2, 16, 16, 16, generator=random) < 0.3).to(torch.uint8)
-    grid = OccupancyCells(box, cells, leaps_over(blocks_of(cells)), 2.0 * torch.rand(cells.shape, generator=random))
+    grid = OccupancyCells(box, cells, leaps_over(blocks_of(cells)))
     lattice = torch.arange(1.9, 6.2, 0.02)
     expected, _ = march_torch(rays, state, lattice, grid, None, None)
     found, _ = march(rays.to(device), state.to(device), lattice.to(device), grid.to(device), capacity=capacity)

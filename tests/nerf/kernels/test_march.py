@@ -3,24 +3,16 @@
 import pytest
 import torch
 from support.scenes import some_rays
-from torch.nn import functional
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.kernels.march.grid import (
-    FARTHEST,
-    March,
-    OccupancyCells,
-    blocks_of,
-    leaps_over,
-    least_around,
-)
+from nerf_lightning.nerf.kernels.march.grid import FARTHEST, March, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 
 AABB = torch.tensor([[-1.0, -1.2, -0.9], [1.0, 1.2, 0.9]])
 
 
-def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0, density=0.0):
+def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0):
     rays = some_rays(count)
     cells = (torch.rand(cascades, resolution, resolution, resolution) < share).to(torch.uint8)
     enter, leave = distances_in_box(rays, AABB * 2.0 ** (cascades - 1))
@@ -28,11 +20,11 @@ def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0, densit
     edges = [1.9]
     while edges[-1] < 6.1:
         edges.append(edges[-1] + max(0.02, growth * edges[-1]))
-    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), grid_of(cells, density)
+    return rays, state, torch.tensor([*edges, 2 * edges[-1] - edges[-2]]), grid_of(cells)
 
 
-def grid_of(cells, density):
-    return OccupancyCells(AABB, cells, leaps_over(blocks_of(cells)), density * torch.rand(cells.shape))
+def grid_of(cells):
+    return OccupancyCells(AABB, cells, leaps_over(blocks_of(cells)))
 
 
 @pytest.mark.parametrize("limit", [None, 1, 5])
@@ -70,13 +62,6 @@ def test_leaps_are_distances_to_the_next_occupied_block():
     assert torch.equal(nested, 1 - blocks.expand(2, -1, -1, -1))
 
 
-def test_the_least_around_is_the_smallest_of_27_cells_and_nothing_at_the_faces():
-    floor = torch.rand(2, 8, 12, 4)
-    padded = functional.pad(floor, (1, 1) * 3)
-    expected = -functional.max_pool3d(-padded, 3, stride=1)
-    assert torch.equal(least_around(floor), expected)
-
-
 def _of_rays(samples, chosen):
     counts = samples.bounds.diff() * chosen
     return chosen[samples.ray_index].nonzero()[:, 0], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
@@ -102,25 +87,6 @@ def test_a_full_grid_gives_every_interval_whose_middle_is_in_the_box():
     chord = (state.leave - state.enter).clamp(min=0)
     assert float((lengths - chord).abs().max()) <= 0.021  # an interval at either end, half of it each
     assert bool((samples.deltas > 0).all())
-
-
-def test_a_march_ends_behind_what_is_opaque_by_a_wide_margin():
-    rays, state, lattice, grid = a_march(count=200, share=1.0, density=500.0)
-    fast, _ = march(rays, state, lattice, grid)
-    slow, _ = march_torch(rays, state, lattice, grid, None, None)
-    assert torch.equal(fast.bounds, slow.bounds)
-    everything, _ = march(rays, state, lattice, OccupancyCells(AABB, grid.cells, grid.leaps, 0 * grid.floor))
-    assert fast.starts.numel() < 0.5 * everything.starts.numel()
-    optical = torch.zeros(200).index_add(0, fast.ray_index, density_at(rays, fast, grid) * fast.deltas)
-    cut = fast.bounds.diff() < everything.bounds.diff()
-    assert bool((optical[cut] > 12).all())
-
-
-def density_at(rays, samples, grid):
-    from nerf_lightning.nerf.kernels.march.reference import floor_of_cells
-
-    along = samples.midpoints[:, None] * rays.directions[samples.ray_index]
-    return floor_of_cells(rays.origins[samples.ray_index] + along, grid)
 
 
 def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():

@@ -6,12 +6,14 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field
 from support.steps import rays_of
 
+from nerf_lightning.nerf.kernels.packed.integrate import num_visible
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.rendering.packed import first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -82,6 +84,27 @@ def test_samples_end_where_the_ray_is_opaque():
     optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
     longest = 80.0 * level.sampler.step_size
     assert 1.0 < float(optical.max()) <= -torch.tensor(1e-3).log() + longest + 1e-3
+
+
+@pytest.mark.parametrize("opaque_below", [0.5, 1e-6])
+def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypatch):
+    level, rays, random, asked = a_level(opaque_below=opaque_below), some_rays(300), batch_random(1, 300), []
+    density_of = level.field.density
+    monkeypatch.setattr(level.field, "density", lambda points: asked.append(points) or density_of(points))
+    found, _ = level.visible_samples(rays, random)
+    samples = level.sampler(rays, random)
+    with torch.no_grad():
+        density, _ = density_of(packed_points(rays, samples, random))
+    kept, bounds = first_of_each_ray(samples, num_visible(density, samples, opaque_below))
+    for name, value in vars(samples.at(kept, bounds)).items():
+        assert torch.equal(getattr(found, name), value), name
+    number = sum(points.positions.shape[0] for points in asked)
+    assert len(asked) > 3
+    assert kept.numel() <= number
+    if opaque_below == 0.5:
+        assert number < 0.8 * samples.starts.numel(), "what lies behind opaque samples is not asked about"
+    else:
+        assert number == samples.starts.numel(), "no sample is asked about twice"
 
 
 def test_tiles_change_nothing_but_rounding():

@@ -6,7 +6,6 @@ import torch
 from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
@@ -79,31 +78,6 @@ def test_the_update_is_a_function_of_the_step():
     assert not torch.equal(grids[0], learn(a_sampler(), ball_density(), 336).grid.density)
 
 
-@pytest.mark.parametrize("density", [500.0, 1e12])
-def test_rays_go_on_until_there_is_matter_before_them(density):
-    """The fault: one dense point made a cell solid that a surface cuts, and rays through its empty part ended there.
-
-    The background showed through, against which surfaces grew until the scene was a lump.
-    """
-    sampler, rays, ended = a_sampler(), some_rays(2000), 0
-
-    def matter(positions):
-        slit = (positions[..., 0] - 0.06).abs() < 0.01  # a sixth of a cell
-        return ball_density(density=density)(positions) * ~slit
-
-    for step in range(16, 1600, 16):
-        sampler.update(matter, step, fold(0, 0, step))
-        found = sampler(rays, batch_random(step, 2000))
-        state, lattice, cells = sampler.march(rays, batch_random(step, 2000))
-        everything, _ = march(rays, state, lattice, replace(cells, floor=0 * cells.floor))
-        cut = found.bounds.diff() < everything.bounds.diff()
-        positions = packed_points(rays, found, None).positions
-        met = torch.zeros(2000).index_add(0, found.ray_index, matter(positions) * found.deltas)
-        assert bool((met[cut] > 12.0).all())
-        ended += int(cut.sum())
-    assert ended > 10_000, "solid matter ends a march"
-
-
 def test_jitter_is_fresh_for_every_ray_and_step_and_absent_at_evaluation():
     sampler, rays = a_sampler(), some_rays(50)
     first = sampler.start(rays, batch_random(fold(0, 0, 0), 50)).jitter
@@ -154,7 +128,7 @@ def contracted_ball():
 
 def sizes(sampler):
     return {
-        name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "floor", "possible", "cells", "blocks")
+        name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "possible", "cells", "blocks")
     }
 
 
@@ -170,7 +144,7 @@ def sizes(sampler):
 def test_contracted_space_wants_more_and_coarser_boxes_unless_told(settings, cascades, side, cone_angle):
     sampler = a_sampler(contracted_ball(), **settings)
     grid = (cascades, side, side, side)
-    assert sizes(sampler) == dict.fromkeys(("density", "floor", "possible", "cells"), grid) | {
+    assert sizes(sampler) == dict.fromkeys(("density", "possible", "cells"), grid) | {
         "blocks": (cascades, side // 4, side // 4, side // 4)
     }
     assert sampler.cone_angle == cone_angle

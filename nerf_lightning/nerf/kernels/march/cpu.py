@@ -9,11 +9,11 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, OPAQUE, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
-COMPILED_WITH = "06fa24fd"
+COMPILED_WITH = "f300b13d"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -29,7 +29,7 @@ def march(
     ray = (*in_box(rays, grid), state.enter, state.leave, state.jitter)
     numbers = torch.empty(count, most, dtype=torch.int16)
     bounds, following = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count, dtype=torch.int64)
-    arrays = (*ray, lattice, grid.cells, grid.leaps, grid.floor, state.next, numbers, bounds, following)
+    arrays = (*ray, lattice, grid.cells, grid.leaps, state.next, numbers, bounds, following)
     over_rows(_find, count, *(x.contiguous().numpy() for x in arrays))
     torch.cumsum(bounds, 0, out=bounds)
     total = int(bounds[-1])
@@ -49,7 +49,7 @@ def trial() -> None:
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
-    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)), cells.float())
+    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
 
 
@@ -131,7 +131,7 @@ def _skip(lattice, jitter, k, t, ahead):
 @njit(fastmath=True)
 @no_type_check
 def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k):
-    """Return the first interval from k on that is occupied, and its cell; the lattice's end where there is none."""
+    """Return the first interval from k on that is occupied; the lattice's end where there is none."""
     end, resolution = lattice.shape[0] - 2, np.int32(cells.shape[1])
     last = resolution - np.int32(1)
     while k < end:
@@ -147,22 +147,21 @@ def next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, 
         x, y, z = (x + size) * scale, (y + size) * scale, (z + size) * scale
         a, b, c = min(np.int32(x), last), min(np.int32(y), last), min(np.int32(z), last)
         if cells[cascade, a, b, c]:
-            return k, cascade, a, b, c
+            return k
         leap = leaps[cascade, a // BLOCK, b // BLOCK, c // BLOCK]
         k = _skip(lattice, jitter, k, t, _end_of_empty(x, y, z, dx, dy, dz, leap, scale))
-    return end, 0, np.int32(0), np.int32(0), np.int32(0)
+    return end
 
 
 @njit(fastmath=True)
 @no_type_check
-def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, floor, k, numbers):
+def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k, numbers):
     # Writes the numbers of the occupied intervals from k on; returns how many, and where to go on.
-    end, found, optical = lattice.shape[0] - 2, 0, np.float32(0.0)
+    end, found = lattice.shape[0] - 2, 0
     while found < numbers.shape[0]:
-        k, cascade, a, b, c = next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k)
-        if k >= end or optical > OPAQUE:
+        k = next_occupied(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, k)
+        if k >= end:
             return found, end
-        optical += floor[cascade, a, b, c] * (edge(lattice, jitter, k + 1) - edge(lattice, jitter, k))
         numbers[found] = k
         found += 1
         k += 1
@@ -171,16 +170,14 @@ def _walk(ox, oy, oz, dx, dy, dz, leave, lattice, jitter, cells, leaps, floor, k
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _find(
-    first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, leaps, floor, first, numbers, bounds, following
-):
+def _find(first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, leaps, first, numbers, bounds, following):
     for r in range(first_ray, last_ray):
         found, k = 0, lattice.shape[0] - 2
         if enter[r] < leave[r]:
             k = first_from(lattice, jitters[r], first[r], enter[r])
             found, k = _walk(
                 *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]),
-                *(leave[r], lattice, jitters[r], cells, leaps, floor, k, numbers[r]),
+                *(leave[r], lattice, jitters[r], cells, leaps, k, numbers[r]),
             )
         bounds[r + 1] = found
         following[r] = k

@@ -14,9 +14,6 @@ BLOCK = 4
 FARTHEST = 8
 """So many blocks on are skipped at once, at most."""
 
-OPAQUE = 12.0
-"""Optical depth, by the floor of the cells' densities, behind which nothing is kept."""
-
 
 @dataclass(frozen=True)
 class OccupancyCells(TensorStruct):
@@ -28,9 +25,6 @@ class OccupancyCells(TensorStruct):
     """1 where occupied."""
     leaps: UInt8[Tensor, "cascades a b c"]
     """What `leaps_over` says of each block of cells: how much around it is empty."""
-    floor: Float[Tensor, "cascades x y z"]
-    """About the smallest density in each cell and around it: a march ends where so much matter lies before it that
-    nothing behind can be seen, even by this cautious guess."""
 
 
 def blocks_of(cells: UInt8[Tensor, "cascades x y z"]) -> UInt8[Tensor, "cascades a b c"]:
@@ -50,16 +44,6 @@ def leaps_over(blocks: UInt8[Tensor, "cascades a b c"]) -> UInt8[Tensor, "cascad
         leaps += 1.0 - reached
         reached = functional.max_pool3d(reached, 3, stride=1, padding=1)
     return leaps.to(torch.uint8)
-
-
-def least_around(floor: Float[Tensor, "cascades x y z"]) -> Float[Tensor, "cascades x y z"]:
-    """Return the smallest value of each cell and its 26 neighbours; 0 at the faces of a box, where there are fewer."""
-    for axis in range(1, floor.ndim):
-        inner = floor.shape[axis] - 2
-        before, here, after = (floor.narrow(axis, first, inner) for first in range(3))
-        floor = torch.zeros_like(floor)
-        floor.narrow(axis, 1, inner).copy_(torch.minimum(torch.minimum(before, here), after))
-    return floor
 
 
 @dataclass(frozen=True)

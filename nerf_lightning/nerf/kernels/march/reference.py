@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
-from nerf_lightning.nerf.kernels.march.grid import OPAQUE, March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
 
@@ -32,7 +32,7 @@ def march_torch(
 def occupied_intervals(
     rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells
 ) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
-    """Tell which intervals of each ray may hold something that can be seen, and return the fenceposts of all.
+    """Tell which intervals of each ray may hold something, and return the fenceposts of all.
 
     The shapes are the same whatever the grid holds.
     """
@@ -40,14 +40,11 @@ def occupied_intervals(
     midpoints = 0.5 * (edges[:, :-1] + edges[:, 1:])
     number = torch.arange(midpoints.shape[1], device=edges.device)
     keep = (midpoints >= state.enter[:, None]) & (midpoints <= state.leave[:, None]) & (number >= state.next[:, None])
-    floor = floor_of_cells(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid)
-    keep &= floor >= 0
-    optical = torch.where(keep, floor * (edges[:, 1:] - edges[:, :-1]), 0.0)
-    return keep & (optical.cumsum(dim=-1) - optical <= OPAQUE), edges
+    return keep & in_occupied(rays.origins[:, None] + midpoints[..., None] * rays.directions[:, None], grid), edges
 
 
-def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Float[Tensor, "*points"]:
-    """Look positions up in the smallest cascade that holds them; -1 in empty cells and outside of all."""
+def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> Bool[Tensor, "*points"]:
+    """Tell which positions lie in an occupied cell of the smallest cascade that holds them."""
     cascades, resolution = grid.cells.shape[:2]
     center, half = center_and_half(grid.aabb)
     scaled = (positions - center) / half
@@ -58,8 +55,7 @@ def floor_of_cells(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) 
     unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
     cell = (unit * resolution).long().clamp(0, resolution - 1)
     place = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
-    occupied = (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
-    return torch.where(occupied, grid.floor[place], -1.0)
+    return (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
 
 
 def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:

@@ -34,7 +34,7 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "95a93cc5"
+COMPILED_WITH = "f5327696"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -88,7 +88,7 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, Oc
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
-    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)), cells.float())
+    grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
     state, lattice = March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
     for features in (2, 4):
         layout = hash_grid_layout(16 // features, 4, 2, 8)
@@ -123,10 +123,9 @@ def network(weights: list[Tensor], dtype: torch.dtype, transposed: bool = False)
 def next_sample(march, r, k):
     """Return the first interval of a ray from k on that may hold something; the lattice's end if there is none."""
     o, d, _, leave, jitters, lattice, cells, leaps = march
-    found, _, _, _, _ = next_occupied(
+    return next_occupied(
         *(o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], leave[r], lattice, jitters[r], cells, leaps, k)
     )
-    return found
 
 
 @njit
