@@ -180,7 +180,7 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.rendering.blending.background_colors": {"background": "random"},
     "nerf.rendering.blending.photograph": {"background": "white"},
     "nerf.rendering.packed.composite_packed": {"output": Known("packed output"), "samples": Known("packed samples")},
-    "nerf.rendering.sample_points.packed_points": {"samples": Known("packed samples")},
+    "nerf.rendering.sample_points.packed_points": {"samples": Known("packed samples"), "first": 0},
     "nerf.rendering.packed.first_of_each_ray": {"samples": Known("packed samples")},
     "nerf.samplers.base.Sampler.update": {"density": density_there},
     "nerf.samplers.base.Sampler.reached_density": {"density": density_there},

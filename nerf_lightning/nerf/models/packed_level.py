@@ -18,7 +18,6 @@ from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.base import PackedSampler, Sampler
-from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering, Rendering
 
@@ -164,12 +163,13 @@ class PackedLevel(Level):
         if self.sampler.capacity_on(rays.near.device) is not None or self.sampler.opaque_below == 0:
             return samples, None
         with torch.no_grad():
-            points = packed_points(rays, samples, random, self.field.sees_cones)
-            counts, features = self._until_opaque(points, samples)
+            counts, features = self._until_opaque(rays, samples, random)
             kept = first_of_each_ray(samples, counts)
             return samples.at(*kept), None if features is None else features.index_select(0, kept[0])
 
-    def _until_opaque(self, points: Points, samples: PackedSamples) -> tuple[Tensor, Tensor | None]:
+    def _until_opaque(
+        self, rays: RayBundle, samples: PackedSamples, random: RayRandom | None
+    ) -> tuple[Tensor, Tensor | None]:
         """Return how many samples of each ray are visible, and the features of all that were asked about.
 
         Rays are asked round by round, so that most of what lies behind opaque samples never is.
@@ -178,13 +178,15 @@ class PackedLevel(Level):
         place, counts, asked = samples.place, samples.bounds.diff(), 0
         while rays_left := int((counts > asked).sum()):
             until = asked + _samples_in_round(counts.shape[0], rays_left)
-            goes_on = (counts > asked).index_select(0, samples.ray_index)
-            part = (goes_on & (place >= asked) & (place < until)).nonzero()[:, 0]
-            found, computed = self.field.density(points[part])
-            density[part] = found.float()
+            in_round = (counts.clamp(max=until) - asked).clamp(min=0)
+            until_there = counts.clamp(max=until).index_select(0, samples.ray_index)
+            number = ((place >= asked) & (place < until_there)).nonzero()[:, 0]
+            part = samples.at(number, torch.cat([counts.new_zeros(1), in_round.cumsum(0)]))
+            found, computed = self.field.density(packed_points(rays, part, random, self.field.sees_cones, first=asked))
+            density[number] = found.float()
             if computed is not None:
                 features = computed.new_empty(*place.shape, computed.shape[1]) if features is None else features
-                features[part] = computed
+                features[number] = computed
             counts = num_visible(density, samples, self.sampler.opaque_below)
             asked = until
         return counts, features

@@ -30,8 +30,13 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None,
     )
 
 
-def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | None, cones: bool = False) -> Points:
-    """Return the midpoints of packed samples: one axis. The arguments are those of `points_along`."""
+def packed_points(
+    rays: RayBundle, samples: PackedSamples, random: RayRandom | None, cones: bool = False, first: int = 0
+) -> Points:
+    """Return the midpoints of packed samples: one axis.
+
+    The arguments are those of `points_along`; `first` is the number that each ray's first sample has there.
+    """
     ray = samples.ray_index
 
     def of_ray(each: Tensor) -> Tensor:
@@ -42,7 +47,7 @@ def packed_points(rays: RayBundle, samples: PackedSamples, random: RayRandom | N
         positions=of_ray(rays.origins) + along,
         directions=of_ray(rays.view_directions),
         photograph=None if rays.photograph is None else of_ray(rays.photograph),
-        random=None if random is None else PointRandom(of_ray(random.key), of_ray(random.slots), samples.place),
+        random=None if random is None else PointRandom(of_ray(random.key), of_ray(random.slots), first + samples.place),
         covariance=_covariance(rays, samples, ray) if cones else None,
     )
 

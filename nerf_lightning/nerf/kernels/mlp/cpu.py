@@ -37,7 +37,9 @@ ROWS = 128
 """So many go through all layers together."""
 KINDS: dict[torch.dtype, Any] = {torch.float32: np.float32(0), torch.bfloat16: np.int32(0)}
 """What tells the kernels of which numbers words are made."""
-WIDE = not numba.config.CPU_NAME and bool(llvm.get_host_cpu_features().get("avx512f"))  # type: ignore[attr-defined]
+CPU = {} if numba.config.CPU_NAME else llvm.get_host_cpu_features()  # type: ignore[attr-defined]
+"""What LLVM knows of this CPU; nothing where numba is told to compile for another."""
+WIDE = bool(CPU.get("avx512f"))
 """Whether there are 32 registers of a whole vector each."""
 
 
@@ -51,9 +53,7 @@ def dtypes() -> list[torch.dtype]:
 
     Where it does not, it would end the program.
     """
-    if numba.config.CPU_NAME or not llvm.get_host_cpu_features().get("avx512bf16"):  # type: ignore[attr-defined]
-        return [torch.float32]
-    return [torch.float32, torch.bfloat16] if cpu_multiplies_bfloat16() else [torch.float32]
+    return [torch.float32, torch.bfloat16] if CPU.get("avx512bf16") and cpu_multiplies_bfloat16() else [torch.float32]
 
 
 def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, Tensor]:
