@@ -32,7 +32,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-slow test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -57,8 +57,11 @@ test: setup ## Run the tests, but for the exhaustive ones: five minutes on two q
 test-all: setup ## Run every test, the exhaustive ones included
 	@$(PYTEST) -m ""
 
+test-slow: setup ## Run the tests that take minutes: kernels compiled for GPUs that are not here
+	@$(PYTEST) -m minutes
+
 test-fast: setup ## Run the tests that take less than a few seconds each
-	@$(PYTEST) -m "not slow and not exhaustive"
+	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
 
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
 	@$(MAKE) --no-print-directory xla \

@@ -26,7 +26,7 @@ def check_perceptron(device, counts):
     twin.trial(device)
     generator = torch.Generator().manual_seed(7)
     for sizes in SIZES:
-        assert twin.takes(sizes[:-1])
+        assert twin.takes(sizes, torch.device(device))
         weights = [_weight(outer, inner, generator).to(device) for inner, outer in pairwise(sizes)]
         for count in counts:
             points = torch.randint(-3, 4, (count, sizes[0]), generator=generator).float().to(device)
@@ -41,5 +41,5 @@ def check_perceptron(device, counts):
                 assert torch.equal(found, leaf.grad), (sizes, count, found.shape)
             assert torch.equal(twin.forward(points, weights, keep=False)[0], out)
             assert twin.backward(grad, weights, kept, wants_points=False)[0] is None
-    assert not twin.takes([32])
-    assert not twin.takes([32, 256])
+    assert not twin.takes((32, 3), torch.device(device))
+    assert not twin.takes((32, 256, 3), torch.device(device))

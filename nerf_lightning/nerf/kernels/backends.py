@@ -15,6 +15,8 @@ from types import ModuleType
 import torch
 
 LONG_SECONDS = 2.0
+# What triton says where there is no C compiler, and where that finds no headers.
+NO_COMPILER = ("C compiler", "CalledProcessError")
 
 log = logging.getLogger(__name__)
 
@@ -154,10 +156,15 @@ def _require_own_cache(folder: str) -> None:
 
 @functools.cache
 def _warn_once(library: str, reason: str) -> None:
+    cure = f"Reinstall it (pip install --force-reinstall {library}), or read its list of supported machines."
+    if library == "triton" and any(word in reason for word in NO_COMPILER):
+        cure = (
+            "It builds a small launcher with a C compiler, which needs gcc or clang and the headers of Python (Debian, "
+            "Ubuntu: apt install gcc python3-dev)."
+        )
     log.warning(
-        "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. "
-        "Reinstall it (pip install --force-reinstall %s), or read its list of supported machines.",
+        "%s cannot be used here (%s): the torch twins of its kernels run instead, many times slower. %s",
         library,
         reason,
-        library,
+        cure,
     )

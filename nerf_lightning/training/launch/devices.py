@@ -113,12 +113,15 @@ def choose_precision(asked: Precision, device_type: DeviceType) -> tuple[Chosen,
             "device here is none. Use trainer.precision=32-true, or auto."
         )
     if asked == "bf16-mixed" and not has_native_bfloat16(device_type):
-        log.warning("trainer.precision=%s: this device has no native bfloat16 and emulates it, slowly.", asked)
+        instead = "float32 is used instead" if device_type == "cuda" else "it is emulated, slowly"
+        log.warning("trainer.precision=%s: this device has no native bfloat16, so %s.", asked, instead)
     return asked, "as asked"
 
 
 def suited(precision: Chosen, reason: str, device_type: DeviceType, model: Model) -> tuple[Chosen, str]:
-    """Return what `choose_precision` has chosen, or float32 where this model is slower in bfloat16; and why."""
+    """Return what `choose_precision` has chosen, or float32 where that suits the GPU or the model better; and why."""
+    if precision == "bf16-mixed" and device_type == "cuda" and not has_native_bfloat16(device_type):
+        return "32-true", "bfloat16 products need an NVIDIA GPU from Ampere on, or an AMD GPU"
     wide = any(isinstance(part, Linear) for part in model.modules())
     if reason == NATIVE and device_type == "cpu" and wide and not cpu_gains_by_bfloat16():
         return "32-true", "bfloat16 is native, but slower for layers as wide as this model's"

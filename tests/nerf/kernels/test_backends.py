@@ -74,6 +74,20 @@ def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, c
     assert backends.cuda_twin("hash_grid.cuda", torch.device("cpu")) is None
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "Failed to find C compiler. Please specify via CC environment variable",
+        "CalledProcessError: Command '['/usr/bin/gcc', 'cuda_utils.c']' returned non-zero exit status 1",
+    ],
+)
+def test_without_a_c_compiler_or_its_headers_the_message_names_them(words, anew, monkeypatch, caplog):
+    monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial(words))
+    assert backends.cuda_twin("hash_grid.cuda", torch.device("cuda")) is None
+    assert "apt install gcc python3-dev" in caplog.text
+    assert "Reinstall" not in caplog.text
+
+
 def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(anew, monkeypatch, caplog):
     found, asked = module_whose_trial(), []
 

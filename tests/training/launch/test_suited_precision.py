@@ -59,3 +59,13 @@ def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
     assert products.cpu_gains_by_bfloat16.__wrapped__()
+
+
+@pytest.mark.parametrize(("native", "used"), [(False, "32-true"), (True, "bf16-mixed")])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
+    asked = ("bf16-mixed", "as the run began") if begun else devices.choose_precision("bf16-mixed", "cuda")
+    assert devices.suited(*asked, "cuda", tiny_model())[0] == used
+    said = ["trainer.precision=bf16-mixed: this device has no native bfloat16, so float32 is used instead."]
+    assert caplog.messages == ([] if native or begun else said)

@@ -4,9 +4,11 @@ A framework writes and reads the activations of each layer; here only what the w
 of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 
+import functools
+import logging
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 import triton
@@ -14,17 +16,43 @@ import triton.language as tl
 from jaxtyping import BFloat16, Float
 from torch import Tensor
 from torch.nn import functional
+from triton.runtime.errors import OutOfResources
 
-BLOCK = 128
+log = logging.getLogger(__name__)
+
+BLOCK, BACKWARD_BLOCK = 128, 64
+FORWARD: dict[str, Any] = {"enable_fp_fusion": True}
+# A pipeline would keep the rows of several rounds in shared memory: 124 KiB for layers 32-64-64-3, where most GPUs have
+# 99. In one stage it is 16 to 32 KiB, and 64 for layers of 128. Of larger blocks and fewer warps most sums would not
+# fit into the registers.
+BACKWARD: dict[str, Any] = {"enable_fp_fusion": True, "num_stages": 1, "num_warps": 8}
 PROGRAMS = 256
 """So many sum up the gradients of the weights, each for itself: the order of sums, and so their bits, are fixed."""
 NARROWEST, WIDEST = 16, 128
 LAYERS = (2, 3)
 
 
-def takes(widths: Sequence[int]) -> bool:
-    """Tell whether the kernels take a perceptron whose layers have inputs of these widths."""
-    return len(widths) in LAYERS and max(widths) <= WIDEST
+@functools.cache
+def takes(sizes: tuple[int, ...], device: torch.device) -> bool:
+    """Tell whether the kernels run here for a perceptron of these widths, from inputs to outputs: it is tried once."""
+    if len(sizes) - 1 not in LAYERS or max(sizes) > WIDEST:
+        return False
+    try:
+        weights = [torch.zeros(outer, inner, device=device) for inner, outer in pairwise(sizes)]
+        out, kept = forward(torch.zeros(BLOCK, sizes[0], device=device), weights, keep=True)
+        backward(out, weights, kept, wants_points=True)
+    except OutOfResources as error:
+        log.warning(
+            "%s has %d bytes of %s and the fused kernel for layers of widths %s needs %d: torch computes these layers "
+            "instead, slower. trainer.precision=32-true or narrower layers avoid this.",
+            torch.cuda.get_device_name(device) if device.type == "cuda" else device,
+            error.limit,
+            error.name,
+            "-".join(map(str, sizes)),
+            error.required,
+        )
+        return False
+    return True
 
 
 def forward(
@@ -37,7 +65,8 @@ def forward(
     if rows:
         arrays = points.contiguous(), _packed(weights, widths), out, kept
         sizes = points.shape[1], out.shape[1], *widths, widths[-1]
-        _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *sizes[:6], len(weights), keep, BLOCK, _interpreted(out))
+        flags = len(weights), keep, BLOCK, _interpreted(out)
+        _forward[(triton.cdiv(rows, BLOCK),)](*arrays, rows, *sizes[:6], *flags, **FORWARD)
     return out, kept
 
 
@@ -48,12 +77,13 @@ def backward(
     """Return the gradients of the inputs and of the weights; `kept` is what `forward` returned."""
     widths, rows, inputs = _padded_widths(weights), grad.shape[0], weights[0].shape[1]
     of_points = torch.empty(rows if wants_points else 0, inputs, device=grad.device)
-    programs = max(1, min(PROGRAMS, triton.cdiv(rows, BLOCK)))
+    programs = max(1, min(PROGRAMS, triton.cdiv(rows, BACKWARD_BLOCK)))
     sums = of_points.new_zeros(programs, sum(a * b for a, b in pairwise(widths)))
     if rows:
         arrays = grad.contiguous(), _packed(weights, widths), kept, of_points, sums
         sizes = inputs, grad.shape[1], *widths, widths[-1]
-        _backward[(programs,)](*arrays, rows, *sizes[:6], len(weights), wants_points, BLOCK, _interpreted(sums))
+        flags = len(weights), wants_points, BACKWARD_BLOCK, _interpreted(sums)
+        _backward[(programs,)](*arrays, rows, *sizes[:6], *flags, **BACKWARD)
     total, grads, place = sums.sum(dim=0), [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         of_weight = total[place : place + inner * outer].view(outer, inner)

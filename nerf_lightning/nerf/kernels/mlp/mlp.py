@@ -45,7 +45,8 @@ def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> t
         return None
     if points.is_cuda:
         kernels = cuda_twin("mlp.cuda", points.device) if products == "bfloat16" else None
-        takes = kernels is not None and kernels.takes([weight.shape[1] for weight in weights])
+        sizes = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
+        takes = kernels is not None and kernels.takes(sizes, points.device)
         return (kernels, torch.float32) if kernels is not None and takes else None  # it rounds by itself
     if not points.is_cpu or not is_on("mlp.cpu"):
         return None
