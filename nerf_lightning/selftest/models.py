@@ -25,6 +25,7 @@ from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
+from nerf_lightning.nerf.types.rays import RayBundle
 
 CAPACITY = 1 << 15
 
@@ -32,7 +33,7 @@ CAPACITY = 1 << 15
 class StaticSampler(OccupancySampler):
     """An occupancy grid that packs samples into a fixed capacity on every device, as it does on GPUs."""
 
-    def capacity_on(self, device: torch.device) -> int | None:
+    def capacity_for(self, rays: RayBundle) -> int | None:
         """Return the capacity."""
         return self.capacity
 

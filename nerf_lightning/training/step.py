@@ -31,6 +31,7 @@ from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, ti
 from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
+from nerf_lightning.nerf.samplers.base import PackedSampler
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.renderings import Rendering
@@ -125,6 +126,9 @@ class TrainStep:
         self.guard = StepGuard()
         self._recorded: RecordedGradients | None = None
         model.keep_weights(loss.needs_weights)
+        for part in model.modules():
+            if isinstance(part, PackedSampler) and sample_budget is not None:
+                part.sample_budget = -(-sample_budget // ranks.world_size())
         if model.subpixels.side > 1 and loss.needs_weights:
             raise InputError(
                 f"model.subpixels={model.subpixels.side} compares the mean of several rays with a photograph's pixel, "

@@ -20,7 +20,7 @@ SETTING = "trainer.cuda_graph=true"
 @pytest.fixture(autouse=True)
 def as_on_a_gpu(monkeypatch):
     """Arrays of samples have a capacity, and torch does what numba would."""
-    monkeypatch.setattr(OccupancySampler, "capacity_on", lambda sampler, device: 8192)
+    monkeypatch.setattr(OccupancySampler, "capacity_for", lambda sampler, rays: 8192)
     with without(*KERNELS):
         yield
 
@@ -70,7 +70,7 @@ def test_a_new_attempt_is_recorded_anew_since_what_it_took_up_may_lie_elsewhere(
 
 
 def test_what_asks_the_host_cannot_be_recorded(monkeypatch):
-    monkeypatch.setattr(OccupancySampler, "capacity_on", lambda sampler, device: None)
+    monkeypatch.setattr(OccupancySampler, "capacity_for", lambda sampler, rays: None)
     with pytest.raises(AssertionError, match="asks the host"):
         trained([48], record=True)
 

@@ -114,7 +114,7 @@ class PackedLevel(Level):
         if whole is not None:
             return whole
         samples, features = self.visible_samples(rays, random)
-        capacity = self.sampler.capacity_on(rays.near.device)
+        capacity = self.sampler.capacity_for(rays)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         self._count(samples.found, rays, torch.zeros_like(samples.found) + dropped)
         output = self.field(packed_points(rays, samples, random, self.field.sees_cones), features)
@@ -160,7 +160,7 @@ class PackedLevel(Level):
         Without gradients. Where sizes may not be read on the host, all samples are kept.
         """
         samples = self.sampler(rays, random)
-        if self.sampler.capacity_on(rays.near.device) is not None or self.sampler.opaque_below == 0:
+        if self.sampler.capacity_for(rays) is not None or self.sampler.opaque_below == 0:
             return samples, None
         with torch.no_grad():
             counts, features = self._until_opaque(rays, samples, random)

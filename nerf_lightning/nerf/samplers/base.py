@@ -84,6 +84,8 @@ class PackedSampler(Sampler, ABC):
     """A ray's samples end where less light than this is left; 0 keeps them all."""
     update_every: int = 16
     """Training steps between two updates; meanwhile a level counts how many samples rays have."""
+    sample_budget: int | None = None
+    """Samples of a training step, about; None: as many as its rays have."""
 
     @property
     @abstractmethod
@@ -94,7 +96,7 @@ class PackedSampler(Sampler, ABC):
     def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
         """Return the intervals that may hold something; `random` is None outside of training."""
 
-    def capacity_on(self, device: torch.device) -> int | None:
+    def capacity_for(self, rays: RayBundle) -> int | None:
         """Return the size of the arrays of samples where no size may be read on the host; None elsewhere."""
         return None
 

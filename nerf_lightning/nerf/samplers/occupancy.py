@@ -25,6 +25,7 @@ from nerf_lightning.nerf.types.scene import Scene
 log = logging.getLogger(__name__)
 
 CELLS_AT_ONCE = 1 << 18
+CAPACITY = 1 << 20
 # Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
 CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
 # Devices on which a number may be read on the host between two kernels while rendering.
@@ -65,7 +66,8 @@ class OccupancySampler(PackedSampler):
         decay: of the average, per update.
         min_alpha: opacity of an interval that counts.
         opaque_below: a ray's samples end where less light than this is left; 0 keeps them all.
-        capacity: size of the arrays of samples on GPUs, where no size is read on the host.
+        capacity: size of the arrays of samples on GPUs, where no size is read on the host; what does not fit is dropped
+            and counted. None: twice data.sample_budget, or 2^20 where that is null.
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class OccupancySampler(PackedSampler):
         decay: float = 0.95,
         min_alpha: float = 0.001,
         opaque_below: float = 1e-3,
-        capacity: int = 1 << 20,
+        capacity: int | None = None,
     ):
         super().__init__()
         if resolution % BLOCK or resolution < BLOCK:
@@ -152,7 +154,7 @@ class OccupancySampler(PackedSampler):
     def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
         """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
         rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
-        return march(rays, *self.march(rays, random), capacity=self.capacity_on(rays.near.device))[0]
+        return march(rays, *self.march(rays, random), capacity=self.capacity_for(rays))[0]
 
     def march(self, rays: RayBundle, random: RayRandom | None) -> tuple[March, Float[Tensor, "edges"], OccupancyCells]:
         """Return where each ray stands, and through what it goes."""
@@ -170,9 +172,12 @@ class OccupancySampler(PackedSampler):
         """Return the share of cells that are occupied."""
         return {"train/occupied": float(self.grid.cells.cpu().float().mean())}
 
-    def capacity_on(self, device: torch.device) -> int | None:
+    def capacity_for(self, rays: RayBundle) -> int | None:
         """Return the size of the arrays of samples; None where sizes may be read on the host."""
-        return self.capacity if device.type == "cuda" else None
+        if rays.near.device.type != "cuda":
+            return None
+        expected = CAPACITY if self.sample_budget is None else 2 * self.sample_budget
+        return min(self.capacity or expected, rays.near.shape[0] * (self.lattice.numel() - 2))
 
     def start(self, rays: RayBundle, random: RayRandom | None) -> March:
         """Return the beginning of a march along rays."""

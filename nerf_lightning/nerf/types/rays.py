@@ -66,8 +66,9 @@ class RaySamples(TensorStruct):
 class PackedSamples(TensorStruct):
     """Only the intervals that may hold something, ray after ray, each ray's in order.
 
-    The arrays have a capacity; what lies beyond the last bound is padding of zero length. It is packed for speed, and
-    has functions of its own (`rendering.packed`).
+    The arrays have a capacity; what lies beyond the last bound is padding of zero length, spread over the rays, since a
+    GPU adds up what flows back to one ray one by one. It is packed for speed, and has functions of its own
+    (`rendering.packed`).
     """
 
     ray_index: Int[Tensor, "capacity"]
@@ -77,6 +78,8 @@ class PackedSamples(TensorStruct):
     """The samples of ray r are those from bounds[r] to bounds[r + 1]; one more than there are rays."""
     found: Int[Tensor, ""]
     """How many there were before what exceeds the capacity was dropped."""
+    longest: int | None = None
+    """No ray has more samples; None: the bounds say so, read on the host."""
 
     @property
     def place(self) -> Int[Tensor, "capacity"]:
@@ -87,7 +90,7 @@ class PackedSamples(TensorStruct):
     def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""
         ray, starts, ends = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
-        return PackedSamples(ray, starts, ends, bounds, self.found)
+        return PackedSamples(ray, starts, ends, bounds, self.found, self.longest)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:

@@ -116,4 +116,4 @@ def test_numbers_of_values_may_exceed_32_bits(reachable):
         arrays = re.findall(r"(%\S+) = tt.splat %\S+ : !tt.ptr", code)
         assert arrays
         offsets = [re.findall(rf"tt.addptr {array}, .*tensor<128x(i\d+)> ", code) for array in arrays]
-        assert set(sum(offsets, [])) == {"i64"}
+        assert set().union(*offsets) == {"i64"}

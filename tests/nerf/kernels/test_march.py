@@ -44,6 +44,21 @@ def test_skipping_keeps_what_looking_everywhere_keeps(cascades, growth, share, l
     torch.testing.assert_close(a.ends, b.ends)
 
 
+@pytest.mark.parametrize(("share", "limit"), [(0.02, None), (0.3, None), (0.3, 4), (0.0, None)])
+def test_padding_is_spread_over_the_rays(share, limit):
+    given, capacity = a_march(share=share), 1 << 15
+    exact, _ = march_torch(*given, limit, None)
+    padded, _ = march_torch(*given, limit, capacity)
+    count = exact.starts.numel()
+    assert torch.equal(padded.bounds, exact.bounds)
+    for name in ("ray_index", "starts", "ends"):
+        assert torch.equal(getattr(padded, name)[:count], getattr(exact, name))
+    assert not bool(padded.deltas[count:].any())
+    most = int(exact.bounds.diff().max()) + -(-(capacity - count) // 300)
+    assert int(padded.ray_index.bincount().max()) <= most
+    assert int(exact.bounds.diff().max()) <= padded.longest == exact.longest
+
+
 def test_large_empty_spaces_are_left_at_one_leap():
     """A few cells in a large grid: leaps over many blocks, past whatever is next to them."""
     given = a_march(count=2000, resolution=96, share=1e-3)

@@ -40,6 +40,31 @@ def test_the_numba_twin_equals_the_reference_in_value_and_gradient(counts):
         torch.testing.assert_close(found.double(), expected, rtol=2e-4, atol=2e-5)
 
 
+@pytest.mark.parametrize("longest", [None, 64])
+def test_light_is_exact_in_float32_whatever_other_rays_stop(longest):
+    density, _, samples = packed([40, 0, 7] * 200)
+    padding = torch.zeros(1000)
+    samples = PackedSamples(
+        torch.cat([samples.ray_index, torch.arange(1000) % 600]), torch.cat([samples.starts, padding]),
+        torch.cat([samples.ends, padding]), samples.bounds, samples.found, longest,
+    )  # fmt: skip
+    # Every other ray meets something so opaque that a sum over all of them would keep nothing of the rest.
+    density = torch.cat([torch.where(samples.ray_index[:-1000] % 2 == 0, 1e9 * density, density), padding])
+    leaf = density.clone().requires_grad_()
+    light = transmittance_torch(leaf, samples)
+    light.sum().backward()
+    expected = density.double()
+    for start, end in zip(samples.bounds[:-1].tolist(), samples.bounds[1:].tolist(), strict=True):
+        optical = expected[start:end] * samples.deltas[start:end].double()
+        exact = torch.exp(-(optical.cumsum(0) - optical))
+        torch.testing.assert_close(light[start:end].double(), exact, rtol=1e-4, atol=1e-7)
+        behind = exact.flip(0).cumsum(0).flip(0) - exact
+        torch.testing.assert_close(
+            leaf.grad[start:end].double(), -behind * samples.deltas[start:end].double(), rtol=1e-4, atol=1e-7
+        )
+    assert bool((light[samples.bounds[-1] :] == 1.0).all())
+
+
 def test_it_is_the_dense_quadrature_in_another_layout():
     density, _, samples = packed([7] * 5, torch.float64)
     dense = weights_from_density(density.view(5, 7), samples.deltas.view(5, 7))

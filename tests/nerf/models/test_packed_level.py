@@ -100,8 +100,8 @@ def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypa
     with torch.no_grad():
         density, _ = density_of(packed_points(rays, samples, random))
     kept, bounds = first_of_each_ray(samples, num_visible(density, samples, opaque_below))
-    for name, value in vars(samples.at(kept, bounds)).items():
-        assert torch.equal(getattr(found, name), value), name
+    for ours, theirs in zip(found.tensors(), samples.at(kept, bounds).tensors(), strict=True):
+        assert torch.equal(ours, theirs)
     number = sum(points.positions.shape[0] for points in asked)
     assert len(asked) > 3
     assert kept.numel() <= number

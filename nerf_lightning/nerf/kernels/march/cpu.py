@@ -35,7 +35,7 @@ def march(
     total = int(bounds[-1])
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
     over_rows(_pack, count, *(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
-    return PackedSamples(*out, bounds, bounds[-1]), following
+    return PackedSamples(*out, bounds, bounds[-1], most), following
 
 
 def in_box(rays: RayBundle, grid: OccupancyCells) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:

@@ -26,7 +26,7 @@ def march_torch(
         keep &= rank <= limit
         last = torch.where(keep & (rank == limit), number, number.numel() - 1).amin(dim=-1)
         following = torch.where(keep.sum(dim=-1) == limit, last + 1, following)
-    return _packed(keep, edges, capacity), following
+    return _packed(keep, edges, capacity, limit), following
 
 
 def occupied_intervals(
@@ -58,8 +58,10 @@ def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> 
     return (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
 
 
-def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None) -> PackedSamples:
-    counts = keep.sum(dim=-1)
+def _packed(
+    keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None, limit: int | None
+) -> PackedSamples:
+    counts, intervals = keep.sum(dim=-1), keep.shape[1]
     found = counts.sum()
     bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     if capacity is None:
@@ -67,10 +69,13 @@ def _packed(keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capaci
         filled = torch.ones_like(flat, dtype=torch.bool)
     else:
         # A fixed size, so that nothing is read on the host.
-        flat = torch.nonzero_static(keep.flatten(), size=capacity, fill_value=0)[:, 0]
+        flat = torch.nonzero_static(keep.flatten(), size=capacity)[:, 0]
         bounds = bounds.clamp(max=capacity)
-        filled = torch.arange(capacity, device=keep.device) < bounds[-1]
-    ray = flat // keep.shape[1]
-    number = flat - ray * keep.shape[1]
+        slot = torch.arange(capacity, device=keep.device)
+        filled = slot < bounds[-1]
+        flat = torch.where(filled, flat, slot % counts.numel() * intervals)
+    ray = flat // intervals
+    number = flat - ray * intervals
     starts, ends = edges[ray, number], edges[ray, number + 1]
-    return PackedSamples(ray, starts * filled, ends * filled, bounds, found)
+    longest = intervals if limit is None else min(limit, intervals)
+    return PackedSamples(ray, starts * filled, ends * filled, bounds, found, longest)

@@ -3,17 +3,25 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.nerf.types.rays import PackedSamples
 
 
 def transmittance_torch(density: Float[Tensor, "capacity"], samples: PackedSamples) -> Float[Tensor, "capacity"]:
     """Return the light that reaches the start of each interval."""
-    # One sum over all rays, less what the earlier rays added: only float64 keeps the small difference.
-    optical = (density * samples.deltas).double()
-    before = torch.cat([optical.new_zeros(1), optical.cumsum(0)])
-    at_ray = before[samples.bounds[:-1]]
-    return torch.exp(at_ray[samples.ray_index] - before[:-1]).to(density.dtype)
+    # A row of a table for each ray: sums of their own are exact in float32, and no two samples share a cell, so what
+    # flows back waits for nothing. Padding has rows of its own.
+    rays, capacity = samples.bounds.shape[0] - 1, density.shape[0]
+    longest = int(samples.bounds.diff().amax()) if samples.longest is None and rays else samples.longest
+    columns = max(1, longest or 0)
+    slot = torch.arange(capacity, device=density.device)
+    in_ray = samples.ray_index * columns + samples.place
+    cell = torch.where(slot < samples.bounds[-1], in_ray, rays * columns + slot)
+    optical = density * samples.deltas
+    table = optical.new_zeros((rays + -(-capacity // columns)) * columns).scatter(0, cell, optical).view(-1, columns)
+    optical_depth = functional.pad(table[:, :-1], (1, 0)).cumsum(dim=-1)
+    return torch.exp(-optical_depth.flatten().gather(0, cell)).to(density.dtype)
 
 
 def integrate_torch(
