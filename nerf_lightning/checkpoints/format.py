@@ -107,7 +107,8 @@ def record(resumable: bool) -> Record:
         "num_threads": Whole(1, MOST_THREADS),
         "world_size": Whole(1, 1 << 16),
     }
-    learnt: dict[str, Description] = {"refined": cameras()}
+    # Earlier versions wrote no hashes of the pixels.
+    learnt: dict[str, Description] = {"refined": cameras(), "pixels": Numbers(("views",), (torch.int64,))}
     # Nothing goes on from a file that was made smaller but its weights (`init_from`).
     smaller: dict[str, Description] = {"packed": packed_format()}
     return Record(use | run, learnt) if resumable else Record(use, run | learnt | smaller)

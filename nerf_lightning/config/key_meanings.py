@@ -161,7 +161,7 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """,
     ),
     (CURVE, "path.**"),
-    (ONE_START, "resume print_config paths.** sweep.** viewer.** budgets.**"),
+    (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
     (SWEEP_NUMBER, "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
     (SWEEP_WORD, "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction"),

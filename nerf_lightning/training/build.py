@@ -17,6 +17,7 @@ from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.pixels.hashes import photograph_hashes
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import require_sound
 from nerf_lightning.errors import InputError
@@ -184,6 +185,7 @@ def _run(
 ) -> Run:
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
+    record["pixels"] = ranks.from_first(lambda: photograph_hashes(scene.pixels))
     progress = Progress()
     start = None
     if config.init_from is not None:
@@ -193,7 +195,7 @@ def _run(
         log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
-    return Run(settings, scene, data, RadianceFieldSystem(step, record))
+    return Run(settings, scene, data, RadianceFieldSystem(step, record, config.resume_changed_capture))
 
 
 def _chosen_callbacks(config: DictConfig) -> list[Callback]:

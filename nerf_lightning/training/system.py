@@ -15,6 +15,7 @@ from nerf_lightning import ranks
 from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
+from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
@@ -39,12 +40,13 @@ class RadianceFieldSystem(LightningModule):
     Args:
         step: takes the steps.
         record: what a checkpoint needs to be used alone (config text, cameras, bounds).
+        resume_changed_capture: go on from a checkpoint of a capture that has changed, and warn.
     """
 
-    def __init__(self, step: TrainStep, record: dict[str, Any]):
+    def __init__(self, step: TrainStep, record: dict[str, Any], resume_changed_capture: bool = False):
         super().__init__()
         self.automatic_optimization = False
-        self.step, self.record = step, record
+        self.step, self.record, self.resume_changed_capture = step, record, resume_changed_capture
         # Modules of the step are this module's, so that they move to the trainer's device and are saved.
         self.model, self.rays, self.correction, self.loss = step.model, step.rays, step.correction, step.loss
         self.val_errors = RayErrors()
@@ -175,10 +177,12 @@ class RadianceFieldSystem(LightningModule):
         """Take up the state again: place, threads, and the tile (`TrainerSettings.keep_tile`) decide a sum's last bits.
 
         Raises:
-            InputError: the checkpoint is not one of this run; nothing was taken from it.
+            InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
         """
         require_ours(checkpoint, Path(self.trainer.ckpt_path or LAST), resumable=True)
         trainer, step, state = self.trainer, self.step, checkpoint[KEY]
+        if trainer.state.fn == TrainerFn.FITTING:  # a model may be tested on any capture
+            require_same_capture(state, self.record, self.resume_changed_capture)
         require_resumable(
             checkpoint, self.state_dict(), step.build_optimizer, step.progress, self.configure_optimizers()
         )

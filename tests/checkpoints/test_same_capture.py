@@ -1,0 +1,110 @@
+"""What is said of a capture that is not the one of a checkpoint."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import ball_scene
+
+from nerf_lightning.checkpoints.reading import make_record
+from nerf_lightning.checkpoints.same_capture import changes, require_same_capture
+from nerf_lightning.data.pixels import hashes
+from nerf_lightning.data.pixels.hashes import photograph_hashes
+from nerf_lightning.nerf.geometry.frames import poses_from_user
+
+SCENE = ball_scene()
+
+
+def record(scene):
+    return make_record(scene, "", {}) | {"pixels": photograph_hashes(scene.pixels)}
+
+
+def told(scene):
+    return changes(record(SCENE), record(scene))
+
+
+def with_cameras(**changed):
+    return replace(SCENE, cameras=replace(SCENE.cameras, **changed))
+
+
+def changed_at(tensor, *place, by):
+    tensor = tensor.clone()
+    tensor[place] += by
+    return tensor
+
+
+def reordered(order):
+    cameras, store = SCENE.cameras[torch.tensor(order)], SCENE.pixels
+    place = {old: new for new, old in enumerate(order)}
+    return replace(
+        SCENE,
+        cameras=cameras,
+        pixels=replace(store, offset=store.offset[torch.tensor(order)]),
+        view_names=tuple(SCENE.view_names[view] for view in order),
+        splits={split: tuple(place[view] for view in views) for split, views in SCENE.splits.items()},
+    )
+
+
+def in_another_frame(scene):
+    """The scene in a working frame that is turned, moved and of another unit."""
+    frame = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    c2w = poses_from_user(scene.cameras.c2w.double(), frame.double()).float()
+    return replace(scene, cameras=replace(scene.cameras, c2w=c2w), to_user=scene.to_user @ frame)
+
+
+def test_the_same_capture_is_the_same_to_rounding():
+    assert told(SCENE) == []
+    assert told(with_cameras(c2w=SCENE.cameras.c2w * (1 + 1e-7), focal=SCENE.cameras.focal * (1 + 1e-7))) == []
+
+
+CHANGED = [
+    (with_cameras(c2w=changed_at(SCENE.cameras.c2w, 2, 0, 3, by=0.01)), ["the pose of 1 of 6 photographs (ball_2)"]),
+    (with_cameras(focal=SCENE.cameras.focal * 1.01), ["the focal length of 6 of 6 photographs (ball_0, ball_1, ball_2 and 3 more)"]),
+    (with_cameras(center=changed_at(SCENE.cameras.center, 1, 0, by=0.5)), ["the principal point of 1 of 6 photographs (ball_1)"]),
+    (with_cameras(lens_model="fisheye"), ["the lens of 6 of 6 photographs (ball_0, ball_1, ball_2 and 3 more)"]),
+    (replace(SCENE, pixels=replace(SCENE.pixels, rgba=changed_at(SCENE.pixels.rgba, 700, 1, by=1))), ["the pixels of 1 of 6 photographs (ball_4)"]),
+    (reordered([1, 0, 2, 3, 4, 5]), ["the order of the photographs"]),
+    (replace(SCENE, view_names=("new", *SCENE.view_names[1:])), ["1 of 6 photographs are gone (ball_0)", "1 of 6 photographs are new (new)"]),
+    (replace(SCENE, splits=SCENE.splits | {"train": (0, 1), "test": (2, 3, 4, 5)}), ["the use (training, validation or test) of 1 of 6 photographs (ball_2)"]),
+    (replace(SCENE, far=SCENE.far + 1), ["where the content lies (near, far, the box, or points of the reconstruction)"]),
+    (replace(SCENE, background="black"), ["the background (white there, black here)"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("scene", "words"), CHANGED, ids=[words[0][:30] for _, words in CHANGED])
+def test_what_has_changed_is_named(scene, words):
+    assert told(scene) == words
+
+
+def test_one_pose_that_moves_the_working_frame_is_one_pose():
+    moved = with_cameras(c2w=changed_at(SCENE.cameras.c2w, 2, 0, 3, by=0.01))
+    assert told(in_another_frame(moved)) == ["the pose of 1 of 6 photographs (ball_2)"]
+
+
+def test_a_mask_is_part_of_a_photograph():
+    mask = torch.ones(len(SCENE.pixels.rgba), dtype=torch.uint8)
+    masked = replace(SCENE, pixels=replace(SCENE.pixels, mask=mask))
+    other = replace(SCENE, pixels=replace(SCENE.pixels, mask=changed_at(mask, 0, by=255)))
+    assert changes(record(masked), record(other)) == ["the pixels of 1 of 6 photographs (ball_0)"]
+
+
+def test_a_checkpoint_of_before_has_no_hashes_and_is_compared_by_what_it_has():
+    old = record(SCENE)
+    del old["pixels"]
+    assert changes(old, record(replace(SCENE, pixels=replace(SCENE.pixels, rgba=255 - SCENE.pixels.rgba)))) == []
+    assert changes(old, record(reordered([1, 0, 2, 3, 4, 5]))) == ["the order of the photographs"]
+
+
+def test_of_more_pixels_than_memory_holds_some_rows_of_each_photograph_count(monkeypatch):
+    monkeypatch.setattr(hashes, "CHECKED_WHOLE", 0)
+    monkeypatch.setattr(hashes, "THINNED", SCENE.pixels.rgba.nbytes // 4)
+    before = photograph_hashes(SCENE.pixels)
+    seen, unseen = (photograph_hashes(replace(SCENE.pixels, rgba=changed_at(SCENE.pixels.rgba, at, by=1)))
+                    for at in (4 * 12, 5 * 12))  # fmt: skip
+    assert (seen != before).tolist() == [True, *[False] * 5]
+    assert torch.equal(unseen, before)
+
+
+def test_going_on_all_the_same_is_said(caplog):
+    require_same_capture(record(SCENE), record(reordered([1, 0, 2, 3, 4, 5])), allow_changed=True)
+    assert "the order of the photographs. What was learnt of a photograph goes on with the one that now" in caplog.text

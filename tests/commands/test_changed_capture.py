@@ -1,0 +1,51 @@
+"""A run goes on with the capture that it has learnt from: another one is refused, with what is another."""
+
+import shutil
+
+import numpy as np
+import pytest
+from support.running import FAST
+
+WHAT = {
+    "poses": "the pose of 1 of 10 photographs (3)",
+    "focal": "the focal length of 10 of 10 photographs",
+    "images": "the pixels of 1 of 10 photographs (3)",
+}
+
+
+def changed(path, key):
+    content = dict(np.load(path))
+    if key == "poses":
+        content["poses"][3, 0, 3] += 0.5
+    elif key == "focal":
+        content["focal"] = content["focal"] * 1.25
+    else:
+        content["images"][3, 5, 5] = 1 - content["images"][3, 5, 5]
+    np.savez(path, **content)
+
+
+@pytest.fixture
+def begun(nerf, capture, tmp_path):
+    """A run of 6 steps on a capture of its own, and the command that goes on with it."""
+    shutil.copy(capture, tmp_path / "ball.npz")
+    command = (
+        "train", "scene=npz", f"scene.path={tmp_path}/ball.npz", *FAST, "final.evaluate=false", "final.video=false",
+        f"paths.output_dir={tmp_path}/run", "correction=exposure",
+    )  # fmt: skip
+    result = nerf(*command, "trainer.max_steps=6")
+    assert result.code == 0, result.err
+    return (*command, "trainer.max_steps=12", "resume=auto")
+
+
+@pytest.mark.parametrize("key", WHAT)
+def test_a_changed_capture_is_not_gone_on_with_unless_that_is_asked_for(key, nerf, begun, tmp_path):
+    changed(tmp_path / "ball.npz", key)
+    result = nerf(*begun)
+    assert result.code == 2, result.err
+    for part in (WHAT[key], "resume_changed_capture=true"):
+        assert part in result.err.strip().splitlines()[-1]
+    if key == "images":  # the refusal has left the run as it was
+        result = nerf(*begun, "resume_changed_capture=true")
+        assert result.code == 0, result.err
+        assert WHAT[key] in result.out + result.err
+        assert "going on from step 6" in result.out + result.err
