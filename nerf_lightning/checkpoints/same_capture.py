@@ -1,4 +1,4 @@
-"""Whether a run goes on with the capture that it has learnt from: cameras, names, splits and pixels are held against it."""
+"""Whether a run goes on with the capture that it has learnt from: cameras, names, splits, pixels."""
 
 import logging
 from collections.abc import Iterable, Mapping

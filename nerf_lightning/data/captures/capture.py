@@ -1,5 +1,7 @@
 """What a format says of a capture, before any pixel is read: views with poses and intrinsics, sparse points, splits."""
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -9,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.budgets import require_within
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, require_different
+from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, WIDEST, degrees_across, require_different
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import downscaled_size
 from nerf_lightning.errors import InputError
@@ -19,6 +21,8 @@ from nerf_lightning.nerf.types.scene import Cameras, LensModel, PixelStore
 
 # Of width and height: how far a picture's scale may differ from one axis to the other.
 LARGEST_STRETCH = 0.01
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,36 @@ def filtered(capture: Capture, pattern: str | None) -> Capture:
     if not kept:
         names = listed((view.name for view in capture.views), cap=5)
         raise InputError(f"scene.frames={pattern!r} fits none of the views of {capture.source}; they are {names}.")
+    return _with_views(capture, kept)
+
+
+def without_impossible_lenses(capture: Capture) -> Capture:
+    """Return the capture without the views whose focal length no perspective picture of their size has.
+
+    Raises:
+        InputError: none is left; with the first, and its focal length.
+    """
+    if capture.lens_model not in ("pinhole", "radial_tangential"):
+        return capture
+    degrees = [max(map(degrees_across, view.size, view.focal)) for view in capture.views]
+    odd = [number for number, across in enumerate(degrees) if across > WIDEST]
+    if not odd:
+        return capture
+    first = capture.views[odd[0]]
+    reason = (
+        f"a focal length of {min(first.focal):g} pixels for {first.size[0]:g} x {first.size[1]:g} is a field of view "
+        f"of {degrees[odd[0]]:.1f} degrees, which no perspective lens has"
+    )
+    cure = "The focal length must be in pixels of the width and height beside it, not a share of them."
+    if len(odd) == len(degrees):
+        raise InputError(f"{capture.source}: the view {first.name} has {reason}; so has every other. {cure}")
+    names = listed((capture.views[number].name for number in odd), cap=5)
+    log.warning("%d of %d views are left out (%s): %s. %s", len(odd), len(degrees), names, reason, cure)
+    return _with_views(capture, [number for number in range(len(degrees)) if number not in set(odd)])
+
+
+def _with_views(capture: Capture, kept: Sequence[int]) -> Capture:
+    """Return some of the views, in order; the splits follow."""
     place = {number: new for new, number in enumerate(kept)}
     splits = capture.splits and {
         split: tuple(place[number] for number in numbers if number in place)

@@ -20,6 +20,8 @@ from nerf_lightning.nerf.types.scene import Background
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 """What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
 have not lost every digit that a picture could show."""
+WIDEST = 170.0
+"""Degrees across a picture, beyond which nothing was photographed through a perspective lens."""
 
 
 def require_different(names: Iterable[str], where: str) -> None:
@@ -31,6 +33,15 @@ def require_different(names: Iterable[str], where: str) -> None:
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InputError(f"{where} lists {listed(twice)} more than once. Remove all but one of each.")
+
+
+def degrees_across(pixels: int | float, focal: int | float) -> float:
+    """Return the field of view of a perspective picture, in degrees.
+
+    >>> degrees_across(800, 400)
+    90.0
+    """
+    return math.degrees(2 * math.atan2(pixels, 2 * focal))
 
 
 def contents(folder: Path) -> str:

@@ -8,11 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from nerf_lightning.data.captures.capture import Capture, cameras_of, check_capture, filtered
+from nerf_lightning.data.captures.capture import (
+    Capture,
+    cameras_of,
+    check_capture,
+    filtered,
+    without_impossible_lenses,
+)
 from nerf_lightning.data.captures.checks import check_metres, check_step
 from nerf_lightning.data.captures.extent import extent_of, require_possible
 from nerf_lightning.data.captures.space import choose_space
-from nerf_lightning.data.captures.splits import every_kth
+from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
@@ -90,6 +96,7 @@ class CaptureReader(Reader):
         self._check_settings()
         capture = filtered(self.capture(), self.frames)
         check_capture(capture)
+        capture = without_impossible_lenses(capture)
         splits = self._splits(capture)
         if self.masks_keep == "black" and not any(view.photograph.mask for view in capture.views):
             raise InputError(
@@ -116,6 +123,7 @@ class CaptureReader(Reader):
             log.warning(
                 "%d photographs have no pose and are left out: %s", len(capture.left_out), listed(capture.left_out, 5)
             )
+        remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
         extent = extent_of(capture, cameras, space, self.near, self.far)
         to_user = (capture.undo @ extent.to_user).float()
         require_possible(extent, to_user, capture)
@@ -133,7 +141,7 @@ class CaptureReader(Reader):
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
             metres_per_unit=self.metres_per_unit,
-            protocol=self._protocol() | protocol_of(color),
+            protocol=self._protocol() | protocol_of(color) | remembered,
             truth=None,
             left_out=capture.left_out,
         )
@@ -201,6 +209,8 @@ class CaptureReader(Reader):
             train, held = every_kth(range(len(capture.views)), self.hold_every)
             return {"train": train, "val": held, "test": held}
         splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
+        names = [view.name for view in capture.views]
+        splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
         held = splits["val"] or splits["test"]
         if not splits["train"] or not held:
             raise InputError(

@@ -1,8 +1,18 @@
 """Which views are learnt from and which are held out."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Hashable, Sequence
+from typing import TypeVar
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.escaping import listed
+
+MEMORISED = {"test_views": "learnt from"}
+"""Stands in the protocol of numbers that say how well photographs are remembered, and nothing of new views."""
+
+View = TypeVar("View", bound=Hashable)
+
+log = logging.getLogger(__name__)
 
 
 def in_order(views: Sequence[int], train_fraction: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -29,6 +39,52 @@ def every_kth(views: Sequence[int], k: int) -> tuple[tuple[int, ...], tuple[int,
     """
     held = tuple(views[::k])
     return _both(tuple(view for view in views if view not in set(held)), held)
+
+
+def apart(
+    train: Sequence[View], val: Sequence[View], test: Sequence[View], named: Callable[[View], str], source: str
+) -> tuple[View, ...]:
+    """Return the views to learn from without those to judge by, and say which are left out.
+
+    Where a capture lists the very same views for training and test, that is meant, and said.
+
+    Args:
+        train: views, or what stands for them.
+        val: those to judge by while training; there may be none.
+        test: those to judge by in the end; there may be none.
+        named: a view's name.
+        source: the file that lists them, for messages.
+
+    Raises:
+        InputError: less than half of the views to learn from would be left, so that either list may be the mistake.
+    """
+    held = {*val, *test}
+    both = [view for view in train if view in held]
+    if not both:
+        return tuple(train)
+    if set(train) == set(test):
+        log.warning(
+            "%s: the views to learn from are those to judge by, so scores will say how well they are remembered, and "
+            "nothing of new views.",
+            source,
+        )
+        return tuple(train)
+    names = listed(map(named, both), cap=5)
+    left = len(train) - len(both)
+    if left < len(both):
+        raise InputError(
+            f"{source}: {len(both)} of {len(train)} views to learn from are to be judged by, too ({names}), and "
+            f"without them {left} would be left. Take them out of the lists to judge by (val, test) if they are "
+            "to be learnt from, or out of the list to learn from."
+        )
+    log.warning(
+        "%s: %d of %d views are listed both to learn from and to judge by, and are not learnt from: %s",
+        source,
+        len(both),
+        len(train),
+        names,
+    )
+    return tuple(view for view in train if view not in held)
 
 
 def _both(train: tuple[int, ...], held: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:

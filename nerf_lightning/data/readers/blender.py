@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import (
+    WIDEST,
     box_around_origin,
     check_bounds,
     check_divisible,
@@ -25,7 +26,7 @@ from nerf_lightning.data.captures.checks import (
     pose_from_matrix,
     require_different,
 )
-from nerf_lightning.data.captures.splits import every_kth
+from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import read_pixels
@@ -62,10 +63,10 @@ def read_frames(path: Path, step: int = 1) -> list[Frame]:
     """
     content = read_json(path)
     fov, entries = keys_of(content, KEYS, str(path), FORMAT)
-    if isinstance(fov, bool) or not isinstance(fov, int | float) or not LEAST_ANGLE <= fov < math.pi:
+    if isinstance(fov, bool) or not isinstance(fov, int | float) or not LEAST_ANGLE <= fov <= math.radians(WIDEST):
         raise InputError(
-            f"{path}: camera_angle_x is {fov!r}, but it must be an angle between 0 and pi radians "
-            "(the horizontal angle of view)."
+            f"{path}: camera_angle_x is {fov!r}, but it must be an angle between 0 and {math.radians(WIDEST):.2f} "
+            f"radians (the horizontal angle of view; no perspective lens has more than {WIDEST:g} degrees)."
         )
     if not isinstance(entries, list):
         raise InputError(f"{path}: frames must be a list of views, but it is {type(entries).__name__}.")
@@ -209,17 +210,21 @@ class BlenderReader(Reader):
             require_different((frame.label for frame in named), str(files[split]))
         if not frames["train"]:
             raise InputError(f"{files['train']} has no frames, so there is nothing to learn from. Export it again.")
-        return frames
+        images = [[frame.image for frame in frames[split]] for split in SPLITS]
+        kept = set(apart(*images, lambda image: image.name, str(self.root)))
+        return frames | {"train": [frame for frame in frames["train"] if frame.image in kept]}
 
     def _protocol(self, frames: Mapping[str, list[Frame]]) -> dict[str, str]:
         """Say how the pixels were made and which views are judged."""
         judged = "test" if frames["test"] else "val" if frames["val"] else f"every {HOLD_EVERY}th train view"
+        learnt = {frame.image for frame in frames["train"]}
+        remembered = MEMORISED if any(frame.image in learnt for frame in frames["test"]) else {}
         return {
             "downscale": str(self.downscale),
             "filter": "none" if self.downscale == 1 else "area, premultiplied",
             "test_views": judged,
             "test_skip": str(self.skip.get(judged, 1)),
-        }
+        } | remembered
 
 
 def _cameras(views: list[Frame], width: int, height: int) -> Cameras:

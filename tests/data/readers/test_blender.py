@@ -81,8 +81,8 @@ def test_names_are_the_shortest_that_differ(tmp_path):
 
 def test_names_fall_back_to_the_path_in_the_file_of_a_split(root):
     frames = [{"file_path": f"./{split}/r_0.png", "transform_matrix": pose(0)} for split in ("val", "test")]
-    write_transforms(root, "train", frames)
-    assert BlenderReader(str(root)).read().view_names[:2] == ("train/val/r_0", "train/test/r_0")
+    write_transforms(root, "test", frames)
+    assert BlenderReader(str(root)).read().view_names[-2:] == ("test/val/r_0", "test/test/r_0")
 
 
 def test_missing_val_is_held_out_from_train(root, caplog):

@@ -82,7 +82,7 @@ def test_refuses_json_that_is_not_text(root):
         ([], r"transforms_train.json must be a json object with the keys .*, but it is list"),
         (
             {"camera_angle_x": 4, "frames": []},
-            r"camera_angle_x is 4, but it must be an angle between 0 and pi",
+            r"camera_angle_x is 4, but it must be an angle between 0 and 2.97 radians",
         ),
         ({"camera_angle_x": "1", "frames": []}, r"camera_angle_x is '1', but it must be an angle"),
         ({"camera_angle_x": 1, "frames": {}}, r"frames must be a list of views, but it is dict"),
