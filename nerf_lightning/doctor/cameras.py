@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Check, Given
 from nerf_lightning.nerf.geometry.cameras import image_plane
 from nerf_lightning.nerf.geometry.frames import focus_point
 from nerf_lightning.nerf.geometry.lenses import stretches, unproject
@@ -15,7 +15,7 @@ NARROW, WIDE, WIDEST = 12.0, 100.0, 140.0
 OFF_CENTER, FAR_OFF_CENTER = 0.06, 0.2
 
 
-def rigid(evidence: Evidence) -> Check:
+def rigid(evidence: Given) -> Check:
     """Judge whether poses are rotations (no scale, no mirror), and no two cameras are one."""
     c2w = evidence.scene.cameras.c2w
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
@@ -33,7 +33,7 @@ def rigid(evidence: Evidence) -> Check:
     return Check("rotations", "ok", f"all {len(c2w)} poses are right-handed rotations with different centres")
 
 
-def common_middle(evidence: Evidence) -> Check:
+def common_middle(evidence: Given) -> Check:
     """Judge whether the cameras look at, or away from, the place where their axes meet."""
     c2w, name = evidence.scene.cameras.c2w.double(), "common middle"
     if evidence.scene.cameras.lens_model == "equirectangular":
@@ -55,7 +55,7 @@ def common_middle(evidence: Evidence) -> Check:
     return Check(name, "look", f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
 
 
-def upright(evidence: Evidence) -> Check:
+def upright(evidence: Given) -> Check:
     """Judge whether the photographs lie on their side or stand on their head in the working frame."""
     scene, name = evidence.scene, "upright"
     up = torch.tensor([0.0, 1.0, 0.0] if scene.space == "ndc" else [0.0, 0.0, 1.0])
@@ -70,7 +70,7 @@ def upright(evidence: Evidence) -> Check:
     return Check(name, "ok", "the photographs are upright")
 
 
-def field_of_view(evidence: Evidence) -> Check:
+def field_of_view(evidence: Given) -> Check:
     """Judge the focal lengths by the field of view, and by how much they vary."""
     cameras, name = evidence.scene.cameras, "field of view"
     if cameras.lens_model == "equirectangular":
@@ -91,7 +91,7 @@ def field_of_view(evidence: Evidence) -> Check:
     return Check(name, "ok", message)
 
 
-def principal_point(evidence: Evidence) -> Check:
+def principal_point(evidence: Given) -> Check:
     """Judge how far the principal point lies from the photograph's centre; a halved one is named."""
     cameras, name = evidence.scene.cameras, "principal point"
     size = torch.stack([cameras.width, cameras.height], dim=-1)
@@ -110,7 +110,7 @@ def principal_point(evidence: Evidence) -> Check:
     return Check(name, "wrong" if wrong else "look", message, cure)
 
 
-def lens(evidence: Evidence) -> Check:
+def lens(evidence: Given) -> Check:
     """Judge how strongly the lens bends towards the corners; one that folds is refused when the capture is read."""
     cameras, name = evidence.scene.cameras, "lens"
     if cameras.lens_model == "pinhole" or not bool(cameras.lens.any()):

@@ -34,10 +34,20 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """All that checks look at."""
+class Given:
+    """What the capture says of itself, before any pixel is asked."""
 
     scene: Scene
+
+    def named(self, views: Iterable[int]) -> str:
+        """Return the names of views, the first few of them."""
+        return listed((self.scene.view_names[view] for view in views), cap=5)
+
+
+@dataclass(frozen=True)
+class Evidence(Given):
+    """All that checks look at."""
+
     looks: Looks
     """What each photograph looks like."""
     matches: Matches
@@ -51,10 +61,6 @@ class Evidence:
     def agreement(self) -> float:
         """Share of the matches that agree; 0 where there are none."""
         return float(self.agrees.float().mean()) if len(self.agrees) else 0.0
-
-    def named(self, views: Iterable[int]) -> str:
-        """Return the names of views, the first few of them."""
-        return listed((self.scene.view_names[view] for view in views), cap=5)
 
 
 CheckFn = Callable[[Evidence], Check]

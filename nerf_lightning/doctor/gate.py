@@ -1,11 +1,28 @@
 """Before hours are spent on a capture: what is wrong with it stops the training, what is doubtful is said."""
 
 import logging
+from collections.abc import Callable
 
-from nerf_lightning.doctor.check import Check
+from nerf_lightning.data.pixels.store import in_threads
+from nerf_lightning.doctor import cameras, views
+from nerf_lightning.doctor.check import Check, Given
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.escaping import listed
+from nerf_lightning.nerf.types.scene import PixelStore, Scene
+
+QUICK: tuple[Callable[[Given], Check], ...] = (
+    cameras.rigid,
+    cameras.common_middle,
+    cameras.field_of_view,
+    cameras.principal_point,
+    views.number_of_views,
+)
+"""Checks that cost nothing, and find what is wrong."""
+ROWS = 8
+"""Of a photograph, that are looked at first: nearly all show something there."""
+SPREAD = 3
+"""Levels of 255 that a JPEG makes of one."""
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +42,34 @@ def require_sound(scene: Scene) -> list[Check]:
         raise InputError(_stopped(scene.name, wrong))
     log.info("doctor: %d checks find nothing wrong (doctor=off leaves them out)", len(checks))
     return checks
+
+
+def warn_of_faults(scene: Scene) -> None:
+    """Say what is wrong with a scene as far as that is seen in no time, whether the doctor is asked or not."""
+    train = scene.splits["train"]
+    found = in_threads(lambda number: _nothing(scene.pixels, train[number]), len(train), "Looking", shown=False)
+    blank = [f"{scene.view_names[view]} ({what})" for view, what in zip(train, found, strict=True) if what]
+    if blank:
+        alpha = ", whether alpha was exported (0 is transparent)" if scene.pixels.has_transparency else ""
+        masks = ", whether the masks keep the wrong side (scene.masks_keep)" if scene.pixels.mask is not None else ""
+        log.warning(
+            "%d of %d training photographs of %s show nothing: %s. Look whether the files do%s%s.",
+            *(len(blank), len(train), scene.name, listed(blank, cap=5), alpha, masks),
+        )
+    for check in [check(Given(scene)) for check in QUICK] if scene.capture_of is None else []:
+        if check.verdict == "wrong":
+            log.warning("%s: %s. %s", check.name, check.message, check.cure)
+
+
+def _nothing(pixels: PixelStore, view: int) -> str | None:
+    """Return what is there in the place of a picture: one colour, or nothing at all; None: a picture."""
+    rgba, kept = pixels.view(view), pixels.kept(view)
+    for step in (max(1, len(rgba) // ROWS), 1):
+        part = rgba[::step].reshape(-1, 4) if kept is None else rgba[::step][kept[::step]]
+        seen = part[part[:, 3] > 0, :3]
+        if len(seen) and int((seen.amax(dim=0) - seen.amin(dim=0)).max()) > SPREAD:
+            return None
+    return f"all {', '.join(map(str, seen[0].tolist()))}" if len(seen) else "transparent"
 
 
 def _stopped(name: str, wrong: list[Check]) -> str:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
+from nerf_lightning.doctor.check import Check, Evidence, Given, rows_at_once
 from nerf_lightning.escaping import listed
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
 from nerf_lightning.nerf.geometry.frames import gaps_around
@@ -17,7 +17,7 @@ FEW_MATCHES = 30
 FAR_HELD_OUT = 40.0
 
 
-def number_of_views(evidence: Evidence) -> Check:
+def number_of_views(evidence: Given) -> Check:
     """Judge whether there are enough views to learn from."""
     splits = evidence.scene.splits
     count = len(splits["train"])

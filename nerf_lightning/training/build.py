@@ -19,7 +19,7 @@ from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.hashes import photograph_hashes
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.doctor.gate import require_sound
+from nerf_lightning.doctor.gate import require_sound, warn_of_faults
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
@@ -183,6 +183,8 @@ def _run(
     model: Model | None = None,
     loss: Loss | None = None,
 ) -> Run:
+    if ranks.is_first():
+        warn_of_faults(scene)
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
     record["pixels"] = ranks.from_first(lambda: photograph_hashes(scene.pixels))

@@ -210,8 +210,8 @@ class BlenderReader(Reader):
             require_different((frame.label for frame in named), str(files[split]))
         if not frames["train"]:
             raise InputError(f"{files['train']} has no frames, so there is nothing to learn from. Export it again.")
-        images = [[frame.image for frame in frames[split]] for split in SPLITS]
-        kept = set(apart(*images, lambda image: image.name, str(self.root)))
+        train, val, test = ([frame.image for frame in frames[split]] for split in SPLITS)
+        kept = set(apart(train, val, test, lambda image: image.name, str(self.root)))
         return frames | {"train": [frame for frame in frames["train"] if frame.image in kept]}
 
     def _protocol(self, frames: Mapping[str, list[Frame]]) -> dict[str, str]:
