@@ -183,8 +183,6 @@ def _run(
     model: Model | None = None,
     loss: Loss | None = None,
 ) -> Run:
-    if ranks.is_first():
-        warn_of_faults(scene)
     text = yaml.safe_dump(OmegaConf.to_container(config, resolve=True), sort_keys=False)
     record = make_record(scene, text, chosen(choices))
     record["pixels"] = ranks.from_first(lambda: photograph_hashes(scene.pixels))
@@ -197,6 +195,8 @@ def _run(
         log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
     data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
+    if ranks.is_first():
+        warn_of_faults(scene)
     return Run(settings, scene, data, RadianceFieldSystem(step, record, config.resume_changed_capture))
 
 
