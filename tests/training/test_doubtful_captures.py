@@ -1,6 +1,5 @@
 """A training says what is wrong with its capture as far as that is seen in no time, though no doctor is asked."""
 
-
 import numpy as np
 import pytest
 from PIL import Image
