@@ -41,9 +41,11 @@ class StepByStep:
         return torch.stack(self.losses).cpu().double()
 
 
-def step_by_step(model: str, device: torch.device, precision: str = "32-true", tile_points: int | None = None):
+def step_by_step(
+    model: str, device: torch.device, precision: str = "32-true", tile_points: int | None = None, *changes: str
+):
     """Prepare a model of conf/model on a device, its pixels there too."""
-    config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null")
+    config = composed("train", f"model={model}", f"data.batch_rays={RAYS}", "data.sample_budget=null", *changes)
     settings = TrainerSettings(accelerator="cpu", precision="32-true", tile_points=tile_points)
     looks = model.startswith("view_transformer")  # at up to ten photographs for each view
     scene, progress = many_views(24) if looks else ball_scene(), Progress()
@@ -54,7 +56,7 @@ def step_by_step(model: str, device: torch.device, precision: str = "32-true", t
             level.sampler.opaque_below = CUT
     training.model.multiply_in(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
-    return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, RAYS))
+    return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))
 
 
 def default_callbacks(*changes: str):
