@@ -82,7 +82,7 @@ class NearestViews:
 
     def _colors(self, places: Tensor, at: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
         used, numbered = torch.unique(places, return_inverse=True)
-        return self.tables.colors(used.tolist(), at.device).look_up(numbered, at)
+        return self.tables.colors(used, used.tolist()).look_up(numbered, at)
 
     def _to_plane(self, rays: RayBundle, view: int) -> Float[Tensor, "rays"]:
         axis = -self.scene.cameras.c2w[view, :, 2]

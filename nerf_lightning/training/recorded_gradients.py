@@ -36,7 +36,8 @@ def cuda_graph(work: Callable[[], Seen]) -> tuple[Callable[[], None], Seen]:
         for _ in range(WARM_UPS):
             work()
     torch.cuda.current_stream().wait_stream(side)
-    with torch.cuda.graph(graph):
+    # The thread that makes batches pins memory, which a capture would otherwise forbid in every thread.
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         seen = work()
     return graph.replay, seen
 

@@ -31,7 +31,7 @@ REFUSED_IN_STEPS = {
         lambda there, host: there.nonzero(),
         lambda there, host: there[there > 0],
         lambda there, host: there.masked_select(there > 0),
-        lambda there, host: there.__setitem__(there > 1, there[:2]),
+        lambda there, host: there.__setitem__(there > 1, there[:2].clone()),
         lambda there, host: there.unique(),
         lambda there, host: there.long().bincount(),
         lambda there, host: there.repeat_interleave(there.long()),

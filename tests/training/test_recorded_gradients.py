@@ -1,5 +1,8 @@
 """A recorded step is the step: `tests/support/tape.py` stands for CUDA graphs, with the torch twins of the kernels."""
 
+from contextlib import contextmanager, nullcontext
+from unittest.mock import Mock
+
 import pytest
 import torch
 from support.gpu_training import step_by_step
@@ -11,6 +14,7 @@ from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.recorded_gradients import cuda_graph
 
 CPU = torch.device("cpu")
 KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "packed.cpu")
@@ -100,3 +104,18 @@ def test_models_without_an_occupancy_grid_are_refused(model):
 def test_other_devices_are_refused():
     with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
         TrainerSettings(accelerator="cpu", cuda_graph=True)
+
+
+def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
+    asked = {}
+
+    @contextmanager
+    def graph(recorded, **how):
+        asked.update(how)
+        yield
+
+    for name, stand_in in {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock}.items():
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(torch.cuda, "current_stream", Mock())
+    cuda_graph(dict)
+    assert asked == {"capture_error_mode": "thread_local"}

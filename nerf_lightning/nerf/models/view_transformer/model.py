@@ -176,12 +176,12 @@ class ViewTransformer(Model):
         tables = self.tables
         if tables is None:
             raise InputError("model=view_transformer renders from photographs, and was given none: call look_at first.")
-        photographs = tables.photographs.to(rays.near.device)
+        tables.move_to(rays.near.device)
+        photographs = tables.photographs
         sources = choose_sources(photographs, rays, self.num_sources, random)
         samples = self._samples(rays, random)
         places = sources.places[sources.target]
-        least_cosine = tables.least_cosine.to(rays.near.device)
-        projected = project_samples(photographs.cameras, least_cosine, places, rays, samples.midpoints)
+        projected = project_samples(photographs.cameras, tables.least_cosine, places, rays, samples.midpoints)
         visible = projected.visible & sources.given[sources.target][:, None]
         projected = replace(projected, visible=visible)
         views = self._looked_up(tables, sources, projected)
@@ -251,10 +251,10 @@ class ViewTransformer(Model):
 
     def _looked_up(self, tables: ViewTables, sources: SourceViews, projected: Projected) -> Views:
         views, numbered = torch.unique(sources.places, return_inverse=True)
-        used, device = views.tolist(), views.device
+        numbers = views.tolist()
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
-        features = tables.features(used, self.image_network, device).look_up(view, projected.at)
-        colors = tables.colors(used, device).look_up(view, projected.at)
+        features = tables.features(views, numbers, self.image_network).look_up(view, projected.at)
+        colors = tables.colors(views, numbers).look_up(view, projected.at)
         return Views(self.look(torch.cat([colors, features], dim=-1)), colors, projected.turned, projected.visible)
 
     def _penalty(self, gates: Gates, rays: RayBundle, sources: SourceViews) -> Float[Tensor, "rays"]:

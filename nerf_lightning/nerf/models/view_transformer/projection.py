@@ -56,13 +56,13 @@ def project_samples(
     c2w, t = cameras.c2w[places], t[:, :, None, None]
     apart = rays.origins[:, None] - c2w[..., 3]
     # From a camera's axes (right, up, back) to those of its lens (right, down, forward).
-    axes = c2w[..., :3] * c2w.new_tensor([1.0, -1.0, -1.0])
+    axes = torch.cat([c2w[..., :1], -c2w[..., 1:3]], dim=-1)
     start = (apart[..., None, :] @ axes)[..., 0, :]
     along = (rays.directions[:, None, None, :] @ axes)[..., 0, :]
     local = start[:, None] + t * along[:, None]
     distance = local.square().sum(dim=-1).clamp(min=1e-12).sqrt()
     ahead = local[..., 2] > least_cosine[places][:, None] * distance
-    in_front = torch.where(ahead[..., None], local, local.new_tensor([0.0, 0.0, 1.0]))
+    in_front = torch.where(ahead[..., None], local, torch.eye(3, device=local.device, dtype=local.dtype)[2])
     plane = project_plane(in_front, cameras.lens[places][:, None], cameras.lens_model)
     at = plane * cameras.focal[places][:, None] + cameras.center[places][:, None]
     size = torch.stack([cameras.width[places], cameras.height[places]], dim=-1)[:, None]

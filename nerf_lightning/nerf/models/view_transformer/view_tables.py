@@ -68,22 +68,33 @@ class ViewTables:
     def __init__(self, photographs: Photographs):
         self.photographs = photographs
         self.least_cosine = seen_cosines(photographs.cameras)
+        self.size = torch.stack([photographs.pixels.width, photographs.pixels.height], dim=-1)
         self._colors, self._features = _Kept(), _Kept()
 
-    def colors(self, views: Sequence[int], device: torch.device) -> ViewTable:
-        """Return the colours of views in [0, 1], over the background of evaluation."""
-        return _table(
-            [picture.flatten(0, 1) for picture in self._pictures(views, device)], self._sizes(views, 1), 1, device
-        )
+    def move_to(self, device: torch.device) -> None:
+        """Let all but the pixels lie on a device: copied in each step, the host would wait for it."""
+        self.photographs = self.photographs.to(device)
+        self.least_cosine, self.size = self.least_cosine.to(device), self.size.to(device)
 
-    def features(self, views: Sequence[int], network: ImageNetwork, device: torch.device) -> ViewTable:
-        """Return the features of views, with gradients where they are asked for."""
+    def colors(self, views: Int[Tensor, "views"], numbers: Sequence[int]) -> ViewTable:
+        """Return the colours of views in [0, 1], over the background of evaluation.
+
+        Args:
+            views: which, on the device that these tables were moved to.
+            numbers: the same, on the host.
+        """
+        pictures = self._pictures(numbers, views.device)
+        return _table([picture.flatten(0, 1) for picture in pictures], self.size[views], 1)
+
+    def features(self, views: Int[Tensor, "views"], numbers: Sequence[int], network: ImageNetwork) -> ViewTable:
+        """Return the features of views, given as to `colors`, with gradients where they are asked for."""
+        device = views.device
         if torch.is_grad_enabled():
-            found = self._made(views, network, device)
+            found = self._made(numbers, network, device)
         else:
             made = functools.partial(self._made, network=network, device=device)
-            found = self._features.get(views, made, device, _state_of(network))
-        return _table(found, self._sizes(views, network.scale), network.scale, device)
+            found = self._features.get(numbers, made, device, _state_of(network))
+        return _table(found, -(-self.size[views] // network.scale), network.scale)
 
     def _made(self, views: Sequence[int], network: ImageNetwork, device: torch.device) -> list[Tensor]:
         pictures = self._pictures(views, device)
@@ -105,11 +116,6 @@ class ViewTables:
             return [blend(pixels.view(view).cpu().float() / 255.0, behind).to(device) for view in lacking]
 
         return self._colors.get(views, make, device)
-
-    def _sizes(self, views: Sequence[int], scale: int) -> Tensor:
-        pixels = self.photographs.pixels
-        size = torch.stack([pixels.width, pixels.height], dim=-1)[torch.tensor(views, device=pixels.width.device)]
-        return -(-size // scale)
 
 
 class _Kept:
@@ -141,9 +147,9 @@ class _Kept:
             return [found[view] for view in views]
 
 
-def _table(of_views: Sequence[Tensor], size: Int[Tensor, "views 2"], scale: int, device: torch.device) -> ViewTable:
+def _table(of_views: Sequence[Tensor], size: Int[Tensor, "views 2"], scale: int) -> ViewTable:
     count = size.prod(dim=1)
-    return ViewTable(torch.cat(list(of_views)), (count.cumsum(0) - count).to(device), size.to(device), scale)
+    return ViewTable(torch.cat(list(of_views)), count.cumsum(0) - count, size, scale)
 
 
 def _state_of(network: nn.Module) -> object:
