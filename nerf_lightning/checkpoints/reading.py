@@ -33,6 +33,8 @@ LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
 OUTLIVED = ".sampler.grid.floor"
 """How the names of weights end that earlier versions kept, and nothing reads now."""
+ONCE_FLOAT64 = ".measured"
+"""How those end that earlier versions kept in float64, which not every device has."""
 
 log = logging.getLogger(__name__)
 
@@ -125,7 +127,7 @@ def _unpacked(record: dict[str, Any], path: Path) -> dict[str, Tensor]:
 def read_content(path: Path, resumable: bool) -> dict[str, Any]:
     """Return a checkpoint as it lies in its file, of which everything is as `format.checkpoint` says.
 
-    What earlier versions kept and nothing reads now is left out.
+    What earlier versions kept and nothing reads now is left out, and what they kept in float64 is float32.
 
     Args:
         path: the file.
@@ -139,6 +141,8 @@ def read_content(path: Path, resumable: bool) -> dict[str, Any]:
     for weights in (content["state_dict"], content[KEY].get("packed", {}).get("rows", {})):
         for name in [name for name in weights if name.endswith(OUTLIVED)]:
             del weights[name]
+    state = content["state_dict"]
+    state |= {name: number.float() for name, number in state.items() if name.endswith(ONCE_FLOAT64)}
     return content
 
 

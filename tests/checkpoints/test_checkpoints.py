@@ -10,7 +10,13 @@ from support.running import refused
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.packing import pack_rows
-from nerf_lightning.checkpoints.reading import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
+from nerf_lightning.checkpoints.reading import (
+    last_good_checkpoint,
+    make_record,
+    newest_checkpoint,
+    read_checkpoint,
+    read_content,
+)
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.errors import InputError
 
@@ -65,6 +71,15 @@ def test_what_earlier_versions_kept_of_an_occupancy_grid_is_left_out(tmp_path):
     for more in ({}, {"packed": packed}):
         torch.save({"state_dict": state, "global_step": 0, "nerf_lightning": record | more}, path)
         assert list(read_checkpoint(path).weights) == ["levels.fine.sampler.grid.density"]
+
+
+def test_the_samples_per_ray_that_earlier_versions_kept_in_float64_are_read(tmp_path):
+    name, path = "model.levels.fine.measured", tmp_path / "last.ckpt"
+    record = make_record(ball_scene(), config="", choices={}) | {"precision": "32-true", "tile_points": None}
+    state = {name: torch.tensor(7.25, dtype=torch.float64)}
+    torch.save({"state_dict": state, "global_step": 0, "nerf_lightning": record}, path)
+    assert read_content(path, resumable=False)["state_dict"][name].dtype == torch.float32
+    assert read_checkpoint(path).weights["levels.fine.measured"] == 7.25
 
 
 def change_a_weight(path):

@@ -46,7 +46,7 @@ class PackedLevel(Level):
         # Samples and rays since the last update of the grid, and samples that exceeded the capacity, ever.
         self.register_buffer("tally", torch.zeros(3, dtype=torch.int64))
         # Samples per ray before the last update; negative: unknown.
-        self.register_buffer("measured", torch.tensor(-1.0, dtype=torch.float64))
+        self.register_buffer("measured", torch.tensor(-1.0))
         self._samples_per_ray: float | None = None
 
     def points_per_ray(self, before: float, training: bool) -> float:

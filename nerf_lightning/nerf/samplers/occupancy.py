@@ -98,6 +98,7 @@ class OccupancySampler(PackedSampler):
         # Made on the host when first needed, from what the buffers hold: reading them stops other devices.
         self._lattice: Tensor | None = None
         self._numbers: Tensor | None = None
+        self._least_density = 0.0
 
     def fit_to(self, scene: Scene) -> None:
         """Take the scene's box, near and far, and mark the cells in which there cannot be anything.
@@ -258,6 +259,7 @@ class OccupancySampler(PackedSampler):
         grid = self.grid
         if self._numbers is None:
             self._numbers = grid.possible.flatten().cpu().nonzero()[:, 0]
+            self._least_density = self.min_alpha / self.step_size
         number = self._numbers = self._numbers.to(grid.possible.device)
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
@@ -266,9 +268,7 @@ class OccupancySampler(PackedSampler):
             grid.learn(cells, density(grid.positions(cells, part)).float(), self.decay)
         if step >= self.prune_after:
             mean = grid.density.sum() / grid.possible.sum()
-            shortest = (grid.aabb[1] - grid.aabb[0]).norm().double() / self.num_steps
-            threshold = torch.minimum(0.5 * mean, (self.min_alpha / shortest).float())
-            grid.occupy((grid.density > threshold) & grid.possible)
+            grid.occupy((grid.density > (0.5 * mean).clamp(max=self._least_density)) & grid.possible)
 
     def _fit_to_space(self) -> None:
         """Make the grid as large as the space wants it; what it held is forgotten."""
