@@ -34,6 +34,7 @@ from nerf_lightning.console import say, stderr_console
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.machine import peak_memory, seconds_of
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.packed_level import PackedLevel
@@ -124,7 +125,7 @@ def benchmark(config: DictConfig) -> float:
         "rounds": config.rounds,
     }
     print_table(result)
-    folder = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
+    folder = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
     write_json(folder / "bench.json", result)
     say(f"written to {folder / 'bench.json'}")
     return float(result["training rays/s"]["median"])

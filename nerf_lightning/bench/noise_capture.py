@@ -7,6 +7,8 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 
+from nerf_lightning.files.made_folders import make_folder
+
 ANGLE = 0.7
 """Radians that a photograph shows across."""
 KINDS = 8
@@ -15,7 +17,7 @@ KINDS = 8
 
 def write_noise_capture(folder: Path, count: int, side: int) -> None:
     """Write so many square photographs (JPEG) of smooth noise, and a transforms.json of cameras on a circle."""
-    folder.mkdir(parents=True)
+    make_folder(folder)
     random = np.random.default_rng(0)
     frames, pictures = [], []
     for _ in range(min(count, KINDS)):

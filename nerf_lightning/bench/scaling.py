@@ -23,6 +23,7 @@ from nerf_lightning.console import StdoutConsole, say, stderr_console
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,7 +59,7 @@ def benchmark_scaling(config: DictConfig) -> dict[str, float]:
         for name, case in track(cases, "measuring", console=stderr_console(), transient=True):
             found[name].append((case.size, _measured(config, case, Path(folder))))
     _print(found)
-    where = Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench")
+    where = make_folder(Path(config.paths.output_dir or Path(config.paths.root_dir) / "bench"))
     content = {name: [{"size": size} | vars(point) for size, point in points] for name, points in found.items()}
     write_json(where / "scaling.json", content)
     _draw(found, where / "scaling.png")

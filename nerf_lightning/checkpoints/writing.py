@@ -24,7 +24,8 @@ def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
     part = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         target.parent.mkdir(exist_ok=True)  # not the run folder: one that was deleted or renamed stays away
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file:  # not through a link of this name
             torch.save(checkpoint, file)
             file.flush()
             os.fsync(file.fileno())

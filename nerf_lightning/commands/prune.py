@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.packing import NumberType
-from nerf_lightning.checkpoints.reading import LAST, Checkpoint
+from nerf_lightning.checkpoints.reading import LAST, Checkpoint, read_content
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.commands.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.config.instantiate import require_fitting
@@ -17,6 +17,7 @@ from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.narrower_model import shapes_of, widths_of, with_widths
 from nerf_lightning.console import say
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import below, make_folder
 from nerf_lightning.nerf.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.open_checkpoint import open_checkpoint, trusted_modules
@@ -59,10 +60,24 @@ def run(config: DictConfig) -> float | None:
     packed = packed_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
     tuning = fine_tuning(wide, after, config.finetune_steps)
     with filled_folder(config.paths.output_dir, beside_checkpoint(wide.path, "pruned")) as folder:
-        target = folder / "checkpoints" / LAST
+        target = make_folder(folder, "checkpoints") / LAST
+        _require_own(target)
         write_checkpoint(_content(narrow, packed), target)
         say(*(f"{name}  {before[name]} -> {width} neurons wide" for name, width in after.items()), _sizes(wide, target))
-        return None if tuning is None else fine_tune(tuning, target, folder / "finetuned")
+        return None if tuning is None else fine_tune(tuning, target, below(folder, "finetuned"))
+
+
+def _require_own(target: Path) -> None:
+    """Refuse to write over what is no checkpoint that was made smaller: one of a run has more than weights."""
+    try:
+        is_own = not target.exists() or "optimizer_states" not in read_content(target, resumable=False)
+    except InputError:
+        is_own = False
+    if not is_own:
+        raise InputError(
+            f"{target} was not written by nerf prune, and would be lost. Move it away, or give another folder with "
+            "paths.output_dir=DIR."
+        )
 
 
 def _content(narrow: Checkpoint, packed: dict[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.escaping import for_file_name
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.visualization.pictures import (
     depth_picture,
     error_picture,
@@ -76,7 +77,8 @@ class KeptViews:
         return names
 
     def _write(self, name: str, view: ScoredView) -> None:
-        save_view(view, self.folder / "images" / f"{name}.png", self.folder / "images" / "views" / name)
+        parts = make_folder(self.folder, "images", "views", name)
+        save_view(view, self.folder / "images" / f"{name}.png", parts)
 
 
 def picture_name(split: str, view_name: str) -> str:

@@ -14,6 +14,7 @@ from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_scri
 from nerf_lightning.export.base import Export, require_no_files, require_no_folders
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model
@@ -67,7 +68,7 @@ class CamerasExport(Export):
         if reason:
             log.warning("%s No COLMAP model is written, only transforms.json.", reason)
             return [transforms]
-        sparse = folder / "sparse" / "0"
+        sparse = make_folder(folder, "sparse", "0")
         for name, text in colmap_files(cameras, record.view_names).items():
             with whole_file(sparse / name) as part:
                 part.write_text(text, encoding="utf-8")

@@ -19,6 +19,7 @@ from nerf_lightning.export.base import Export, require_no_files, require_no_fold
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
 from nerf_lightning.nerf.geometry.frames import directions_to_user, told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -60,26 +61,27 @@ class ImagesExport(Export):
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)
         names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
+        depths, opacities, directions = (make_folder(folder, name) for name in ("depth", "opacity", "normals"))
         farthest = 0.0
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):
                 seen = see(model, record, record.cameras, view, tile_points)
                 depth = self._depth(seen, record, view)
-                _save_array(folder / "depth" / f"{names[view]}.npy", depth)
+                _save_array(depths / f"{names[view]}.npy", depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
-                _save_opacity(folder / "opacity" / f"{names[view]}.png", seen.opacity)
+                _save_opacity(opacities / f"{names[view]}.png", seen.opacity)
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
-                save_png(folder / "normals" / f"{names[view]}.png", to_bytes(normals))
+                save_png(directions / f"{names[view]}.png", to_bytes(normals))
                 report("pictures", (number + 1) / len(views))
             scale = _scale(record, farthest)
             for number, view in enumerate(views):
-                _save_depth(folder / "depth", names[view], scale)
+                _save_depth(depths, names[view], scale)
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
         write_json(about, self._described(record, names, scale))
         said = "millimetres" if scale == MILLIMETRE and record.metres_per_unit is not None else f"{scale:.4g} of these"
         say(f"depth        in {told_length(record)[1]}; a step of the 16-bit PNG is {said}")
-        return [*(folder / name for name in ("depth", "opacity", "normals")), about]
+        return [depths, opacities, directions, about]
 
     def _views(self, record: SceneRecord) -> list[int]:
         everything = tuple(range(len(record.view_names)))

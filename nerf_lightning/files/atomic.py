@@ -19,10 +19,9 @@ _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 def whole_file(path: Path) -> Iterator[Path]:
     """Lend a temporary path beside `path` that takes its place when the block ends well, else is removed.
 
-    A missing folder is made. The temporary name keeps the suffix, since writers choose a format by it. What killed
-    processes left in the folder is removed.
+    Its folder is there (see `made_folders`). The temporary name keeps the suffix, since writers choose a format
+    by it. What killed processes left in the folder is removed.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path.parent)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:

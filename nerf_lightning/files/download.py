@@ -16,6 +16,7 @@ from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn, Transf
 
 from nerf_lightning.console import progress_bar
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.regular import open_regular, open_to_append
 
 TIMEOUT = 10.0
@@ -42,7 +43,7 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
     """
     try:
         _check_address(url, sha256)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         with FileLock(f"{target}.lock"):
             if not target.exists():
                 part = Path(f"{target}.part")

@@ -30,6 +30,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.files.made_folders import make_folder, make_new_folder
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 from nerf_lightning.slurm import slurm_job, was_requeued
@@ -142,8 +143,7 @@ def open_run(
         _require_same_run(folder, identity, set(map(key_of, typed)), resuming)
     require_no_way_out(folder)
     try:
-        (folder / ".hydra").mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / ".hydra" / "lock")
+        lock = FileLock(make_folder(folder, ".hydra") / "lock")
         lock.acquire(timeout=0)
     except Timeout as error:
         raise InputError(
@@ -206,9 +206,7 @@ def write_config(folder: Path, config: DictConfig, hydra_config: Any) -> None:
             OmegaConf.save(content, part)
 
 
-def _choose(
-    config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None
-) -> tuple[Path, bool]:
+def _choose(config: DictConfig, identity: dict[str, Any], num_steps: int, job_folder: Path | None) -> tuple[Path, bool]:
     """Return the folder, and whether what is there is to be gone on with."""
     resume, given = config.resume, config.paths.output_dir
     if resume is not None and resume != "auto":
@@ -302,6 +300,6 @@ def _fresh(parent: Path) -> Path:
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     for name in itertools.chain([stamp], (f"{stamp}_{count}" for count in itertools.count(2))):
         with contextlib.suppress(FileExistsError):
-            (parent / name).mkdir(parents=True)
+            make_new_folder(parent / name)
             return parent / name
     raise AssertionError("unreachable: the names never end")

@@ -1,6 +1,5 @@
 """Where a command that does not train writes: as the user says, or beside the checkpoint."""
 
-import contextlib
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +7,7 @@ from pathlib import Path
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.runs.folder import job_folder
 
 
@@ -39,7 +39,7 @@ def output_folder(given: str | None, default: Path) -> Path:
     """
     folder = chosen_folder(given, default)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         # Under a name that nobody can have planted a link at.
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".probe"):
             pass
@@ -62,6 +62,4 @@ def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
     try:
         yield output_folder(given, default)
     finally:
-        with contextlib.suppress(OSError):  # the first that holds something ends it
-            for folder in made:
-                folder.rmdir()
+        remove_empty(*made)

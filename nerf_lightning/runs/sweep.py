@@ -20,8 +20,9 @@ from nerf_lightning.config.overrides import to_type
 from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
+from nerf_lightning.files.made_folders import remove_empty
 from nerf_lightning.runs.saved_overrides import to_give_again
-from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, remove_empty, stop_file
+from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
 from nerf_lightning.slurm import slurm_job
 
@@ -135,8 +136,7 @@ def _remove_refused(sweep: Sweep) -> bool:
         return False
     for left in (*records_folder(folder).glob("*.json"), sweep_record(folder), folder / "multirun.yaml"):
         left.unlink(missing_ok=True)
-    for empty in (records_folder(folder), folder / ".hydra", *sweep.made):
-        remove_empty(empty)
+    remove_empty(records_folder(folder), folder / ".hydra", *sweep.made)
     return True
 
 

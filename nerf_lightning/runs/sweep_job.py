@@ -4,7 +4,6 @@ Jobs may run in other processes and on other machines; what the sweep's own proc
 files in the sweep's folder. A job that fails returns None, so that the sweep goes on with the others.
 """
 
-import contextlib
 import json
 import logging
 import os
@@ -20,6 +19,7 @@ from omegaconf import DictConfig
 from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.files.json_files import number, write_json
+from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 from nerf_lightning.slurm import was_requeued
@@ -45,7 +45,7 @@ class JobRecord:
 
     def write(self, sweep_folder: Path) -> None:
         """Leave the record for the sweep's own process."""
-        write_json(records_folder(sweep_folder) / f"{self.number}.json", asdict(self))
+        write_json(make_folder(records_folder(sweep_folder)) / f"{self.number}.json", asdict(self))
 
 
 def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:
@@ -100,12 +100,6 @@ def _skip(record: JobRecord, former: Path, sweep_folder: Path) -> float | None:
         remove_empty(own)
     replace(record, folder=str(former), state="finished before").write(sweep_folder)
     return number(read_note(former).get("psnr"))
-
-
-def remove_empty(folder: Path) -> None:
-    """Remove a folder that nothing was written into."""
-    with contextlib.suppress(OSError):
-        folder.rmdir()
 
 
 def job_label(number: int, folder: Path, overrides: list[str]) -> str:

@@ -6,6 +6,8 @@ from pathlib import Path
 import yaml
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
 
 JOB_NUMBER = "${hydra.job.num}"
@@ -23,8 +25,9 @@ class SweepRecord:
     def write(self, sweep_folder: Path) -> None:
         """Leave it in the sweep's folder."""
         record = sweep_record(sweep_folder)
-        record.parent.mkdir(parents=True, exist_ok=True)
-        record.write_text(yaml.safe_dump({"arguments": self.arguments, "slurm_job": self.slurm_job}))
+        make_folder(sweep_folder, record.parent.name)
+        with whole_file(record) as part:
+            part.write_text(yaml.safe_dump({"arguments": self.arguments, "slurm_job": self.slurm_job}))
 
     def typed(self) -> list[str]:
         """Return the arguments without what was made of them."""

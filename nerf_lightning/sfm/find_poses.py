@@ -1,17 +1,14 @@
 """Structure from motion from beginning to end: photographs or a video in, a capture in a folder out, or nothing."""
 
-import contextlib
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from nerf_lightning.console import StageProgress
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
+from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.sfm.image_pairs import chosen_matching
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
@@ -35,9 +32,9 @@ def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
         is_video: which of the two.
 
     Raises:
-        InputError: there are poses in the folder already, or other pictures.
+        InputError: there are poses in the folder already, or other pictures; or a link leads to where they would go.
     """
-    if (folder / "sparse" / "0").exists():
+    if below(folder, "sparse", "0").exists():
         raise InputError(
             f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
             "with paths.output_dir=DIR."
@@ -52,33 +49,15 @@ def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
 @contextmanager
 def _unfinished(folder: Path) -> Iterator[Path]:
     """Lend a folder in `folder` that vanishes at the end, and `folder` with it if nothing came to lie in it."""
-    work, is_new = folder / UNFINISHED, not folder.exists()
-    work.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(work / "lock")
+    scratch, is_new = ScratchFolder(folder, UNFINISHED, "finds poses"), not folder.exists()
+    scratch.hold()
     try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise InputError(
-            f"{folder} is in use by another process that finds poses there. Wait for it, or give another folder with "
-            "paths.output_dir=DIR."
-        ) from error
-    try:
-        _remove_content(work)  # what a killed process left
-        yield work
+        empty_ours(scratch.path)  # of what a killed process left
+        yield scratch.path
     finally:
-        lock.release()
-        shutil.rmtree(work, ignore_errors=True)
+        scratch.remove()
         if is_new:
-            with contextlib.suppress(OSError):  # not empty
-                folder.rmdir()
-
-
-def _remove_content(work: Path) -> None:
-    for path in work.iterdir():
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path.name != "lock":
-            path.unlink()
+            remove_empty(folder)
 
 
 def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_outside: bool) -> tuple[SparseModel, str]:
@@ -106,8 +85,7 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_ou
         )
     costs = {READING: READING_COST * sum(p.width * p.height for p in photographs) / 1e6}
     with _unfinished(folder) as work, StageProgress(costs | stage_costs(photographs, settings)) as report:
-        images = folder / "images" if in_place else work / "images"
-        images.mkdir(exist_ok=True)
+        images = folder / "images" if in_place else make_folder(work, "images")
         for number, photograph in enumerate(photographs):
             report(READING, number / len(photographs))
             check_pixels(photograph)
@@ -127,8 +105,7 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
     num_frames = count_frames(video)
     stride = frame_stride(num_frames, every)
     with _unfinished(folder) as work:
-        images = work / "images"
-        images.mkdir()
+        images = make_folder(work, "images")
         with StageProgress({FRAMES: FRAME_COST * num_frames}) as report:
             write_sharp_frames(video, images, stride, lambda count: report(FRAMES, count / num_frames))
         photographs = _frames(video, images, stride, num_frames)
@@ -170,5 +147,4 @@ def _publish(work: Path, folder: Path) -> None:
     """Move what is finished to its place; sparse/0 comes last, for it says that all is there."""
     if (work / "images").exists():
         (work / "images").rename(folder / "images")
-    (folder / "sparse").mkdir(exist_ok=True)
-    (work / "sparse" / "0").rename(folder / "sparse" / "0")
+    (work / "sparse" / "0").rename(make_folder(folder, "sparse") / "0")

@@ -15,6 +15,7 @@ from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.sfm.image_pairs import image_pairs, tiles_of
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_one_camera
 from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings
@@ -94,8 +95,7 @@ def reconstruct(
         models = _models(colmap, database, folder, work / "models", settings, report)
         if not models:
             raise NothingFoundError(_nothing_found(len(names)))
-        sparse.mkdir(parents=True)
-        models[0].write_binary(sparse)
+        models[0].write_binary(make_folder(sparse))
     return _in_short(models, names)
 
 
@@ -219,7 +219,7 @@ def _models(
     with _opened(colmap, database) as content:
         total = content.num_images()
     placed = chain([0.0], (count / total for count in range(2, 10**9)))
-    models.mkdir()
+    make_folder(models)
 
     def advance() -> None:
         # A second model starts again with its first pair; the bar stays full while it is tried.

@@ -6,13 +6,11 @@ seen) and over which depths their colours reach.
 
 import json
 import logging
-import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from filelock import FileLock, Timeout
 from jaxtyping import UInt8
 from torch import Tensor
 
@@ -21,6 +19,7 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_folder, make_ours
 from nerf_lightning.video.animation import write_animation
 from nerf_lightning.video.encoding import write_video
 from nerf_lightning.video.exr import Channels, save_exr
@@ -28,7 +27,7 @@ from nerf_lightning.video.settings import ENDINGS, Form
 from nerf_lightning.visualization.pictures import save_png
 
 Range = tuple[float, float]
-LOCK = "lock"
+HIDDEN = ".frames"
 
 log = logging.getLogger(__name__)
 
@@ -57,10 +56,9 @@ class FilmFrames:
     ) -> None:
         self.shows_encoding, self.transparent = shows_encoding, transparent
         self.folder, self.films, self.count, self.form = folder, films, count, form
-        self.hidden = folder / ".frames"
-        self.root = self.hidden if ENDINGS[form] else folder
+        self.scratch = ScratchFolder(folder, HIDDEN, "is filming")
+        self.root = self.scratch.path if ENDINGS[form] else folder
         self.suffix = ".exr" if form == "exr" else ".png"
-        self.lock = FileLock(self.hidden / LOCK)
 
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
         """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
@@ -68,14 +66,22 @@ class FilmFrames:
         Frames of another film are removed, and the range is measured anew.
 
         Raises:
-            InputError: another process films into this folder, or it cannot be written.
+            InputError: another process films into this folder, it cannot be written, or it holds files that would be
+                removed and are not ours.
         """
-        self._hold()
-        note = read_json_object(self.hidden / "film.json")
+        with self._kept():
+            self.scratch.hold()
+            kept = [] if ENDINGS[self.form] else self.films
+            results = [make_ours(self.folder, film, files=self._pattern) for film in kept]
+        about = self.scratch.path / "film.json"
+        note = read_json_object(about)
         if note.get("fingerprint") != fingerprint or not _is_range(note.get("depth_range")):
-            self._discard()
+            with self._kept():
+                empty_ours(self.scratch.path)
+                for folder in results:
+                    empty_ours(folder, self._pattern)
             note = {"fingerprint": fingerprint, "depth_range": list(measure())}
-            with self._kept(), whole_file(self.hidden / "film.json") as part:
+            with self._kept(), whole_file(about) as part:
                 part.write_text(json.dumps(note, indent=2) + "\n")
         missing = [number for number in range(self.count) if not self._is_there(number)]
         if len(missing) < self.count:
@@ -94,6 +100,7 @@ class FilmFrames:
         try:
             with self._kept():
                 file = self._file(film, number)
+                make_folder(self.folder, *file.parent.relative_to(self.folder).parts)
                 if isinstance(picture, Tensor):
                     save_png(file, picture)
                 else:
@@ -115,19 +122,21 @@ class FilmFrames:
                         write(file, self._read(film), fps, self.count)
                 except InputError as error:
                     raise InputError(f"{error} {self._cure()}") from error
-            self._remove()
-        self.close()
-        if ENDINGS[self.form]:
-            with suppress(OSError):  # another process has come
-                self.hidden.rmdir()
+            self.scratch.remove()
+        else:
+            self.close()
 
     def close(self) -> None:
         """Let others have the folder; the frames stay."""
-        self.lock.release()
+        self.scratch.release()
 
     def results(self) -> list[Path]:
         """Return the files, or the folders of frames."""
         return [self.folder / f"{film}{ENDINGS[self.form]}" for film in self.films]
+
+    @property
+    def _pattern(self) -> str:
+        return f"frame_*{self.suffix}"
 
     def _file(self, film: str, number: int) -> Path:
         return self.root / film / f"frame_{number:04d}{self.suffix}"
@@ -144,36 +153,6 @@ class FilmFrames:
                 yield torch.from_numpy(read_rgba(file)[..., :channels].copy())
             except InputError as error:
                 raise InputError(f"The frame {file} cannot be read. Remove it.") from error
-
-    def _hold(self) -> None:
-        with self._kept():
-            self.hidden.mkdir(parents=True, exist_ok=True)
-            try:
-                self.lock.acquire(timeout=0)
-            except Timeout as error:
-                raise InputError(
-                    f"{self.folder} is in use by another process that is filming there. Wait for it, stop it, or give "
-                    "another folder with paths.output_dir=DIR."
-                ) from error
-
-    def _remove(self) -> None:
-        """Remove all that is hidden while it is ours, the lock's file last: released, it may be another process's."""
-        with suppress(OSError):  # the films are there, whatever stays
-            for place in self.hidden.iterdir():
-                if place.is_dir():
-                    shutil.rmtree(place)
-                elif place.name != LOCK:
-                    place.unlink()
-            (self.hidden / LOCK).unlink()
-
-    def _discard(self) -> None:
-        for folder in self.hidden.iterdir():
-            if folder.is_dir():
-                shutil.rmtree(folder)
-        if not ENDINGS[self.form]:
-            for film in self.films:
-                for file in (self.folder / film).glob(f"frame_*{self.suffix}"):
-                    file.unlink()
 
     @contextmanager
     def _kept(self) -> Iterator[None]:

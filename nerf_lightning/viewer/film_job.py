@@ -1,6 +1,5 @@
 """A film that is rendered beside what people look at: a frame whenever it has its turn."""
 
-import shutil
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,6 +9,7 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import make_new_folder, remove_new_folder
 from nerf_lightning.video.film import film_steps, films_of
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.settings import FilmSettings
@@ -117,8 +117,7 @@ class FilmJob:
     def _fail(self, why: str) -> None:
         self.failure = why
         self._steps.close()
-        with suppress(OSError):
-            shutil.rmtree(self.folder)
+        remove_new_folder(self.folder)
         self.on_change(self)
 
 
@@ -139,6 +138,6 @@ def new_folder(folder: Path) -> Path:
     for number in range(1, limits.MOST_FILMS + 1):
         with suppress(FileExistsError):
             made = folder / f"film_{number:03d}"
-            made.mkdir(parents=True)
+            make_new_folder(made)
             return made
     raise OSError(f"{folder} holds {limits.MOST_FILMS} films, the most that the page makes")

@@ -1,10 +1,10 @@
 """The panel's part for films: the camera path as a video, how far it is, and where it lies."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import remove_new_folder
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.client import ViewerClient
@@ -66,7 +66,7 @@ class FilmPanel:
             self.job = self._job(folder)
         except (InputError, OSError) as error:
             if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_new_folder(folder)
             text = str(error) if isinstance(error, InputError) else not_saved(error)
             self.said.content = as_plain_markdown(text, MOST_SAID)
             return

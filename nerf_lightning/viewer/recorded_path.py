@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve, keyframe_focal, keyframe_poses
@@ -223,7 +224,7 @@ def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]
 
 
 def _made(folder: Path, stem: str, ending: str, most: int) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for number in range(1, most + 1):
         path = folder / f"{stem}_{number:03d}{ending}"
         with suppress(FileExistsError):

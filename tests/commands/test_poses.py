@@ -9,6 +9,8 @@ from support.alignment import colmap_poses, pose_errors
 from support.captures import real_capture
 from support.corner import corner_poses, photograph, write_corner
 
+from nerf_lightning.files.made_folders import make_ours
+
 pytest.importorskip("pycolmap")
 # imageio's reader of videos forgets its pipes.
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
@@ -195,7 +197,7 @@ def test_poses_and_pictures_that_exist_are_not_overwritten(poses, photographs, t
 @pytest.mark.slow
 def test_the_cameras_of_a_known_scene_are_found(poses, tmp_path):
     true = write_corner(tmp_path / "found" / "images", count=6)
-    (tmp_path / "found" / ".poses.part" / "models").mkdir(parents=True)  # as a killed process leaves it
+    (make_ours(tmp_path / "found", ".poses.part") / "models").mkdir()  # as a killed process leaves it
     result = poses(f"images={tmp_path / 'found' / 'images'}", "camera_model=SIMPLE_PINHOLE", "num_features=600")
     assert result.code == 0, result.err
     assert result.err == ""

@@ -2,12 +2,16 @@
 
 import errno
 import json
+import sys
+from contextlib import suppress
 
 import pytest
 import torch
 from filelock import FileLock
+from support.running import refused
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.made_folders import MARK
 from nerf_lightning.video import frames as film_frames
 from nerf_lightning.video.frames import FilmFrames
 
@@ -60,7 +64,7 @@ def test_frames_that_are_the_result_are_replaced_by_another_films_and_else_kept(
     each.finish(fps=4)
     assert (tmp_path / "video" / "frame_0003.png").is_file()
     assert opened(frames(tmp_path, "frames"), fingerprint="b")[0] == [0, 1, 2, 3]
-    assert [file.name for file in (tmp_path / "video").iterdir()] == ["note.txt"]
+    assert {file.name for file in (tmp_path / "video").iterdir()} == {"note.txt", MARK}
 
 
 def test_an_empty_file_is_no_frame(tmp_path):
@@ -133,14 +137,14 @@ def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch
     stop_after(tmp_path, 0, 1, 2, 3)
     each, other = frames(tmp_path), frames(tmp_path)
     opened(each)
-    release = each.close
+    release = each.scratch.release
 
-    def closed():
+    def released():
         release()
         opened(other, fingerprint="b")  # at the first chance
         other.save("video", 0, PICTURE)
 
-    monkeypatch.setattr(each, "close", closed)
+    monkeypatch.setattr(each.scratch, "release", released)
     each.finish(fps=4)
     assert (tmp_path / ".frames" / "video" / "frame_0000.png").is_file()
     with pytest.raises(InputError, match="in use by another process"):
@@ -156,3 +160,51 @@ def test_nothing_hidden_stays_beside_a_finished_film(tmp_path):
     opened(each)
     each.finish(fps=4)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
+
+
+def test_a_folder_that_is_not_ours_is_neither_emptied_nor_filled(tmp_path):
+    for theirs in ("film.json", "chapters/1.tex"):
+        (tmp_path / ".frames" / theirs).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / ".frames" / theirs).write_text("{}")
+    for form in ("video", "frames"):
+        refused(opened, frames(tmp_path, form), parts=(f"{tmp_path}/.frames", "not made by this program", "chapters"))
+    assert (tmp_path / ".frames" / "chapters" / "1.tex").is_file()
+
+
+def test_frames_that_are_not_ours_are_neither_removed_nor_written_over(tmp_path):
+    (tmp_path / "video").mkdir()
+    (tmp_path / "video" / "frame_0000.png").write_text("mine")
+    refused(opened, frames(tmp_path, "frames"), parts=(f"{tmp_path}/video", "not made by this program", "frame_0000"))
+    assert (tmp_path / "video" / "frame_0000.png").read_text() == "mine"
+
+
+def test_frames_are_ours_whatever_was_filmed_since(tmp_path):
+    stop_after(tmp_path, 0, 1, 2, 3, form="frames")
+    stop_after(tmp_path, 0, 1, 2, 3)
+    each = frames(tmp_path)
+    opened(each)
+    each.finish(fps=4)
+    assert opened(frames(tmp_path, "frames"), fingerprint="b")[0] == [0, 1, 2, 3]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
+@pytest.mark.parametrize("link", [".frames", "video", ".frames/video", ".frames/lock", ".frames/film.json"])
+def test_frames_go_through_no_link(tmp_path, link):
+    """One that leads to another place in the same folder, too."""
+    mine = tmp_path / "mine"
+    (mine / "chapters").mkdir(parents=True)
+    (mine / "frame_0000.png").write_text("mine")
+    (mine / "1.tex").write_text("mine")
+    stop_after(tmp_path, 0)
+    if (tmp_path / link).is_dir():
+        (tmp_path / link).rename(tmp_path / "away")
+    (tmp_path / link).unlink(missing_ok=True)
+    (tmp_path / link).symlink_to(mine / "1.tex" if "." in link[2:] or "lock" in link else mine)
+    for form in ("video", "frames"):
+        each = frames(tmp_path, form)
+        with suppress(InputError):
+            opened(each, fingerprint="b")
+            each.save("video", 0, PICTURE)
+        each.close()
+    assert {path.name for path in mine.iterdir()} == {"chapters", "frame_0000.png", "1.tex"}
+    assert (mine / "1.tex").read_text() == (mine / "frame_0000.png").read_text() == "mine"

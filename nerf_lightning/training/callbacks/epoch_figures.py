@@ -7,6 +7,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.errors import require_positive
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.schema import Many, Number, Record, Whole
 from nerf_lightning.training.callbacks.watcher import render_validation_view
 from nerf_lightning.visualization.figures import epoch_figure, loss_curve
@@ -45,8 +46,8 @@ class EpochFigures(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: Any) -> None:
         """Draw the whole curve."""
         if trainer.is_global_zero:
-            path = Path(trainer.default_root_dir) / "images" / "loss_curve.png"
-            save_png(path, loss_curve(self.steps, self.losses))
+            folder = make_folder(Path(trainer.default_root_dir), "images")
+            save_png(folder / "loss_curve.png", loss_curve(self.steps, self.losses))
 
     def state_dict(self) -> dict[str, Any]:
         """Remember the curve across a resume."""
@@ -61,4 +62,5 @@ class EpochFigures(Callback):
             return
         _, picture = render_validation_view(trainer, system, self.view)
         figure = epoch_figure(picture.rgb, picture.depth, self.steps, self.losses)
-        save_png(Path(trainer.default_root_dir) / "images" / "epochs" / f"epoch_{epoch:04d}.png", figure)
+        folder = make_folder(Path(trainer.default_root_dir), "images", "epochs")
+        save_png(folder / f"epoch_{epoch:04d}.png", figure)

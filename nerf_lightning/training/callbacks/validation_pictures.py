@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
@@ -35,7 +36,7 @@ class ValidationPictures(Watcher):
         scene = trainer.datamodule.scene
         truth = photograph(scene, view, scene.background)
         panel = mosaic(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity)
-        folder = Path(trainer.default_root_dir) / "images"
-        save_png(folder / "validation" / f"step_{step:07d}.png", panel)
-        save_png(folder / "progress" / f"step_{step:07d}.png", to_bytes(picture.rgb))
+        for name, shown in (("validation", panel), ("progress", to_bytes(picture.rgb))):
+            folder = make_folder(Path(trainer.default_root_dir), "images", name)
+            save_png(folder / f"step_{step:07d}.png", shown)
         show_picture(trainer.loggers, "validation/picture", panel, step)

@@ -10,7 +10,6 @@
 `focal` is that of a picture as wide as the photographs, so that it does not depend on the size of the film.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -21,6 +20,7 @@ from typing import Any
 import yaml
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.video.paths.base import is_number, is_point
 
@@ -64,12 +64,8 @@ def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
         {key: list(value) if key in POINTS else value for key, value in asdict(each).items() if value is not None}
         for each in keyframes
     ]
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with whole_file(path) as part:
         part.write_text(yaml.safe_dump({"keyframes": listed}, sort_keys=False, default_flow_style=None))
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_keyframes(path: Path) -> list[Keyframe]:
