@@ -7,6 +7,8 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+from nerf_lightning.files.made_folders import make_folder
+
 try:
     import fcntl
 except ImportError:  # Windows: what killed processes leave there stays
@@ -19,9 +21,11 @@ _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 def whole_file(path: Path) -> Iterator[Path]:
     """Lend a temporary path beside `path` that takes its place when the block ends well, else is removed.
 
-    Its folder is there (see `made_folders`). The temporary name keeps the suffix, since writers choose a format
-    by it. What killed processes left in the folder is removed.
+    A missing folder is made; below one that the user named, `make_folder` does it first, and refuses links. The
+    temporary name keeps the suffix, since writers choose a format by it. What killed processes left in the folder is
+    removed.
     """
+    make_folder(path.parent)
     _sweep(path.parent)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:

@@ -57,6 +57,7 @@ def write_video(
 
     Args:
         path: where to. It ends in .mp4, which plays everywhere, or, for frames with alpha too, in .webm or .mov.
+            Missing folders are made.
         frames: pictures in RGB, or in RGB and straight alpha, row 0 on top.
         fps: frames per second.
         total: how many frames there should be, where it is known.

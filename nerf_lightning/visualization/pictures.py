@@ -48,7 +48,7 @@ def straight_colors(
 
 
 def save_png(path: Path, picture: UInt8[Tensor, "height width channels"]) -> None:
-    """Write a picture, in RGB or in RGB and straight alpha, as PNG: whole or not at all."""
+    """Write a picture, in RGB or in RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
     with whole_file(path) as part:
         Image.fromarray(picture.numpy()).save(part, format="PNG")
 

