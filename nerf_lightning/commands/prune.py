@@ -15,6 +15,7 @@ from nerf_lightning.commands.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.config.instantiate import require_fitting
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.narrower_model import shapes_of, widths_of, with_widths
+from nerf_lightning.config.overrides import to_type
 from nerf_lightning.console import say
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import below, make_folder
@@ -60,11 +61,17 @@ def run(config: DictConfig) -> float | None:
     packed = packed_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
     tuning = fine_tuning(wide, after, config.finetune_steps)
     with filled_folder(config.paths.output_dir, beside_checkpoint(wide.path, "pruned")) as folder:
-        target = make_folder(folder, "checkpoints") / LAST
+        target, run = make_folder(folder, "checkpoints") / LAST, below(folder, "finetuned")
         _require_own(target)
+        if tuning is not None and (run / "run.json").exists():
+            going_on = f"{to_type('resume', str(run))} {to_type('init_from', str(target))}"
+            raise InputError(
+                f"{run} holds a fine-tuning already. Go on with that one with nerf train {going_on}, or give another "
+                "folder with paths.output_dir=DIR."
+            )
         write_checkpoint(_content(narrow, packed), target)
         say(*(f"{name}  {before[name]} -> {width} neurons wide" for name, width in after.items()), _sizes(wide, target))
-        return None if tuning is None else fine_tune(tuning, target, below(folder, "finetuned"))
+        return None if tuning is None else fine_tune(tuning, target, run)
 
 
 def _require_own(target: Path) -> None:

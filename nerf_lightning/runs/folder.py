@@ -25,7 +25,7 @@ from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_c
 from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.instantiate import required_path
-from nerf_lightning.config.overrides import key_of
+from nerf_lightning.config.overrides import key_of, to_type
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
@@ -233,7 +233,15 @@ def _to_resume(path: Path) -> Path:
 
 
 def _require_same_run(folder: Path, identity: dict[str, Any], typed: set[str], resuming: bool) -> None:
-    if read_note(folder).get("fingerprint") == fingerprint(identity):
+    begun_with, note = read_note(folder).get("fingerprint"), folder / "run.json"
+    if begun_with is None:
+        raise InputError(
+            f"{note} is {'damaged' if note.stat().st_size else 'empty'}, so it does not say which run this is. Remove "
+            "it: then a run with the settings of that one (.hydra/overrides.yaml) and "
+            f"{to_type('paths.output_dir', str(folder))} goes on from its checkpoints. Or give another folder with "
+            "paths.output_dir=DIR."
+        )
+    if begun_with == fingerprint(identity):
         if resuming:
             return
         raise InputError(

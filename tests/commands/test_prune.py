@@ -65,6 +65,12 @@ def test_a_run_is_pruned_packed_measured_and_trained_on(nerf, stopped_fast, capt
     assert read_checkpoint(run).step == 2
     assert "field.width=8" in yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text())
     assert load_model(read_checkpoint(run)).last.field.density_mlp[0].shape[0] == 8
+    again = nerf("prune", f"ckpt={stopped_fast}", "keep=0.5", "round_to=8", where, "finetune_steps=2")
+    said(again, f"{run} holds a fine-tuning already", f"nerf train resume={run} init_from={small}, or")
+    assert "resume=auto" not in again.err
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in read_checkpoint(small).weights.items())
+    gone_on_with = nerf("train", f"resume={run}", f"init_from={small}")
+    assert gone_on_with.code == 0, gone_on_with.err
     # What training goes on from is in the run that followed, and not in the file that was made smaller.
     refused(read_content, small, True, parts=("last.ckpt", "lacks"))
 

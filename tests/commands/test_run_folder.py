@@ -6,7 +6,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf, open_dict
 from support.configs import composed
-from support.running import FAST
+from support.running import FAST, refused
 from support.scenes import ball_scene
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -171,6 +171,23 @@ def test_a_run_goes_on_as_its_newest_whole_checkpoint_says(tmp_path):
     (folder / "last.ckpt").write_bytes(b"damaged")
     assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 7, "bf16-mixed", 107)
     assert {path.name for path in folder.iterdir()} == {"last.ckpt", "damaged.ckpt", "best.ckpt"}
+
+
+@pytest.mark.parametrize(("content", "what"), [("", "empty"), ("{", "damaged"), ("[]", "damaged"), ("{}", "damaged")])
+def test_a_note_that_says_nothing_is_named_with_its_cure(tmp_path, content, what):
+    """A disk that was full, or a machine that lost its power, leaves such a one."""
+    here = f"paths.output_dir={tmp_path}/here"
+    run = begin(config(tmp_path, here))
+    run.release()
+    save(run.path / "checkpoints" / "last.ckpt", step=3)
+    note = run.path / "run.json"
+    note.write_text(content)
+    for resuming in ((here,), (here, "resume=auto"), (f"resume={run.path}",)):
+        refused(open_run, config(tmp_path, *resuming), 100, None, parts=(f"{note} is {what}", "Remove it", here))
+    note.unlink()
+    again = begin(config(tmp_path, here))
+    assert again.resume_point().step == 3
+    again.release()
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
