@@ -1,7 +1,6 @@
 """Checkpoint files that are whole at every moment: a crash leaves the old one or the new one, never half of one."""
 
 import contextlib
-import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import torch
 
 from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import FULL
 
 
 def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:
@@ -61,7 +61,7 @@ def _cannot_save(target: Path, error: OSError | RuntimeError) -> InputError:
     if isinstance(error, RuntimeError) and isinstance(error.__context__, OSError):
         error = error.__context__  # torch closes what it could not write, and complains of that
     kept = f"The former checkpoint {target} is unharmed. " if target.exists() else ""
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    full = isinstance(error, OSError) and error.errno in FULL
     cure = "Free some space" if full else f"See that there is space and that {target.parent} can be written"
     return InputError(
         f"The checkpoint {target} could not be saved: {error}. {kept}{cure}, "

@@ -19,6 +19,7 @@ from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.tree import print_tree
 from nerf_lightning.console import StdoutConsole, say, spoken
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.folder import ResumePoint, RunFolder, former_config, job_folder, open_run, write_config
@@ -78,6 +79,7 @@ def train(config: DictConfig) -> Trained:
         path, former = ranks.from_first(lambda: _take_folder(config, asked, parts.num_steps, held))
         with (
             errors_told_once(),
+            full_disk_named(path),
             log_file(path) if ranks.is_first() else nullcontext(),
             _loggers(parts, path, former) as loggers,
         ):

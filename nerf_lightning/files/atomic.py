@@ -1,5 +1,6 @@
 """Files that are either whole or not there."""
 
+import errno
 import os
 import re
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ try:
 except ImportError:  # Windows: what killed processes leave there stays
     fcntl = None  # type: ignore[assignment]
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
 _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 
 
@@ -30,15 +32,28 @@ def whole_file(path: Path) -> Iterator[Path]:
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         part.unlink(missing_ok=True)  # a link of this name, planted or left, would be written through
-        with _held(part):
+        with full_disk_named(path), _held(part):
             yield part
             os.replace(part, path)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(path)  # a full disk is not said of any file
-        raise
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def full_disk_named(place: Path) -> Iterator[None]:
+    """Say of a full disk, or a spent quota, where it is.
+
+    The system says it when something is written, and then of no file; a copy says it of the file that it reads.
+
+    Args:
+        place: the file or folder that is written, where nothing nearer is known.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL:
+            error.filename, error.filename2 = str(error.filename2 or error.filename or place), None
+        raise
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.links import require_no_way_out
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.runs.folder import job_folder
@@ -60,6 +61,7 @@ def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
     wanted = chosen_folder(given, default).absolute()
     made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
     try:
-        yield output_folder(given, default)
+        with full_disk_named(wanted):
+            yield output_folder(given, default)
     finally:
         remove_empty(*made)

@@ -8,6 +8,7 @@ from nerf_lightning.console import StageProgress
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import listed
+from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.sfm.image_pairs import chosen_matching
@@ -53,7 +54,8 @@ def _unfinished(folder: Path) -> Iterator[Path]:
     scratch.hold()
     try:
         empty_ours(scratch.path)  # of what a killed process left
-        yield scratch.path
+        with full_disk_named(folder):
+            yield scratch.path
     finally:
         scratch.remove()
         if is_new:

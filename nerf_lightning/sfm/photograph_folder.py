@@ -191,12 +191,12 @@ def _write_turned(path: Path, target: Path) -> None:
         with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
             upright = ImageOps.exif_transpose(image)
             profile = image.info.get("icc_profile")
-            # PNG and TIFF take no notice of the quality.
-            upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
     except DECODER_ERRORS as error:
         raise InputError(
             f"{path} cannot be turned upright: {error}. It may be damaged or cut short; copy it from the camera again."
         ) from error
+    # PNG and TIFF take no notice of the quality.
+    upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
 
 
 def _too_few(folder: Path, pictures: list[Path], files: list[Path]) -> str:

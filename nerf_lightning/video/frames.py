@@ -159,8 +159,8 @@ class FilmFrames:
         try:
             yield
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            raise InputError(f"{where}{error.strerror or error}. See that there is space left.") from error
+            where = error.filename or self.folder
+            raise InputError(f"{where}: {error.strerror or error}. See that there is space left.") from error
 
     def _cure(self) -> str:
         there = sum(map(self._is_there, range(self.count)))

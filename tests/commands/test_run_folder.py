@@ -1,5 +1,6 @@
 """Which folder a run takes, and which it leaves alone."""
 
+import errno
 import json
 
 import pytest
@@ -214,3 +215,13 @@ def test_a_sweep_leaves_one_clean_folder_per_job(nerf, capture, tmp_path):
         assert (folder / "checkpoints/last.ckpt").is_file()
         assert (folder / ".hydra/config.yaml").is_file()
         assert len(EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("PSNR/test")) == 1
+
+
+def test_a_full_disk_is_said_of_the_run_where_a_logger_does_not_name_its_file(nerf, capture, tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("nerf_lightning.commands.train.describe_run", full)
+    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/here")
+    assert result.code == 2
+    assert f"nerf: {tmp_path}/here: No space left on device. See that the place" in result.err.splitlines()[-1]

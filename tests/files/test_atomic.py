@@ -6,7 +6,7 @@ import pytest
 from support.running import start_code
 
 from nerf_lightning.files import atomic
-from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.atomic import FULL, full_disk_named, whole_file
 
 KILLED = """
 import os, signal, sys
@@ -82,3 +82,27 @@ def write_half(path):
     with whole_file(path) as part:
         part.write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("number", FULL)
+def test_a_full_disk_is_said_of_what_is_written(tmp_path, number):
+    cases = {
+        (): tmp_path,  # something was written, and nobody knows what
+        (str(tmp_path / "a"),): tmp_path / "a",
+        ("read.jpg", None, str(tmp_path / "copy.jpg")): tmp_path / "copy.jpg",
+    }
+    for names, said in cases.items():
+        with pytest.raises(OSError, match="full") as caught:
+            fail_in(tmp_path, OSError(number, "full", *names))
+        assert (caught.value.filename, caught.value.filename2) == (str(said), None)
+
+
+def test_another_error_is_said_of_no_other_file(tmp_path):
+    with pytest.raises(ConnectionRefusedError) as caught:
+        fail_in(tmp_path, ConnectionRefusedError(errno.ECONNREFUSED, "refused"))
+    assert caught.value.filename is None
+
+
+def fail_in(folder, error):
+    with full_disk_named(folder):
+        raise error

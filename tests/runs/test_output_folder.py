@@ -1,5 +1,7 @@
 """A folder is made for what is written, and vanishes where a command is refused before it writes."""
 
+import errno
+
 import pytest
 from support.running import refused
 
@@ -36,3 +38,8 @@ def test_an_empty_folder_that_was_there_stays(tmp_path):
     with filled_folder(str(tmp_path), tmp_path):
         pass
     assert tmp_path.is_dir()
+
+
+def test_a_full_disk_is_said_of_the_folder(tmp_path):
+    with pytest.raises(OSError, match=r"No space left on device: '.*/out'"), filled_folder(None, tmp_path / "out"):
+        raise OSError(errno.ENOSPC, "No space left on device")

@@ -1,5 +1,8 @@
 """What finding poses may remove and write: its own unfinished work, in no folder that a link leads to."""
 
+import errno
+import os
+import shutil
 import sys
 
 import numpy as np
@@ -80,3 +83,32 @@ def test_photographs_may_lie_behind_a_link_that_is_only_read(capture, tmp_path):
     (capture / "images").symlink_to(tmp_path / "photographs")
     assert "sparse/0/cameras.bin" in found(capture, tmp_path / "photographs")
     assert len(list((tmp_path / "photographs").iterdir())) == 3
+
+
+def full(*names):
+    return OSError(errno.ENOSPC, "No space left on device", *names)
+
+
+def test_a_full_disk_is_said_of_the_folder_that_is_written(capture, tmp_path, monkeypatch):
+    """Not of the photograph, which is sound."""
+
+    def unlinked(*arguments):
+        raise OSError(errno.EXDEV, "another disk")
+
+    def copy(source, target):
+        raise full(str(source), None, str(target))
+
+    def save(image, *arguments, **options):
+        raise full()
+
+    monkeypatch.setattr(os, "link", unlinked)
+    monkeypatch.setattr(shutil, "copyfile", copy)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/out/{UNFINISHED}/images/0.png'"):
+        found(tmp_path / "out", capture / "images")
+    turned = Image.open(capture / "images" / "0.png").convert("RGB")
+    turned.getexif()[0x0112] = 6
+    turned.save(capture / "images" / "0.png", exif=turned.getexif())
+    monkeypatch.setattr(Image.Image, "save", save)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/out'"):
+        found(tmp_path / "out", capture / "images")
+    assert not (tmp_path / "out").exists()
