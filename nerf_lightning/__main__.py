@@ -1,5 +1,10 @@
 """`python -m nerf_lightning` is `nerf`."""
 
-from nerf_lightning.cli.process import main
+import sys
+
+if not sys.flags.safe_path:
+    del sys.path[0]  # the working directory, which `python -m` puts there
+
+from nerf_lightning.cli.process import main  # noqa: E402
 
 main()

@@ -18,6 +18,7 @@ from nerf_lightning.cli.broken_pipe import ends_quietly
 from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
+from nerf_lightning.cli.working_directory import require_no_settings_here
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.folders import PACKAGE, conf_folder
@@ -109,6 +110,7 @@ def _help(commands: dict[str, str]) -> str:
 
 def _run(command: str, arguments: list[str]) -> None:
     """Run one Hydra application; bad input ends with one paragraph and exit code 2, never a traceback."""
+    require_no_settings_here()
     announce_start(command, arguments)
     # torch's threads would busily wait for some milliseconds after each operation, in the way of the kernels' threads.
     # Read by GNU's OpenMP when torch is loaded.

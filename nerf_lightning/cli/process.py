@@ -14,7 +14,9 @@ def main() -> None:
     """Run the command line, and end."""
     with quick_end():
         from nerf_lightning.cli.main import main as answer
+        from nerf_lightning.cli.working_directory import keep_from_subprocesses
 
+        keep_from_subprocesses()
         answer()
 
 

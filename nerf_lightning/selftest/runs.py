@@ -4,7 +4,6 @@ They take most of a self-test's time, nearly all of it for starting up; so two c
 checks, on one core each.
 """
 
-import os
 import subprocess
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -88,9 +87,8 @@ class Runs:
 
     def _nerf(self, *arguments: str) -> None:
         command = [sys.executable, "-m", "nerf_lightning", *arguments, *self.overrides]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
         )
         self.started.append(process)
         try:
