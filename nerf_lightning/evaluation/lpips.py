@@ -127,7 +127,7 @@ def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:
     """Return the learnt weight of each channel of each compared layer."""
     source = files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth"
     with as_file(source) as path:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = load_tensors(path)
     return [state[f"lin{level}.model.1.weight"][0] for level in range(len(_TAPS[net]))]
 
 

@@ -27,6 +27,7 @@ CALLED = {
     "torch._utils _rebuild_parameter",
 }
 """What the files of this program, and state dicts, call."""
+ARCHIVE = b"PK\x03\x04"
 LEGACY_PICKLES = 5
 """Magic number, protocol, system, objects, names of the storages; then come the numbers (torch before 1.6)."""
 
@@ -48,15 +49,20 @@ def load_tensors(path: Path) -> Any:
         for stream in pickles:
             _require_plain(stream)
         file.seek(0)
-        content = torch.load(file, map_location="cpu", weights_only=True)
-    _require_own_memory(content, path)
-    return content
+        return _made_anew(torch.load(file, map_location="cpu", weights_only=True), path, {})
 
 
 def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
     """Return the part of the archive that is not numbers."""
+    file.seek(0)
+    # Else PyTorch takes what stands before the archive for a file of its earlier versions.
+    if file.read(len(ARCHIVE)) != ARCHIVE:
+        raise zipfile.BadZipFile("something before the archive")
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
+        # PyTorch looks for names whatever their case, and of several takes another one than Python does.
+        if len({entry.filename.lower() for entry in entries}) < len(entries):
+            raise zipfile.BadZipFile("several entries of one name")
         announced, size = sum(entry.file_size for entry in entries), os.fstat(file.fileno()).st_size
         # torch.save compresses nothing. Entries that share their bytes are counted each.
         if announced > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
@@ -68,7 +74,7 @@ def _objects_of_archive(file: BinaryIO, path: Path) -> io.BytesIO:
         damaged = archive.testzip()
         if damaged is not None:
             raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
-        objects = [entry for entry in entries if entry.filename.endswith("data.pkl")]
+        objects = [entry for entry in entries if entry.filename.lower().endswith("data.pkl")]
         if len(objects) != 1:
             raise zipfile.BadZipFile("no data.pkl")
         require_within("object_bytes", objects[0].file_size, str(path), "bytes beside its numbers")
@@ -88,17 +94,30 @@ def _names_a_type(argument: str) -> bool:
     return isinstance(known, torch.dtype) or (known is not None and name.endswith("Storage"))
 
 
-def _require_own_memory(content: Any, path: Path) -> None:
-    """Refuse tensors whose numbers are fewer in the file than in their shape."""
-    waiting, seen = [content], set[int]()
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, Tensor):
-            if node.numel() * node.element_size() > node.untyped_storage().nbytes():
-                raise InputError(
-                    f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: whatever is "
-                    "done with it would fill the memory. This program saves none such; use another file."
-                )
-        elif isinstance(node, (dict, list, tuple, set)) and id(node) not in seen:
-            seen.add(id(node))
-            waiting += [*node.keys(), *node.values()] if isinstance(node, dict) else node
+def _made_anew(node: Any, path: Path, made: dict[int, Any]) -> Any:
+    """Return tensors and containers of Python's own types; a pickle can hide an OrderedDict's methods by attributes.
+
+    Args:
+        node: of what was loaded.
+        path: of the file, for the message.
+        made: from what was met before, by its `id`, to what it became.
+
+    Raises:
+        InputError: a tensor has fewer numbers in the file than in its shape.
+    """
+    if isinstance(node, Tensor):
+        if node.numel() * node.element_size() > node.untyped_storage().nbytes():
+            raise InputError(
+                f"{path} holds a tensor of the shape {tuple(node.shape)} that repeats few numbers: whatever is "
+                "done with it would fill the memory. This program saves none such; use another file."
+            )
+        return node.detach()
+    if id(node) in made or not isinstance(node, (dict, list, tuple, set)):
+        return made.get(id(node), node)
+    if isinstance(node, dict):
+        table: dict[Any, Any] = {}
+        made[id(node)] = table  # before what it holds, which may be itself
+        table.update((key, _made_anew(value, path, made)) for key, value in dict.items(node))
+    else:
+        made[id(node)] = type(node)(_made_anew(each, path, made) for each in node)
+    return made[id(node)]

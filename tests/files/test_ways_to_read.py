@@ -35,7 +35,6 @@ OURS = {
     "machine.py": ["read_text", "read_text", "read_text"],
     "selftest/machine.py": ["read_text", "read_text"],
     "cli/worker.py": ["load", "load"],
-    "evaluation/lpips.py": ["load"],
     "cli/broken_pipe.py": ["open"],
 }
 # For writing, in a folder of its own, or of what was opened by us.

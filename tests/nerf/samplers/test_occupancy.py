@@ -127,9 +127,7 @@ def contracted_ball():
 
 
 def sizes(sampler):
-    return {
-        name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "possible", "cells", "blocks")
-    }
+    return {name: tuple(getattr(sampler.grid, name).shape) for name in ("density", "possible", "cells", "blocks")}
 
 
 @pytest.mark.parametrize(
