@@ -135,8 +135,8 @@ def check_capture(capture: Capture) -> None:
 
     Raises:
         InputError: with the view's name: no views, two of one name, poses that are no rotation, focal lengths that are
-            not positive, principal points outside the picture, and numbers that are not finite; a name that is not
-            UTF-8 or holds control characters.
+            not positive, principal points outside the picture, and numbers that are not finite; sparse points beyond
+            `FARTHEST`; a name that is not UTF-8 or holds control characters.
     """
     require_within("views", len(capture.views), str(capture.source), "views")
     if not capture.views:
@@ -148,6 +148,12 @@ def check_capture(capture: Capture) -> None:
     require_different(names, str(capture.source))
     for view in capture.views:
         _check_view(view, f"{capture.source}: the view {view.name}")
+    far = int((~(capture.points.abs() <= FARTHEST)).any(dim=-1).sum())  # NaN, too
+    if far:
+        raise InputError(
+            f"{capture.source}: {far} of the {len(capture.points)} sparse points are NaN or not within {FARTHEST:g} of "
+            "the origin, where no digit is left that a picture could show. Remove them, or estimate the poses anew."
+        )
 
 
 def _check_view(view: View, where: str) -> None:

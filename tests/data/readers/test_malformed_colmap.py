@@ -1,5 +1,6 @@
 """Broken COLMAP models: one paragraph that says where, what, and the cure; never another exception."""
 
+import re
 import struct
 
 import numpy as np
@@ -104,10 +105,24 @@ def cameras_that_are_not_listed(root):
     (root / MODEL / "cameras.bin").write_bytes(cameras)
 
 
-@case("colmap", r"points3D.bin holds points with NaN or infinity")
-def points_with_nan(root):
-    point = struct.pack("<Q3d3BdQ", 1, np.nan, 0, 0, 1, 1, 1, 0.1, 0)
+def put_point(root, x):
+    point = struct.pack("<Q3d3BdQ", 1, x, 0, 0, 1, 1, 1, 0.1, 0)
     (root / MODEL / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
+
+
+@case("colmap", r"sparse/0: 1 of the 1 sparse points are NaN or not within 1e\+09 of the origin")
+def points_with_nan(root):
+    put_point(root, np.nan)
+
+
+@case("colmap", r"sparse/0: 1 of the 1 sparse points are NaN or not within 1e\+09 of the origin")
+def points_that_float32_cannot_hold(root):
+    put_point(root, 1e300)
+
+
+@case("text", r"sparse/0: 1 of the 60 sparse points are NaN or not within 1e\+09 of the origin")
+def text_with_a_point_that_float32_cannot_hold(root):
+    edit_text(root, "points3D.txt", lambda text: re.sub(r"(?m)^0 \S+", "0 -1e300", text))
 
 
 @case("colmap", r"sparse/0 holds the model twice, and its binary and its text files disagree. Remove .* older")

@@ -93,8 +93,6 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
     if any(not image.name for image in images):
         raise InputError(f"{images_path} holds a photograph without a name. {CURE}")
     points = files.points(points_path) if points_path.exists() else np.zeros((0, 3))
-    if not np.isfinite(points).all():
-        raise InputError(f"{points_path} holds points with NaN or infinity. {CURE}")
     return ColmapModel(dict(cameras), tuple(sorted(images, key=lambda image: image.name)), points)
 
 
