@@ -17,7 +17,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.refinements.se3 import SmallMotions
-from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene
 
@@ -45,28 +45,25 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
     rays_of = RayGenerator(scene.cameras[view : view + 1], near, far, motion).to(device)
     optimizer = torch.optim.Adam(motion.parameters(), lr=FIRST_RATE)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_RATE / FIRST_RATE) ** (1.0 / NUM_STEPS))
-    truth = photograph(scene, view, background)
-    pixels = _pixels(scene, view)
+    rgba, behind = scene.pixels.view(view), background_colors(background, 1, torch.device("cpu"), random=None)
+    kept = scene.pixels.kept(view)
+    shown = None if kept is None or not bool(kept.any()) else kept.flatten().nonzero()[:, 0]
+    count, width = rgba[..., 0].numel() if shown is None else len(shown), rgba.shape[1]
     draw = torch.Generator().manual_seed(view)
     with _frozen(model):
         for _ in range(NUM_STEPS):
-            y, x = pixels[torch.randint(len(pixels), (min(STEP_RAYS, len(pixels)),), generator=draw)].unbind(dim=1)
+            number = torch.randint(count, (min(STEP_RAYS, count),), generator=draw)
+            number = number if shown is None else shown[number]
+            x, y = number % width, number // width
             optimizer.zero_grad()
-            seen = PixelIndex(torch.zeros_like(x), x, y).to(device)
-            _add_gradients(model, rays_of, seen, truth[y, x].to(device), background, tile_points)
+            seen, truth = PixelIndex(torch.zeros_like(x), x, y).to(device), blend(rgba[y, x].float() / 255.0, behind)
+            _add_gradients(model, rays_of, seen, truth.to(device), background, tile_points)
             optimizer.step()
             decay.step()
     found = rays_of.cameras.c2w.detach().cpu()
     c2w = scene.cameras.c2w.clone()
     c2w[view] = found[0]
     return replace(scene.cameras, c2w=c2w)
-
-
-def _pixels(scene: Scene, view: int) -> Tensor:
-    kept = scene.pixels.kept(view)
-    height, width = int(scene.pixels.height[view]), int(scene.pixels.width[view])
-    shown = torch.ones(height, width, dtype=torch.bool) if kept is None or not bool(kept.any()) else kept
-    return shown.nonzero()
 
 
 def _add_gradients(

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
@@ -27,15 +28,28 @@ def color_corrected(
         truth: the photograph.
         kept: pixels that count; None: all. Fewer than 8 leave the render as it is.
     """
-    ours, true = (picture.double() if kept is None else picture.double()[kept] for picture in (render, truth))
-    ours, true = ours.reshape(-1, 3), true.reshape(-1, 3)
-    if len(ours) < FEWEST:
+
+    def counted(picture: Tensor, rows: slice) -> Tensor:
+        return (picture[rows] if kept is None else picture[rows][kept[rows]]).double().reshape(-1, 3)
+
+    count = render[..., 0].numel() if kept is None else int(kept.sum())
+    if count < FEWEST:
         return render
+    parts = list(bands(*render.shape[:2]))
+    at, to = (
+        torch.stack([counted(each, rows).sum(dim=0) for rows in parts]).sum(0) / count for each in (render, truth)
+    )
     # About the means, and by the pseudoinverse: of a picture of one colour nothing but its mean is fitted.
-    at, to = ours.mean(dim=0), true.mean(dim=0)
-    spread = ours - at
-    matrix = torch.linalg.pinv(spread.T @ spread, rtol=1e-9, hermitian=True) @ (spread.T @ (true - to))
-    return ((render.double() - at) @ matrix + to).to(render.dtype)
+    squares, products = torch.zeros(2, 3, 3, dtype=torch.float64, device=render.device)
+    for rows in parts:
+        spread = counted(render, rows) - at
+        squares += spread.T @ spread
+        products += spread.T @ (counted(truth, rows) - to)
+    matrix = torch.linalg.pinv(squares, rtol=1e-9, hermitian=True) @ products
+    corrected = torch.empty_like(render)
+    for rows in parts:
+        corrected[rows] = (render[rows].double() - at) @ matrix + to
+    return corrected
 
 
 def exposure_fitted(

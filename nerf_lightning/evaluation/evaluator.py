@@ -21,14 +21,13 @@ from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
 from nerf_lightning.evaluation.nearest_view import baselines
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
-from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import Picture, render_picture
+from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.scene import Background, Scene
 
@@ -196,9 +195,8 @@ def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, flo
         alpha = alpha * kept  # only what is wholly covered is scored
     true_depth, true_normals = scene.truth.depth[part].view(shape), scene.truth.normals[part].view(*shape, 3)
     far = scene.far[view].expand(shape)
-    rays = rays_through_pixels(scene.cameras, all_pixels(scene.cameras, view), scene.near, scene.far)
-    surface = surface_depth(picture.depth, picture.opacity, far)
-    normals = normals_from_depth(rays.origins + surface[..., None] * rays.directions)
+    _, points = picture_surface(RayGenerator(scene.cameras, scene.near, scene.far), view, picture)
+    normals = normals_from_depth(points)
     return {
         "depth_error": depth_error(picture.depth, picture.opacity, far, true_depth, alpha),
         "normal_error": normal_error(normals, true_normals, alpha),

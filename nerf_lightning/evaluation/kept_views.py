@@ -1,22 +1,20 @@
 """Which of the scored views keep their pictures (some, evenly spaced, and the worst), and which pictures those are."""
 
+import io
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
+import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.escaping import for_file_name
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.visualization.pictures import (
-    depth_picture,
-    error_picture,
-    mosaic,
-    save_png,
-    to_bytes,
-    visible_range,
-)
+from nerf_lightning.visualization.pictures import mosaic, panels, save_png
 
 PARTS = ("truth", "render", "depth", "error")
 
@@ -31,23 +29,20 @@ class ScoredView:
     """Distance along the ray, in the user's units."""
     opacity: Float[Tensor, "height width"]
 
-    def row(self) -> UInt8[Tensor, "taller wider 3"]:
-        """Return truth, render, depth and error in a row."""
-        return mosaic(self.truth, self.render, self.depth, self.opacity)
-
-    def parts(self) -> dict[str, UInt8[Tensor, "_ _ 3"]]:
-        """Return them one by one."""
-        near, far = visible_range(self.depth, self.opacity)
-        depth = depth_picture(self.depth, near, far, self.opacity)
-        error = error_picture(self.truth, self.render)
-        return dict(zip(PARTS, (to_bytes(self.truth), to_bytes(self.render), depth, error), strict=True))
+    def parts(self) -> Iterator[tuple[str, UInt8[Tensor, "_ _ 3"]]]:
+        """Yield its pictures with their names, one by one."""
+        return panels(self.truth, self.render, self.depth, self.opacity)
 
 
-def save_view(view: ScoredView, row: Path, parts: Path) -> None:
-    """Write the row to a file and each part (`truth.png`, ...) to a folder."""
-    save_png(row, view.row())
-    for name, picture in view.parts().items():
-        save_png(parts / f"{name}.png", picture)
+def save_view(parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]], row: Path, folder: Path) -> None:
+    """Write each part (`truth.png`, ...) to a folder, and all in a row to a file."""
+
+    def saved() -> Iterator[tuple[str, Tensor]]:
+        for name, picture in parts:
+            save_png(folder / f"{name}.png", picture)
+            yield name, picture
+
+    save_png(row, mosaic(saved()))
 
 
 @dataclass
@@ -57,28 +52,42 @@ class KeptViews:
     folder: Path
     split: str
     num_worst: int
-    worst: list[tuple[float, str, ScoredView]] = field(default_factory=list)
-    """The lowest PSNR so far, with name and pictures; no more are held, since a split may be larger than memory."""
+    worst: list[tuple[float, str, IO[bytes]]] = field(default_factory=list)
+    """The lowest PSNR so far, with name and pictures; no more are held, since a split may be larger than the disk, and
+    in files without a name, since large ones may be more than memory holds."""
 
     def save(self, name: str, view: ScoredView) -> None:
         """Write the pictures of a view of the even spread."""
-        self._write(picture_name(self.split, name), view)
+        self._write(picture_name(self.split, name), view.parts())
 
     def watch(self, name: str, psnr: float, view: ScoredView) -> None:
         """Hold a view for as long as it may be among the worst."""
-        self.worst = sorted([*self.worst, (psnr, name, view)], key=lambda held: held[:2])[: self.num_worst]
+        if sum((held[:2] < (psnr, name)) for held in self.worst) >= self.num_worst:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        file = TemporaryFile(dir=self.folder)  # noqa: SIM115 (closed where the view is dropped or written)
+        for _, picture in view.parts():
+            content = io.BytesIO()  # numpy itself says nothing where the disk is too full for the last bytes
+            np.save(content, picture.numpy())
+            file.write(content.getbuffer())
+        self.worst = sorted([*self.worst, (psnr, name, file)], key=lambda held: held[:2])
+        for _, _, dropped in self.worst[self.num_worst :]:
+            dropped.close()
+        self.worst = self.worst[: self.num_worst]
 
     def finish(self, rows: list[dict[str, Any]]) -> list[str]:
         """Write those that are among the worst of all processes' rows; return the names of these, the worst first."""
         names = [name for _, name in sorted((row["psnr"], row["name"]) for row in rows)][: self.num_worst]
-        for _, name, view in self.worst:
-            if name in names:
-                self._write(f"worst_{names.index(name) + 1}", view)
+        for _, name, file in self.worst:
+            with file:
+                file.seek(0)
+                if name in names:
+                    parts = ((part, torch.from_numpy(np.load(file))) for part in PARTS)
+                    self._write(f"worst_{names.index(name) + 1}", parts)
         return names
 
-    def _write(self, name: str, view: ScoredView) -> None:
-        parts = make_folder(self.folder, "images", "views", name)
-        save_view(view, self.folder / "images" / f"{name}.png", parts)
+    def _write(self, name: str, parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> None:
+        save_view(parts, self.folder / "images" / f"{name}.png", make_folder(self.folder, "images", "views", name))
 
 
 def picture_name(split: str, view_name: str) -> str:

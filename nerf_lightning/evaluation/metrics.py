@@ -14,6 +14,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from nerf_lightning import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected
+from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
 
@@ -53,17 +54,23 @@ def image_metrics(
             neighbours, the others take the photograph's colours.
     """
     render = masked_out(render.clamp(0, 1), truth, kept)
-    ssim = None
-    if min(render.shape[:2]) >= SSIM_WINDOW:
-        ours, true = (picture.movedim(-1, 0)[None] for picture in (render, truth))
-        similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
-        assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
-        ssim = float(similarity)
     return {
         "psnr": picture_psnr(render, truth, kept),
-        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp(0, 1), truth, kept),
-        "ssim": ssim,
+        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp_(0, 1), truth, kept),
+        "ssim": _similarity(render, truth) if min(render.shape[:2]) >= SSIM_WINDOW else None,
     }
+
+
+def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float:
+    # The mean over all windows that lie inside, which torchmetrics' is, by bands of windows.
+    count, total = render.shape[0] - SSIM_WINDOW + 1, 0.0
+    for windows in bands(count, render.shape[1]):
+        rows = slice(windows.start, windows.stop + SSIM_WINDOW - 1)
+        ours, true = (picture[rows].movedim(-1, 0)[None] for picture in (render, truth))
+        similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
+        assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
+        total += (windows.stop - windows.start) * float(similarity)
+    return total / count
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

@@ -25,7 +25,7 @@ from nerf_lightning.export.base import Beside
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular, read_text
-from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
@@ -202,7 +202,7 @@ def _view(record: SceneRecord, beside: Beside, view: int | None) -> ViewOnPage:
 def _still(marcher: Marcher, record: SceneRecord, view: int) -> str:
     cameras = at_most(record.cameras, STILL)
     rays_of = RayGenerator(cameras, record.near, record.far)
-    return _jpeg(over(marcher.render(view_rays(rays_of, view)[0]), record.background), STILL)
+    return _jpeg(over(marcher.render(view_rays(rays_of, all_pixels(cameras, view))[0]), record.background), STILL)
 
 
 def _jpeg(picture: Float[Tensor, "height width 3"], longest: int) -> str:

@@ -13,12 +13,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.machine import require_memory
-from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most, camera_coordinates, seen_at
+from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, seen_at
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.render_image import picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 # Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
@@ -62,12 +62,7 @@ def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_poi
     """Render one view; `cameras` are the record's, at whatever size."""
     rays_of = RayGenerator(cameras, record.near, record.far, names_photographs=model.needs_photographs)
     picture = render_picture(model, rays_of, view, record.background, tile_points)
-    depth = picture.depth
-    if cameras.ndc is None:
-        # In normalised device coordinates light that escapes has no distance that could be taken out.
-        depth = surface_depth(depth, picture.opacity, record.far[view].expand(depth.shape))
-    rays = rays_of.through_world(all_pixels(cameras, view))
-    points = rays.origins + depth[..., None] * rays.directions
+    depth, points = picture_surface(rays_of, view, picture)
     normals = normals_from_depth(points) if min(depth.shape) > 1 else torch.zeros_like(points)
     return SeenView(picture.rgb, picture.opacity, depth, points, normals)
 

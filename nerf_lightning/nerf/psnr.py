@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerf_lightning.nerf.bands import bands
+
 LEAST_MSE = 1e-10
 """Errors below count as this one, a PSNR of 100 dB."""
 
@@ -25,5 +27,9 @@ def picture_psnr(
     kept: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     """Return the PSNR (dB) of a picture, of the pixels that are kept (at least one; None: all)."""
-    error = (render - truth).square()
-    return float(psnr((error if kept is None else error[kept]).mean()))
+    total, count = 0.0, 0
+    for rows in bands(*render.shape[:2]):
+        error = (render[rows] - truth[rows]).square()
+        error = error if kept is None else error[kept[rows]]
+        total, count = total + float(error.sum(dtype=torch.float64)), count + error.numel()
+    return float(psnr(torch.tensor(total / count, dtype=torch.float64)))

@@ -29,6 +29,7 @@ from nerf_lightning.video.film import film, require_room
 from nerf_lightning.video.paths.base import CameraPath
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, lay_path
+from nerf_lightning.visualization.pictures import at_most
 
 PROGRESS_FPS = 4
 MOST_NAMED = 10
@@ -178,6 +179,6 @@ def _film_progress(folder: Path) -> list[str]:
     files = sorted((folder / "images" / "progress").glob("step_*.png"))
     if len(files) < 2:
         return []
-    frames = [torch.from_numpy(read_rgba(file)[..., :3].copy()) for file in files]
+    frames = [at_most(torch.from_numpy(read_rgba(file)[..., :3].copy())) for file in files]
     write_video(folder / "progress.mp4", frames, PROGRESS_FPS, len(frames))
     return [f"progress     {folder / 'progress.mp4'}"]

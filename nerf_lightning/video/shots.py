@@ -15,10 +15,10 @@ from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
 from nerf_lightning.nerf.geometry.near_far import near_and_far_from
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.geometry.surfaces import normals_from_depth, surface_depth
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import Picture, render_picture, view_rays
+from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, frame_of
 from nerf_lightning.video.settings import Corner, Projection
@@ -91,10 +91,7 @@ class Shot:
 
     def _surface(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the points of the scene that the picture shows."""
-        rays, straight = view_rays(self.rays, frame, self.clip)
-        bent = self.cameras.ndc is not None
-        surface = picture.depth if bent else surface_depth(picture.depth, picture.opacity, rays.far)
-        return straight.origins + surface[..., None] * straight.directions
+        return picture_surface(self.rays, frame, picture, self.clip)[1]
 
     def small(self) -> "Shot":
         """Return a few of the frames, in small."""

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import render_rays
+from nerf_lightning.nerf.models.render_image import render_rays, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
 
@@ -80,26 +80,24 @@ class SlicedRenderer:
     def slices(self, look: CameraState, height: int) -> Generator[None, None, View]:
         """Render a look at about this height (pixels): yields after each slice, and returns the view."""
         cameras, near, far = camera_of(look, self.scene, height)
-        pixels = all_pixels(cameras, 0)
-        shape, pixels = pixels.x.shape, pixels.map(torch.flatten)
-        rays_of = RayGenerator(cameras, near, far)
-        rays = rays_of(pixels)
-        if look.crop is not None:
-            rays = Clip(box=look.crop)(rays, rays, ndc=False)
-        parts, start, total = [], 0, rays.near.numel()
+        shape = int(cameras.height[0]), int(cameras.width[0])
+        rays_of, clip = RayGenerator(cameras, near, far), None if look.crop is None else Clip(box=look.crop)
+        parts, start, total = [], 0, shape[0] * shape[1]
         while start < total:
             stop = start + self._rays_in_a_slice(total - start)
             began = time.perf_counter()
-            with torch.no_grad():
-                parts.append(render_rays(self.model, rays[start:stop], self.background, self.tile_points))
+            parts.append(self._slice(rays_of, slice(start, stop), clip))
             self._learn(stop - start, time.perf_counter() - began)
             start = stop
             yield
-        rgb, depth, opacity = (torch.cat(column) for column in list(zip(*parts, strict=True))[:3])
-        depth = surface_depth(depth, opacity, rays.far)
-        if cameras.ndc is not None:
-            depth = world_distance(rays_of.through_world(pixels), depth / rays.far)
+        rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
         return View(rgb.view(*shape, 3), depth.view(shape), opacity.view(shape), cameras)
+
+    def _slice(self, rays_of: RayGenerator, part: slice, clip: Clip | None) -> tuple[Tensor, Tensor, Tensor]:
+        rays, straight = view_rays(rays_of, pixels_between(rays_of.cameras, 0, part), clip)
+        rgb, depth, opacity, *_ = render_rays(self.model, rays, self.background, self.tile_points)
+        depth = surface_depth(depth, opacity, rays.far)
+        return rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), opacity
 
     def _rays_in_a_slice(self, left: int) -> int:
         rays = max(64, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS))

@@ -3,7 +3,8 @@
 A picture is uint8 (height, width, 3) on the CPU, row 0 on top; colours before that are floats in [0, 1].
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -15,9 +16,16 @@ from torch import Tensor
 
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.nerf.bands import bands
 
+ENOUGH_PIXELS = 1 << 18
+"""For the range of what is visible."""
 ERROR_SCALE = 0.25
 """Absolute error that gets the brightest colour: always the same, so that two runs can be compared."""
+
+LONGEST_PANEL = 1600
+"""Pixels along the longer side of a panel of the validation picture, about, at most: a row of four photographs would
+be more than anything shows."""
 
 _PAPER = 255
 _INK = (64, 64, 64)
@@ -31,7 +39,10 @@ def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
     >>> to_bytes(torch.tensor([[-1.0, 0.5, 2.0]])).tolist()
     [[0, 128, 255]]
     """
-    return (torch.nan_to_num(rgb.detach().float()).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+    picture = torch.empty(rgb.shape, dtype=torch.uint8)
+    for rows in bands(len(rgb), max(1, rgb[:1].numel())):
+        picture[rows] = (torch.nan_to_num(rgb[rows].detach().float()).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+    return picture
 
 
 def straight_colors(
@@ -80,8 +91,10 @@ def visible_range(depth: Float[Tensor, "height width"], opacity: Float[Tensor, "
     """Return near and far (scene units) of what is visible: opacity above one half.
 
     The outer 2 % at each end are left out, so that a few stray points do not take the scale. Where nothing is
-    visible it is the range of the whole picture.
+    visible it is the range of the whole picture. Of a large picture some of the rows and columns are looked at.
     """
+    every = max(1, math.isqrt(depth.numel() // ENOUGH_PIXELS))
+    depth, opacity = (each[::every, ::every] for each in (depth, opacity))
     seen = depth[(opacity > 0.5) & depth.isfinite()].detach().double().cpu().numpy()
     if seen.size == 0:
         seen = torch.nan_to_num(depth.detach().double(), posinf=0.0).cpu().numpy()
@@ -99,10 +112,11 @@ def depth_picture(
 
     Where `opacity` is given, what light passes through fades to pale grey.
     """
-    colors = color_map(depth, low=far, high=near)
-    if opacity is not None:
-        colors = faded(colors, opacity)
-    return _with_scale(to_bytes(colors), top=near, bottom=far)
+    picture = torch.empty(*depth.shape, 3, dtype=torch.uint8)
+    for rows in bands(*depth.shape):
+        colors = color_map(depth[rows], low=far, high=near)
+        picture[rows] = to_bytes(colors if opacity is None else faded(colors, opacity[rows]))
+    return _with_scale(picture, top=near, bottom=far)
 
 
 def faded(
@@ -117,27 +131,42 @@ def error_picture(
     truth: Float[Tensor, "height width 3"], render: Float[Tensor, "height width 3"]
 ) -> UInt8[Tensor, "height wider 3"]:
     """Return the absolute error (mean of the channels) in colours, 0 to `ERROR_SCALE`, with its scale."""
-    error = (truth.detach().float().cpu() - render.detach().float().cpu()).abs().mean(dim=-1)
-    return _with_scale(to_bytes(color_map(error, 0.0, ERROR_SCALE)), top=ERROR_SCALE, bottom=0.0)
+    picture = torch.empty(truth.shape, dtype=torch.uint8)
+    for rows in bands(*truth.shape[:2]):
+        error = (truth[rows].detach().float().cpu() - render[rows].detach().float().cpu()).abs().mean(dim=-1)
+        picture[rows] = to_bytes(color_map(error, 0.0, ERROR_SCALE))
+    return _with_scale(picture, top=ERROR_SCALE, bottom=0.0)
 
 
-def mosaic(
+def panels(
     truth: Float[Tensor, "height width 3"],
     render: Float[Tensor, "height width 3"],
     depth: Float[Tensor, "height width"],
     opacity: Float[Tensor, "height width"],
-) -> UInt8[Tensor, "taller wider 3"]:
-    """Return the validation picture: truth, render, depth and error in a row, a caption above each."""
-    near, far = visible_range(depth, opacity)
-    panels = {
-        "truth": to_bytes(truth),
-        "render": to_bytes(render),
-        "depth": depth_picture(depth, near, far, opacity),
-        "error": error_picture(truth, render),
-    }
-    size = letter_size(truth.shape[0])
-    row = side_by_side([with_caption(p, name, size) for name, p in panels.items()], gap=size)
+) -> Iterator[tuple[str, UInt8[Tensor, "height wider 3"]]]:
+    """Yield truth, render, depth and error with their names, one after the other: a large one takes much memory."""
+    yield "truth", to_bytes(truth)
+    yield "render", to_bytes(render)
+    yield "depth", depth_picture(depth, *visible_range(depth, opacity), opacity)
+    yield "error", error_picture(truth, render)
+
+
+def mosaic(named: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> UInt8[Tensor, "taller wider 3"]:
+    """Return panels in a row, a caption above each; large ones are shrunk (`at_most`)."""
+    small = [(name, at_most(panel)) for name, panel in named]
+    size = letter_size(small[0][1].shape[0])
+    row = side_by_side([with_caption(panel, name, size) for name, panel in small], gap=size)
     return torch.nn.functional.pad(row, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)
+
+
+def at_most(
+    picture: UInt8[Tensor, "height width 3"], longest: int = LONGEST_PANEL
+) -> UInt8[Tensor, "small_height small_width 3"]:
+    """Return the picture, shrunk to half, a third, ... by means over squares where a side is longer than `longest`."""
+    by = -(-max(picture.shape[:2]) // longest)
+    if by == 1:
+        return picture
+    return torch.from_numpy(np.array(Image.fromarray(picture.numpy()).reduce(by)))
 
 
 @cache
@@ -166,21 +195,18 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
 
 def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
     """Set a slim colour bar at the picture's right, from bright at `top` down to dark, with both numbers."""
-    height, width, _ = picture.shape
+    height = picture.shape[0]
     size = letter_size(height)
     font = ImageFont.load_default(size)
     texts = (f"{top:.3g}", f"{bottom:.3g}")
     thick, space = max(4, size // 2), max(3, size // 3)
-    page = Image.new(
-        "RGB", (width + 3 * space + thick + max(_length(font, text) for text in texts), height), (_PAPER,) * 3
-    )
-    page.paste(Image.fromarray(picture.numpy()), (0, 0))
+    page = Image.new("RGB", (3 * space + thick + max(_length(font, text) for text in texts), height), (_PAPER,) * 3)
     ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
-    page.paste(Image.fromarray(to_bytes(ramp).numpy()), (width + space, 0))
-    draw, left = ImageDraw.Draw(page), width + 2 * space + thick
+    page.paste(Image.fromarray(to_bytes(ramp).numpy()), (space, 0))
+    draw, left = ImageDraw.Draw(page), 2 * space + thick
     draw.text((left, 0), texts[0], fill=_INK, font=font, anchor="lt")
     draw.text((left, height), texts[1], fill=_INK, font=font, anchor="ls")
-    return _as_picture(page)
+    return torch.cat([picture, _as_picture(page)], dim=1)
 
 
 def _length(font: ImageFont.FreeTypeFont | ImageFont.ImageFont, text: str) -> int:

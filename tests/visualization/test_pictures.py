@@ -11,6 +11,7 @@ from nerf_lightning.visualization.pictures import (
     depth_picture,
     error_picture,
     mosaic,
+    panels,
     save_png,
     side_by_side,
     to_bytes,
@@ -130,7 +131,7 @@ def test_error_has_a_fixed_scale():
 @pytest.mark.parametrize("size", [8, 100, 200])
 def test_the_mosaic_shows_truth_and_render_unscaled(size):
     truth, render = torch.rand(size, size, 3), torch.rand(size, size, 3)
-    picture = mosaic(truth, render, torch.rand(size, size) + 2, torch.ones(size, size))
+    picture = mosaic(panels(truth, render, torch.rand(size, size) + 2, torch.ones(size, size)))
     corner = max(10, round(0.03 * size)) // 2
     top = picture.shape[0] - corner - size
     assert torch.equal(picture[top : top + size, corner : corner + size], to_bytes(truth))

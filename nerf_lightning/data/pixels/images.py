@@ -20,6 +20,7 @@ from PIL import Image, UnidentifiedImageError
 from nerf_lightning.budgets import allowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.nerf.bands import bands
 
 # A closed list: some of PIL's other decoders start outside programs.
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
@@ -104,9 +105,13 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
                 "the pixels as they are stored, remove the tag alone (`exiftool -Orientation= FILE`); else turn the "
                 "pixels (`magick mogrify -auto-orient FILE`) and estimate the cameras anew."
             )
-        if image.mode in GREY_16:
-            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-        return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
+        rgba = np.empty((image.height, image.width, 4), np.uint8)
+        for rows in bands(*rgba.shape[:2]):  # several copies of the whole would be held at once
+            part = image.crop((0, rows.start, image.width, rows.stop))
+            if part.mode in GREY_16:
+                part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))
+            rgba[rows] = np.asarray(part if part.mode == "RGBA" else part.convert("RGBA"))
+        return rgba
 
 
 def read_mask(path: Path, keep: MaskColor = "white") -> Bool[np.ndarray, "height width"]:

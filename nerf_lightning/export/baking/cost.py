@@ -8,6 +8,8 @@ from torch import Tensor
 
 from nerf_lightning.export.baking.marcher import MarchedRays, Marcher
 from nerf_lightning.export.density_grid import Report
+from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -62,12 +64,14 @@ def measured_cost(
         return Cost(split, 0)
     rays_of = RayGenerator(scene.cameras, scene.near, scene.far)
     errors: list[tuple[float, ...]] = []
-    samples: list[tuple[float, float]] = []
+    samples: list[tuple[float, float, float]] = []
     for number, view in enumerate(views):
         own = render_picture(model, rays_of, view, scene.background, tile_points).rgb.clamp(0, 1)
-        marched = marcher.render(view_rays(rays_of, view)[0])
-        samples.append((marched.num_densities, marched.num_colors))
-        page = over(marched, scene.background).clamp(0, 1)
+        page = torch.empty_like(own)
+        for rows in bands(*page.shape[:2]):
+            marched = marcher.render(view_rays(rays_of, all_pixels(scene.cameras, view)[rows])[0])
+            page[rows] = over(marched, scene.background).clamp(0, 1)
+            samples.append((len(page[rows]) / len(page) / len(views), marched.num_densities, marched.num_colors))
         pairs: list[tuple[Tensor, Tensor, Tensor | None]] = [(page, own, None)]
         if photographs is not None:
             truth, kept = photograph(photographs, view, scene.background), photographs.pixels.kept(view)
@@ -75,7 +79,8 @@ def measured_cost(
         errors.append(tuple(picture_psnr(*pair) for pair in pairs))
         report("measured", (number + 1) / len(views))
     means = [float(column) for column in torch.tensor(errors, dtype=torch.float64).mean(dim=0)]
-    densities, colors = torch.tensor(samples).mean(dim=0).tolist()
+    share, *of_each = torch.tensor(samples).T
+    densities, colors = ((share * each).sum().item() for each in of_each)
     of_page, of_model = means[1:] or (None, None)
     return Cost(split, len(views), means[0], of_page, of_model, densities, colors)
 

@@ -7,7 +7,7 @@ from numpy import ndarray
 
 from nerf_lightning.export.baking.density import DensityGrid, dilated
 from nerf_lightning.export.baking.marcher import STEP
-from nerf_lightning.nerf.geometry.cameras import at_most
+from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.kernels.bricks.layout import kernels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
@@ -31,7 +31,7 @@ def lit(grid: DensityGrid, record: SceneRecord) -> tuple[Bool[ndarray, "x y z"],
     smaller = min(1.0, (RAYS / float((width * height).sum())) ** 0.5)
     cameras = at_most(record.cameras, max(8, int(smaller * float(torch.maximum(width, height).max()))))
     rays_of = RayGenerator(cameras, record.near, record.far)
-    rays = [view_rays(rays_of, view)[0] for view in views]
+    rays = [view_rays(rays_of, all_pixels(cameras, view))[0] for view in views]
     origins = torch.cat([contraction.unit(each.origins).reshape(-1, 3) for each in rays]).float().numpy()
     directions = torch.cat([each.directions.reshape(-1, 3) for each in rays]).float().numpy()
     near = contraction.near / contraction.half

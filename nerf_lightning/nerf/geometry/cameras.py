@@ -108,14 +108,18 @@ def rays_through_pixels(
 
 
 def all_pixels(cameras: Cameras, view: int) -> PixelIndex:
-    """Return every pixel of one view as a picture of indices, shape (height, width)."""
-    device = cameras.c2w.device
-    y, x = torch.meshgrid(
-        torch.arange(int(cameras.height[view]), device=device),
-        torch.arange(int(cameras.width[view]), device=device),
-        indexing="ij",
-    )
-    return PixelIndex(view=torch.full_like(x, view), x=x, y=y)
+    """Return every pixel of one view as a picture of indices, shape (height, width), which takes no memory."""
+    width, height = int(cameras.width[view]), int(cameras.height[view])
+    across, down = (torch.arange(side, device=cameras.c2w.device) for side in (width, height))
+    shape = (height, width)
+    return PixelIndex(across.new_tensor(view).expand(shape), across.expand(shape), down[:, None].expand(shape))
+
+
+def pixels_between(cameras: Cameras, view: int, part: slice) -> PixelIndex:
+    """Return some pixels of one view in a row, numbered row by row from 0."""
+    number = torch.arange(part.start, part.stop, device=cameras.c2w.device)
+    width = int(cameras.width[view])
+    return PixelIndex(view=torch.full_like(number, view), x=number % width, y=number // width)
 
 
 def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:

@@ -1,15 +1,18 @@
 """Whole views: render every pixel of a camera, a chunk of rays at a time."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.bands import bands
+from nerf_lightning.nerf.geometry.cameras import pixels_between
 from nerf_lightning.nerf.geometry.clipping import Clip
 from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.geometry.surfaces import surface_depth
 from nerf_lightning.nerf.kernels.threads import FEWEST_ROWS, PARTS_PER_THREAD, in_parallel, threads_on
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -55,40 +58,82 @@ def render_picture(
         clip: what of the scene is shown; None: all.
         seen_from: other cameras, from whose directions the colour is looked up, in place of the view's own.
     """
-    parts = [
-        _render_through(place, model, rays_of, view, background, tile_points, clip, seen_from)
-        for place in model.subpixels.places()
-    ]
-    if len(parts) == 1:
-        return Picture(*parts[0])
-    return Picture(*(torch.stack(columns).mean(dim=0) for columns in zip(*parts, strict=True)))
+    cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
+
+    def through(place: Float[Tensor, "2"], pixels: PixelIndex) -> list[Tensor]:
+        at = (place, subpixels.per_side)
+        rays, straight = view_rays(rays_of, pixels, clip, *at)
+        if seen_from is not None:
+            rays = replace(rays, view_directions=view_rays(seen_from, pixels, None, *at)[1].view_directions)
+        shown = rays.to(device)
+        rgb, depth, *rest = (_render_tile if clip is None else _render_what_is_left)(model, shown, background)
+        if cameras.ndc is not None:
+            whole = rays.far if clip is None else view_rays(rays_of, pixels, None, *at)[0].far
+            depth = world_distance(straight, depth / whole)
+        return [rgb, depth, *rest]
+
+    def render(part: slice) -> list[Tensor]:
+        pixels = pixels_between(cameras, view, part)
+        first, *others = subpixels.places()
+        totals = through(first, pixels)
+        for place in others:
+            totals = [total + each for total, each in zip(totals, through(place, pixels), strict=True)]
+        return [total / subpixels.per_pixel for total in totals] if others else totals
+
+    height, width = int(cameras.height[view]), int(cameras.width[view])
+    columns = _in_tiles(model, height * width, tile_points, render)
+    return Picture(*(column.view(height, width, *column.shape[1:]) for column in columns))
 
 
 @torch.no_grad()
 def view_rays(
     rays_of: RayGenerator,
-    view: int,
+    pixels: PixelIndex,
     clip: Clip | None = None,
     place: Float[Tensor, "2"] | None = None,
     per_side: int = 1,
 ) -> tuple[RayBundle, RayBundle]:
-    """Return a picture of rays as the model takes them, and the same rays through the world; both on the CPU.
+    """Return the rays of pixels as the model takes them, and the same rays through the world; both on the CPU.
+
+    They take 60 times as much memory as the pixels of a photograph: ask for a tile of a picture at a time.
 
     Args:
         rays_of: the cameras.
-        view: which.
+        pixels: which.
         clip: what of the scene is shown; None: all.
         place: where in each pixel its ray goes through, in pixels from the centre; None: there.
         per_side: so many rays share each side of a pixel.
     """
-    cameras = rays_of.cameras
-    pixels = all_pixels(cameras, view)
     place = None if place is None else place.to(pixels.x.device)
     rays = rays_of(pixels, place, per_side).to("cpu")
-    straight = rays if cameras.ndc is None else rays_of.through_world(pixels, place).to("cpu")
-    if clip is not None:
-        rays = clip(rays, straight, ndc=cameras.ndc is not None)
-    return rays, straight
+    bent = rays_of.ndc is not None
+    straight = rays_of.through_world(pixels, place).to("cpu") if bent else rays
+    return rays if clip is None else clip(rays, straight, ndc=bent), straight
+
+
+@torch.no_grad()
+def picture_surface(
+    rays_of: RayGenerator, view: int, picture: Picture, clip: Clip | None = None
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width 3"]]:
+    """Return the distance at which the light of each pixel was stopped, and where in the world that is; on the CPU.
+
+    In normalised device coordinates light that escapes has no distance that could be taken out.
+
+    Args:
+        rays_of: the cameras that the picture was rendered through.
+        view: which of them.
+        picture: what was rendered.
+        clip: what of the scene it shows; None: all.
+    """
+    cameras = rays_of.cameras
+    depth, opacity = picture.depth.flatten(), picture.opacity.flatten()
+    surface, points = torch.empty_like(depth), torch.empty(len(depth), 3)
+    for part in bands(len(depth), 1):
+        rays, straight = view_rays(rays_of, pixels_between(cameras, view, part), clip)
+        bent = cameras.ndc is not None
+        surface[part] = depth[part] if bent else surface_depth(depth[part], opacity[part], rays.far)
+        points[part] = straight.origins + surface[part, None] * straight.directions
+    return surface.view(picture.depth.shape), points.view(picture.rgb.shape)
 
 
 @torch.no_grad()
@@ -112,61 +157,30 @@ def surface_points(
     return straight.origins + world_distance(straight, depth / rays.far)[:, None] * straight.directions, opacity
 
 
-def _render_through(
-    place: Float[Tensor, "2"],
-    model: Model,
-    rays_of: RayGenerator,
-    view: int,
-    background: Background,
-    tile_points: int,
-    clip: Clip | None,
-    seen_from: RayGenerator | None,
-) -> list[Tensor]:
-    """Return a picture's colour, depth, opacity and first colour, by rays through one place of each pixel."""
-    at = (place, model.subpixels.per_side)
-    rays, straight = view_rays(rays_of, view, clip, *at)
-    if seen_from is not None:
-        rays = replace(rays, view_directions=view_rays(seen_from, view, None, *at)[1].view_directions)
-    columns = (_render_all if clip is None else render_rays)(model, rays.map(_flat), background, tile_points)
-    shape = rays.near.shape
-    rgb, depth, opacity, *first = (column.view(*shape, *column.shape[1:]) for column in columns)
-    if rays_of.cameras.ndc is not None:
-        whole = rays.far if clip is None else view_rays(rays_of, view, None, *at)[0].far
-        depth = world_distance(straight, depth / whole)
-    return [rgb, depth, opacity, *first]
-
-
-def _flat(picture: Tensor) -> Tensor:
-    return picture.flatten(0, 1)
-
-
 @torch.no_grad()
 def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
     """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
 
     Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
     """
-    count = rays.near.numel()
-    behind = background_colors(background, count, torch.device("cpu"), random=None)
-    empty = torch.zeros(count, 3) if behind is None else behind
-    columns = [empty.clone(), rays.far.cpu().clone(), torch.zeros(count)]
-    if model.first_picture is not None:
-        columns.append(empty.clone())
-    shown = (rays.far > rays.near).nonzero()[:, 0]
-    if shown.numel():
-        rendered = _render_all(model, rays[shown], background, tile_points)
-        for column, part in zip(columns, rendered, strict=True):
-            column[shown.cpu()] = part.to(column)
-    return columns
+    device = next(model.parameters()).device
+
+    def render(part: slice) -> list[Tensor]:
+        return _render_what_is_left(model, rays[part].to(device), background)
+
+    return _in_tiles(model, rays.near.numel(), tile_points, render)
 
 
-def _render_all(model: Model, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
-    at_once = min(tile_rays_for(model, tile_points), rays.near.numel())
+def _in_tiles(
+    model: Model, count: int, tile_points: int, render: Callable[[slice], list[Tensor]]
+) -> list[Float[Tensor, "rays *channels"]]:
+    """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory."""
+    at_once = min(tile_rays_for(model, tile_points), count)
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
     while True:
         try:
-            return _render_in_tiles(model, rays, background, at_once)
+            return _fill(model, count, at_once, render)
         except RuntimeError as error:
             if at_once == 1 or not is_out_of_memory(error):
                 raise
@@ -174,26 +188,38 @@ def _render_all(model: Model, rays: RayBundle, background: Background, tile_poin
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
 
 
-def _render_in_tiles(model: Model, rays: RayBundle, background: Background, at_once: int) -> list[Tensor]:
-    device, count = next(model.parameters()).device, rays.near.numel()
+def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], list[Tensor]]) -> list[Tensor]:
     # Made once: thousands of small results between what comes and goes would leave holes many times their size.
     columns = [torch.empty(count, 3), torch.empty(count), torch.empty(count)]
     if model.first_picture is not None:
         columns.append(torch.empty(count, 3))
 
-    def render(part: slice) -> None:
-        for column, result in zip(columns, _render_tile(model, rays[part].to(device), background), strict=True):
+    def fill(part: slice) -> None:
+        for column, result in zip(columns, render(part), strict=True):
             column[part] = result
 
-    threads = threads_on(device)
+    threads = threads_on(next(model.parameters()).device)
     if threads > 1:  # small pictures, too, are shared out
         at_once = min(at_once, max(FEWEST_ROWS, -(-count // (PARTS_PER_THREAD * threads))))
     parts = list(tiles(count, at_once, multiple=threads))
     if threads > 1:
-        in_parallel(render, parts)
+        in_parallel(fill, parts)
     else:
         for part in parts:
-            render(part)
+            fill(part)
+    return columns
+
+
+def _render_what_is_left(model: Model, rays: RayBundle, background: Background) -> list[Tensor]:
+    behind = background_colors(background, rays.near.numel(), torch.device("cpu"), random=None)
+    empty = torch.zeros(rays.near.numel(), 3) if behind is None else behind
+    columns = [empty, rays.far.cpu().clone(), torch.zeros(rays.near.numel())]
+    if model.first_picture is not None:
+        columns.append(empty.clone())
+    left = (rays.far > rays.near).nonzero()[:, 0]
+    if left.numel():
+        for column, part in zip(columns, _render_tile(model, rays[left], background), strict=True):
+            column[left.cpu()] = part.to(column)
     return columns
 
 

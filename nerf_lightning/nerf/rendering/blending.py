@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.scene import DRAWN, UNSURE, Background, Scene
 
@@ -87,4 +88,8 @@ def in_other_light(
 def photograph(scene: Scene, view: int, background: Background) -> Float[Tensor, "height width 3"]:
     """Return what a view's photograph shows over the background of evaluation."""
     behind = background_colors(background, 1, torch.device("cpu"), random=None)
-    return blend(scene.pixels.view(view).float() / 255.0, behind)
+    rgba = scene.pixels.view(view)
+    shown = torch.empty(*rgba.shape[:2], 3)
+    for rows in bands(*rgba.shape[:2]):
+        shown[rows] = blend(rgba[rows].float() / 255.0, behind)
+    return shown

@@ -8,7 +8,7 @@ from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.training.callbacks.watcher import Watcher, render_validation_view
 from nerf_lightning.training.loggers import show_picture
-from nerf_lightning.visualization.pictures import mosaic, save_png, to_bytes
+from nerf_lightning.visualization.pictures import at_most, mosaic, panels, save_png, to_bytes
 
 
 class ValidationPictures(Watcher):
@@ -35,8 +35,8 @@ class ValidationPictures(Watcher):
         view, picture = render_validation_view(trainer, system, self.view)
         scene = trainer.datamodule.scene
         truth = photograph(scene, view, scene.background)
-        panel = mosaic(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity)
-        for name, shown in (("validation", panel), ("progress", to_bytes(picture.rgb))):
+        panel = mosaic(panels(truth, picture.rgb, told_length(scene)[0] * picture.depth, picture.opacity))
+        for name, shown in (("validation", panel), ("progress", at_most(to_bytes(picture.rgb)))):
             folder = make_folder(Path(trainer.default_root_dir), "images", name)
             save_png(folder / f"step_{step:07d}.png", shown)
         show_picture(trainer.loggers, "validation/picture", panel, step)
