@@ -65,7 +65,7 @@ class Finish:
         """
         if self.path is not None:
             record = scene_record(shown_capture(scene))
-            require_room(lay_path(self.path, record), FilmSettings(), [record])
+            require_room(lay_path(self.path, record), FilmSettings())
 
     def __call__(
         self, settings: TrainerSettings, scene: Scene, model: Model, trainer: Trainer, folder: Path

@@ -1,12 +1,13 @@
 """The memory plan: what a run will hold and where, said before it starts."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
 from nerf_lightning.machine import free_memory, held_memory
+from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
@@ -26,7 +27,9 @@ NOTICEABLE = 1.05
 SMALL = 0.1
 # A bound that needs no trial: bytes per ray, per pixel, and per point beside its features, each of which is kept a few
 # times over; what models take lies below the half of it.
-RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 1_024, 1_024, 6
+RAY_BYTES, PIXEL_BYTES, POINT_BYTES, KEPT = 16_384, 128, 1_024, 6
+# And per pixel of a band.
+BAND_BYTES = 1_024
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +65,8 @@ class MemoryPlan:
         def line(what: str, size: int, where: str) -> str:
             return f"  {what:<38} {size / GIGABYTE:8.3f} GB  {where}"
 
-        lines = [line(row.what, row.num_bytes, row.where) for row in [*self.rows, *self.instead]]
+        rows = [*self.rows, self.instead[0], *(replace(row, what=f"or {row.what}") for row in self.instead[1:])]
+        lines = [line(row.what, row.num_bytes, row.where) for row in rows]
         return "\n".join(
             [
                 "memory plan:",
@@ -137,7 +141,8 @@ def at_most(settings: TrainerSettings, step: TrainStep, data: RayDataModule) -> 
     whole = batch * model.points_per_ray(training=True)
     points = whole if settings.tile_points is None else threads_on(settings.device) * settings.tile_points
     features = 4 * sum(sum(matrix.shape) for matrix in matrices_of(model))
-    picture = int((pixels.width * pixels.height).max()) * PIXEL_BYTES
+    largest = int((pixels.width * pixels.height).max())
+    picture = PIXEL_BYTES * largest + BAND_BYTES * min(largest, BAND_PIXELS)
     held = num_bytes(pixels) + 4 * _weights(step) + _compiled(step) + batch * RAY_BYTES + picture
     return int(held + KEPT * points * (features + POINT_BYTES))
 
@@ -170,5 +175,5 @@ def _step(trial: Trial, tile: int | None, where: str) -> Row:
 def _picture(trial: Trial, data: RayDataModule, where: str) -> Row:
     pixels = data.scene.pixels
     view = int((pixels.width * pixels.height).argmax())
-    what = f"or a picture of {int(pixels.width[view])} x {int(pixels.height[view])}"
+    what = f"a picture of {int(pixels.width[view])} x {int(pixels.height[view])}"
     return Row(what, trial.picture, where, cure="raise scene.downscale")

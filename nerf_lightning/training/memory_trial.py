@@ -1,7 +1,7 @@
 """How much memory a step and a picture take: a few small ones are tried and counted, and scaled up.
 
 What a step holds is linear in the rays of the batch and in those of a tile, and what a picture holds is linear in its
-pixels and in the rays of a tile, so a few trials say all.
+pixels, where it has more than a band of them, and in the rays of a tile, so a few trials say all.
 """
 
 import weakref
@@ -16,25 +16,20 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
-from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.level import Level
-from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for
-from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.rendering.blending import background_colors
-from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
+from nerf_lightning.visualization.pictures import mosaic, panels
 
 # So many that rays of different lengths make a mean, and so few that it takes a second at most.
 TRIAL_POINTS, FEWEST_RAYS = 2048, 4
-TRIAL_SIDE = 256
+TRIAL_SIDE = 512
 EXAMPLE = 1024
 
 
@@ -50,7 +45,7 @@ class Trial:
     activations: int
     """What grows with the rays of a tile, and temporary copies of gradients."""
     picture: int
-    """Rendering and measuring the largest picture."""
+    """Rendering the largest picture, or measuring and showing it."""
 
 
 def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> Trial:
@@ -137,52 +132,47 @@ def _few_rays(model: Model, training: bool) -> int:
 
 
 def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None, beside: int) -> int:
-    """Return what the largest picture of the scene holds while it is rendered and measured."""
-    model, scene = step.model, batches.scene
+    """Return what the largest picture of the scene holds while it is rendered, or measured and shown."""
+    model, device = step.model, settings.device
     few = _few_rays(model, training=False)
-    rays = step.rays(batches.at(0, batches.crop_rays(0)).pixels.to(settings.device))
+    pixels = batches.at(0, batches.crop_rays(0)).pixels.to(device)
 
     def rendered(count: int) -> int:
-        some = rays[torch.arange(count, device=settings.device) % rays.near.numel()]
+        some = pixels[torch.arange(count, device=device) % pixels.view.numel()]
         with torch.no_grad():
-            behind = background_colors(step.background, count, settings.device, None)
-            return peak_bytes(lambda: model(some, behind, None), settings.device)
+            behind = background_colors(step.background, count, device, None)
+            return peak_bytes(lambda: model(step.rays(some), behind, None), device)
 
     per_ray = (rendered(2 * few) - rendered(few)) / few
-    num_pixels = int((scene.pixels.width * scene.pixels.height).max())
+    num_pixels = int((batches.scene.pixels.width * batches.scene.pixels.height).max())
     tile_points = settings.inference_tile_points if tile is None else tile
     tile_rays = min(num_pixels, beside * tile_rays_for(model, tile_points))
-    # A small picture, cut into as many tiles by a stand-in that holds as much for each ray.
-    share = TRIAL_SIDE**2 / num_pixels
-    side = torch.tensor([TRIAL_SIDE], device=scene.near.device)
-    small = RayGenerator(resized(scene.cameras[:1], side, side), scene.near[:1], scene.far[:1])
-    stand_in = RadianceModel({"only": _Hungry(int(per_ray))}).to(settings.device)
 
-    def work() -> None:
-        tile_points = max(1, int(tile_rays * share))
-        picture = render_picture(stand_in, small, 0, scene.background, tile_points)
-        image_metrics(picture.rgb, picture.rgb)
+    def held(height: int, work: Callable[[Picture], object]) -> int:
+        def whole() -> None:
+            depth = torch.zeros(height, width)
+            rgb = torch.zeros(height, width, 3)
+            first = None if model.first_picture is None else torch.zeros_like(rgb)
+            work(Picture(rgb, depth, torch.zeros_like(depth), first))
 
-    return int(peak_bytes(work, settings.device) / share)
+        return peak_bytes(whole, device)
+
+    def of_largest(work: Callable[[Picture], object]) -> float:
+        """Beyond two bands, bytes grow with the rows alone."""
+        if height <= 3 * band:
+            return held(height, work)
+        two, three = held(2 * band, work), held(3 * band, work)
+        return three + (three - two) * (height / band - 3)
+
+    width = min(TRIAL_SIDE, num_pixels)
+    height, band = -(-num_pixels // width), BAND_PIXELS // width
+    return int(max(of_largest(lambda picture: None) + tile_rays * per_ray, of_largest(_measured_and_shown)))
 
 
-class _Hungry(Level):
-    """A level that computes nothing, and takes as much memory for each ray as a whole model does."""
-
-    def __init__(self, bytes_per_ray: int):
-        nn.Module.__init__(self)  # it has neither sampler nor field
-        self.bytes_per_ray = bytes_per_ray
-        self.parameter = nn.Parameter(torch.zeros(()))
-
-    def points_per_ray(self, before: float, training: bool) -> float:
-        return 1.0
-
-    def forward(
-        self, rays: RayBundle, background: Tensor | None, history: list[Any], random: RayRandom | None
-    ) -> Rendering:
-        torch.empty(rays.near.numel() * self.bytes_per_ray, dtype=torch.uint8, device=rays.near.device)
-        rgb = torch.zeros_like(rays.directions)
-        return Rendering(rgb, rgb, torch.zeros_like(rays.near), torch.zeros_like(rays.near))
+def _measured_and_shown(picture: Picture) -> None:
+    truth = torch.zeros_like(picture.rgb)
+    image_metrics(picture.rgb, truth)
+    mosaic(panels(truth, picture.rgb, 1.0 * picture.depth, picture.opacity))
 
 
 def _optimizer_bytes(step: TrainStep, trainable: list[nn.Parameter]) -> int:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.geometry.frames import told_length
-from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
+from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.ranks import processes_here
 from nerf_lightning.video.encoding import CODECS, require_encoder
 from nerf_lightning.video.exr import Channels, exr_channels, require_openexr
@@ -101,7 +101,7 @@ def film_steps(
     shots = make_shots(
         subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
     )
-    require_room(shots[0].cameras, settings, [subject.scene for subject in subjects])
+    require_room(shots[0].cameras, settings, len(subjects))
     first = shots[0].subject.scene
     films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
     if settings.form == "exr":
@@ -187,38 +187,34 @@ def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
     return digest.hexdigest()[:16]
 
 
-# Bytes per pixel, measured on the CPU. All rays of a frame are made at once; these are they, and the picture rendered:
-PLAIN = 140
-# where rays are cut, or looked at a second time for normals or for another camera's colour;
-TWICE = 260
-# where they go through normalised device coordinates.
-BENT = 400
+# Bytes per pixel, measured on the CPU: the picture rendered;
+PICTURE = 40
+# where the surface is looked at too: its points and normals, or the channels of an EXR.
+SURFACE = 80
 # What is shown of it: a panel, its caption and its place in the frame.
 PANEL = 16
 
 
-def bytes_per_pixel(settings: FilmSettings, scenes: Sequence[SceneRecord]) -> int:
+def bytes_per_pixel(settings: FilmSettings, num_models: int) -> int:
     """Return what a frame takes for each pixel of a panel; models are rendered one after the other."""
-    bent = any(scene.cameras.ndc is not None for scene in scenes)
-    twice = settings.hold_camera or settings.crop is not None or settings.near is not None
-    picture = BENT if bent else TWICE if twice or "normals" in settings.outputs or settings.form == "exr" else PLAIN
-    return picture + PANEL * len(settings.outputs) * len(scenes)
+    surface = SURFACE if "normals" in settings.outputs or settings.form == "exr" else 0
+    return PICTURE + surface + PANEL * len(settings.outputs) * num_models
 
 
-def require_room(cameras: Cameras, settings: FilmSettings, scenes: Sequence[SceneRecord]) -> None:
+def require_room(cameras: Cameras, settings: FilmSettings, num_models: int = 1) -> None:
     """Refuse frames that take more memory than can be had.
 
     Args:
         cameras: of the path, all of one size.
         settings: what is filmed.
-        scenes: those of the models that are filmed side by side.
+        num_models: so many are filmed side by side.
 
     Raises:
         InputError: in all processes; it says which size would fit.
     """
     width, height = int(cameras.width[0]), int(cameras.height[0])
     together = processes_here() if ranks.world_size() > 1 else 1
-    each = together * bytes_per_pixel(settings, scenes)
+    each = together * bytes_per_pixel(settings, num_models)
 
     def tall(wide: int) -> int:
         return max(1, round(height * wide / width))

@@ -11,6 +11,7 @@ from torch import nn
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
+from nerf_lightning.nerf import bands
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.types.renderings import Rendering
@@ -59,11 +60,12 @@ def forward_facing(scene):
     ],
     ids=["default", "cut", "everything", "everything cut"],
 )
-def test_a_frame_takes_what_is_said(tmp_path, settings, where, models):
+def test_a_frame_takes_what_is_said(tmp_path, monkeypatch, settings, where, models):
+    monkeypatch.setattr(bands, "BAND_PIXELS", 1 << 12)  # frames worth refusing have many bands
     scene = where(scene_record(ball_scene()))
     subjects, path = [Subject(Blank(), scene, "white", "one")] * models, Orbit(1, width=SIDE)
     settings = replace(settings, form="frames")
-    said = SIDE**2 * bytes_per_pixel(settings, [scene] * models)
+    said = SIDE**2 * bytes_per_pixel(settings, models)
     counted = peak_bytes(lambda: film(subjects, path, 1 << 12, tmp_path, settings), torch.device("cpu"))
     # PIL's and numpy's copies are not counted here.
     assert 0.35 * said < counted < said
@@ -75,19 +77,19 @@ def with_free(monkeypatch, available):
 
 def test_a_frame_beyond_memory_is_refused_with_what_would_fit(monkeypatch):
     with_free(monkeypatch, 10**9)
-    scene, settings = scene_record(ball_scene()), FilmSettings()
+    settings = FilmSettings()
 
     def cameras(width, height):
         return pinhole_cameras(torch.eye(4)[:3][None], 100.0, width, height)
 
-    with pytest.raises(InputError, match=r"A frame of 30000 x 15000 pixels .* takes 77\.4 GB, and 0\.8 GB") as error:
-        require_room(cameras(30000, 15000), settings, [scene])
+    with pytest.raises(InputError, match=r"A frame of 30000 x 15000 pixels .* takes 32\.4 GB, and 0\.8 GB") as error:
+        require_room(cameras(30000, 15000), settings)
     width, height = (int(part.split("=")[1].split(" ")[0]) for part in str(error.value).split("path.")[1:])
     assert height == round(width / 2)
-    assert width * height * bytes_per_pixel(settings, [scene]) == pytest.approx(0.8e9, rel=0.01)
-    require_room(cameras(width, height), settings, [scene])
+    assert width * height * bytes_per_pixel(settings, 1) == pytest.approx(0.8e9, rel=0.01)
+    require_room(cameras(width, height), settings)
     with pytest.raises(InputError, match=r"path\.width="):
-        require_room(cameras(width, height), settings, 2 * [scene])
+        require_room(cameras(width, height), settings, num_models=2)
 
 
 def test_nothing_is_begun_of_a_film_that_would_not_fit(tmp_path, monkeypatch):

@@ -194,7 +194,7 @@ def plan(step, free, counts=True):
         Row("pixels", 3 * 10**9, "mapped file", counts),
         Row("optimizer's state", 10**9, "memory", cure="shrink it"),
     ]
-    steps = [Row("a step", step, "memory", cure="lower trainer.tile_points"), Row("or a picture", 10**9, "memory")]
+    steps = [Row("a step", step, "memory", cure="lower trainer.tile_points"), Row("a picture", 10**9, "memory")]
     return MemoryPlan(rows, steps, free)
 
 

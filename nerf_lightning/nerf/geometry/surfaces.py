@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from nerf_lightning.nerf.bands import bands
+
 _SEEN = 1e-3
 """Opacity below which a ray met nothing: what is left of its depth is rounding."""
 REACH, SIGMA = 2, 1.5
@@ -41,6 +43,14 @@ def normals_from_depth(points: Float[Tensor, "height width 3"]) -> Float[Tensor,
     With row 0 on top, (slope down the rows) x (slope along the columns) points towards the camera for whatever a
     pinhole sees, so no pose is needed. The picture must be at least two pixels high and wide.
     """
+    normals, height = torch.empty_like(points), points.shape[0]
+    for rows in bands(*points.shape[:2]):
+        top, bottom = max(0, rows.start - REACH), min(height, rows.stop + REACH)
+        normals[rows] = _normals(points[top:bottom])[rows.start - top : rows.stop - top]
+    return normals
+
+
+def _normals(points: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
     height, width, _ = points.shape
     around = pad(points, (0, 0, REACH, REACH, REACH, REACH), value=torch.nan)
 
