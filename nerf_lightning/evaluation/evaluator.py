@@ -2,6 +2,7 @@
 
 import logging
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -92,29 +93,30 @@ class Scoring:
         """
         views = self._views(scene)
         shown_views = evenly_spaced_subset(views, self.num_pictures)
-        kept = KeptViews(folder, self.split, self.num_worst)
         show_photographs(model, scene)
         rays_of = RayGenerator.of_views(scene, model)
         rows: list[dict[str, Any]] = []
         mine = ranks.every_other(views)
-        for view in tracked(mine, f"evaluating {self.split}"):
-            if scene.refined and view not in scene.splits["train"]:
-                cameras = fitted_camera(model, scene, view, background, tile_points)
-                rays_of = RayGenerator(cameras, scene.near, scene.far)
-            started = time.perf_counter()
-            picture = render_picture(model, rays_of, view, background, tile_points)
-            seconds = time.perf_counter() - started
-            row, shown = self._compare(picture, scene, view, background)
-            if model.needs_photographs:
-                row["unseen"] = float((picture.opacity == 0).float().mean())
-            rows.append(row | {"seconds": seconds})
-            kept.watch(row["name"], row["psnr"], shown)
-            if view in shown_views:
-                kept.save(row["name"], shown)
-        rows = ranks.in_turn(rows)
+        with closing(KeptViews(folder, self.split, self.num_worst)) as kept:
+            for view in tracked(mine, f"evaluating {self.split}"):
+                if scene.refined and view not in scene.splits["train"]:
+                    cameras = fitted_camera(model, scene, view, background, tile_points)
+                    rays_of = RayGenerator(cameras, scene.near, scene.far)
+                started = time.perf_counter()
+                picture = render_picture(model, rays_of, view, background, tile_points)
+                seconds = time.perf_counter() - started
+                row, shown = self._compare(picture, scene, view, background)
+                if model.needs_photographs:
+                    row["unseen"] = float((picture.opacity == 0).float().mean())
+                rows.append(row | {"seconds": seconds})
+                kept.watch(row["name"], row["psnr"], shown)
+                if view in shown_views:
+                    kept.save(row["name"], shown)
+            rows = ranks.in_turn(rows)
+            worst = kept.finish(rows)
         result = summary(rows) | {
             "pictures": [scene.view_names[view] for view in shown_views],
-            "worst_views": kept.finish(rows),
+            "worst_views": worst,
             "protocol": self.protocol(scene, views, background),
             "origin": origin or {},
             "environment": environment(),

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.escaping import for_file_name
+from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.visualization.pictures import mosaic, panels, save_png
 
@@ -64,12 +65,12 @@ class KeptViews:
         """Hold a view for as long as it may be among the worst."""
         if sum((held[:2] < (psnr, name)) for held in self.worst) >= self.num_worst:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        file = TemporaryFile(dir=self.folder)  # noqa: SIM115 (closed where the view is dropped or written)
+        file = TemporaryFile(dir=make_folder(self.folder))  # noqa: SIM115 (closed where the view is dropped or written)
         for _, picture in view.parts():
             content = io.BytesIO()  # numpy itself says nothing where the disk is too full for the last bytes
             np.save(content, picture.numpy())
-            file.write(content.getbuffer())
+            with full_disk_named(self.folder):
+                file.write(content.getbuffer())
         self.worst = sorted([*self.worst, (psnr, name, file)], key=lambda held: held[:2])
         for _, _, dropped in self.worst[self.num_worst :]:
             dropped.close()
@@ -79,12 +80,16 @@ class KeptViews:
         """Write those that are among the worst of all processes' rows; return the names of these, the worst first."""
         names = [name for _, name in sorted((row["psnr"], row["name"]) for row in rows)][: self.num_worst]
         for _, name, file in self.worst:
-            with file:
-                file.seek(0)
-                if name in names:
-                    parts = ((part, torch.from_numpy(np.load(file))) for part in PARTS)
-                    self._write(f"worst_{names.index(name) + 1}", parts)
+            file.seek(0)
+            if name in names:
+                parts = ((part, torch.from_numpy(np.load(file))) for part in PARTS)
+                self._write(f"worst_{names.index(name) + 1}", parts)
         return names
+
+    def close(self) -> None:
+        """Let go of what is held."""
+        for _, _, file in self.worst:
+            file.close()
 
     def _write(self, name: str, parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> None:
         save_view(parts, self.folder / "images" / f"{name}.png", make_folder(self.folder, "images", "views", name))

@@ -62,15 +62,15 @@ def image_metrics(
 
 
 def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]) -> float:
-    # The mean over all windows that lie inside, which torchmetrics' is, by bands of windows.
-    count, total = render.shape[0] - SSIM_WINDOW + 1, 0.0
-    for windows in bands(count, render.shape[1]):
-        rows = slice(windows.start, windows.stop + SSIM_WINDOW - 1)
-        ours, true = (picture[rows].movedim(-1, 0)[None] for picture in (render, truth))
-        similarity = structural_similarity_index_measure(ours, true, data_range=1.0)
-        assert isinstance(similarity, Tensor)  # a pair only where the full map is asked for
-        total += (windows.stop - windows.start) * float(similarity)
-    return total / count
+    # torchmetrics' mean over all windows, those that reach over the border included, by bands of their middles.
+    height, reach, total = render.shape[0], SSIM_WINDOW // 2, 0.0
+    for rows in bands(height, render.shape[1]):
+        top, bottom = max(0, rows.start - reach), min(height, max(rows.stop + reach, SSIM_WINDOW))
+        ours, true = (picture[top:bottom].movedim(-1, 0)[None] for picture in (render, truth))
+        _, each = structural_similarity_index_measure(ours, true, data_range=1.0, return_full_image=True)
+        assert isinstance(each, Tensor)
+        total += float(each[..., rows.start - top : rows.stop - top, :].mean()) * (rows.stop - rows.start)
+    return total / height
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

@@ -15,7 +15,7 @@ try:
 except ImportError:  # Windows: what killed processes leave there stays
     fcntl = None  # type: ignore[assignment]
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 
 
@@ -41,7 +41,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk_named(place: Path) -> Iterator[None]:
-    """Say of a full disk, or a spent quota, where it is.
+    """Say of a full disk, a spent quota, or a file that may not grow, where it is.
 
     The system says it when something is written, and then of no file; a copy says it of the file that it reads.
 

@@ -160,7 +160,7 @@ def _picture(settings: TrainerSettings, step: TrainStep, batches: RayBatches, ti
     def of_largest(work: Callable[[Picture], object]) -> float:
         """Beyond two bands, bytes grow with the rows alone."""
         if height <= 3 * band:
-            return held(height, work)
+            return float(held(height, work))
         two, three = held(2 * band, work), held(3 * band, work)
         return three + (three - two) * (height / band - 3)
 

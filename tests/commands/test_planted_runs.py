@@ -176,10 +176,10 @@ def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_p
 @pytest.mark.parametrize(
     "note", ["[" * 100_000, "{" * 5, '{"fingerprint": ' + "[" * 900 + "]" * 900 + "}", "[1]", "9" * 9999]
 )
-def test_a_garbled_note_is_another_run(nerf, capture, run, note):
+def test_a_garbled_note_is_damaged(nerf, capture, run, note):
     (run / "run.json").write_text(note)
     write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
-    said(nerf("train", f"resume={run}"), "is occupied by a run of another config")
+    said(nerf("train", f"resume={run}"), f"{run / 'run.json'} is damaged", "Remove it")
 
 
 @pytest.mark.parametrize("note", [{"finished_at_step": "x"}, {"seconds": "x"}, {"seconds": 10**400}, {"seconds": [1]}])

@@ -18,6 +18,8 @@ def test_the_worst_of_all_processes_are_kept_in_order(tmp_path):
         kept.watch(name, psnr, view(0.1 * number))
         assert len(kept.worst) <= 2
     assert {tuple(kept.finish(rows)) for kept in processes} == {("a", "d")}
+    for kept in processes:
+        kept.close()
     written = sorted(path.relative_to(tmp_path / "images").as_posix() for path in tmp_path.rglob("*.png"))
     assert [name for name in written if "/" not in name] == ["worst_1.png", "worst_2.png"]
     assert "views/worst_1/truth.png" in written

@@ -19,7 +19,7 @@ from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.page_file import read_baked
-from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
@@ -69,7 +69,7 @@ def marched(page, view: int, width: int, height: int, behind="white") -> np.ndar
 def marched_through(page, c2w, focal, size, width, height, behind="white") -> np.ndarray:
     scale = min(width / size[0], height / size[1])
     cameras = pinhole_cameras(c2w[None].float(), scale * float(focal), width, height)
-    rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), 0)
+    rays, _ = view_rays(RayGenerator(cameras, torch.zeros(1), torch.ones(1)), all_pixels(cameras, 0))
     return over(Marcher(read_baked(page)[1]).render(rays), behind).clamp(0, 1).numpy()
 
 

@@ -13,6 +13,7 @@ from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.fitting import _TrainingRays, _Values, fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.page import PageExport
+from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import view_rays
 
@@ -21,7 +22,7 @@ WHITE, BLACK = (replace(all_around(), background=behind) for behind in ("white",
 
 def error_of(baked, scene, view):
     """The squared error of a view, through what the page shows."""
-    rays = view_rays(RayGenerator(scene.cameras, scene.near, scene.far), view)[0]
+    rays = view_rays(RayGenerator(scene.cameras, scene.near, scene.far), all_pixels(scene.cameras, view))[0]
     wanted = scene.pixels.view(view).float() / 255.0
     return float((over(Marcher(baked).render(rays), scene.background) - wanted[..., :3]).double().square().sum())
 
@@ -85,7 +86,10 @@ def moved(baked, column, by):
 def test_pictures_come_nearer_to_the_photographs(ball):
     spoilt = replace(ball, colors=np.where(np.arange(27)[:, None] < 3, ball.colors // 2, ball.colors))
     scene = WHITE
-    shown = {view: over(Marcher(ball).render(view_rays(_rays(scene), view)[0]), "white") for view in range(6)}
+    shown = {
+        view: over(Marcher(ball).render(view_rays(_rays(scene), all_pixels(scene.cameras, view))[0]), "white")
+        for view in range(6)
+    }
     rgba = torch.cat(
         [torch.cat([each, torch.ones(*each.shape[:2], 1)], dim=-1).flatten(0, 1) for each in shown.values()]
     )

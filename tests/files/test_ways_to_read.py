@@ -28,6 +28,7 @@ OURS = {
     "config/scene_overrides.py": ["read_text"],
     "viewer/page.py": ["open"],
     "export/images.py": ["load"],
+    "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
     "report/page.py": ["read_text"],
     "report/table_page.py": ["read_text"],
     "runs/published.py": ["read_text"],

@@ -109,7 +109,8 @@ def known() -> dict[str, Any]:
     return {
         "scene": scene, "record": scene, "cameras": scene.cameras, "c2w": scene.cameras.c2w, "poses": scene.cameras.c2w,
         "view": 1, "width": scene.cameras.width // 2, "height": scene.cameras.height // 2, "per_side": 7,
-        "pixels": all_pixels(scene.cameras, 1), "names": scene.view_names, "view_names": scene.view_names,
+        "pixels": all_pixels(scene.cameras, 1), "part": slice(3, 40),
+        "names": scene.view_names, "view_names": scene.view_names,
         "place": torch.tensor([0.25, -0.25]),
         "near": scene.near, "far": scene.far, "aabb": scene.aabb * 1.1, "to_user": to_user, "up": to_user[:3, 2] / 1.7,
         "rays": rays, "straight": rays, "ndc": False, "points": points, "positions": points, "centers": points,

@@ -5,9 +5,9 @@ torch's modes watch. `_Calls` sees what Python asks for, before it reaches C++: 
 move. `_Operations` sees every operation, those of the backward pass and those that C++ asks for included.
 
 An error (`Refused`) names the line of the project that asked. Always refused are operands that lie apart, NumPy arrays
-of what lies on the device, and float64 on `mps`. Within a step (`in_step`) also what makes the host wait: a number read,
-a size that depends on numbers, a copy that does not go by way of pinned memory; and float64 on `cuda`, whose GPUs
-compute it at a fraction of the speed.
+of what lies on the device, and float64 on `mps`. Within a step (`in_step`) also what makes the host wait: a number
+read, a size that depends on numbers, a copy that does not go by way of pinned memory; and float64 on `cuda`, whose
+GPUs compute it at a fraction of the speed.
 """
 
 import sys
@@ -48,7 +48,8 @@ class StandInDevice:
     """
 
     def __init__(self, kind: str):
-        self.device = torch.device(kind, 0)
+        # A number that no real device has: the project keeps some tensors for each.
+        self.device = torch.device(kind, 7)
         # How often each function waited that may.
         self.waited: Counter[str] = Counter()
         self._may_wait: Sequence[str] | None = None
@@ -66,7 +67,7 @@ class StandInDevice:
         self._stack.__exit__(*raised)
 
     def _run_backward(self, run: Any) -> Any:
-        # torch leaves a mode while it handles a call, `backward` too, and what is Python in there is to be seen as well.
+        # torch leaves a mode while it handles a call, `backward` too, and what is Python in there is to be seen, too.
         def seen(roots: Sequence[Tensor], *args: Any, **kwargs: Any) -> Any:
             with self._calls, self._calls.call_on(any(map(lies_there, roots))):
                 return run(roots, *args, **kwargs)

@@ -75,7 +75,7 @@ TAKEN = [
     lambda there, host: there.__setitem__(slice(2), 1.0),
     lambda there, host: there[:2] + there[torch.arange(2, device=there.device)],
     lambda there, host: torch.nn.functional.normalize(there, dim=0) + there,
-    lambda there, host: host.tolist() + [float(host.sum()), host.numpy()],
+    lambda there, host: [*host.tolist(), float(host.sum()), host.numpy()],
 ]
 
 

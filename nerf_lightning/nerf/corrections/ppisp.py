@@ -45,6 +45,9 @@ class PhysicalCamera(Correction):
     trained: Tensor
     camera: Tensor
     size: Tensor
+    corners: Tensor
+    reach: Tensor
+    least_curve: Tensor
 
     def __init__(
         self,
@@ -60,6 +63,9 @@ class PhysicalCamera(Correction):
         require_ranges(locals(), ranges | {"brightening_weight": weight, "channel_weight": weight})
         self.learning_rate, self.mean_weight, self.center_weight = learning_rate, mean_weight, center_weight
         self.brightening_weight, self.channel_weight = brightening_weight, channel_weight
+        # Where the parameters are: sent there in each step, the host would wait for them.
+        for name, value in (("corners", CORNERS), ("reach", REACH), ("least_curve", LEAST_CURVE)):
+            self.register_buffer(name, value, persistent=False)
         self._make_room(1, torch.zeros(1, dtype=torch.int64), torch.ones(1, 2), torch.zeros(1, dtype=torch.int64))
 
     def fit_to(self, scene: Scene) -> None:
@@ -92,12 +98,13 @@ class PhysicalCamera(Correction):
         change = _recolored(light, self._homographies()[pixels.view])
         tinted = exposed + (to_encoded(light + change) - to_encoded(light))
         inside, curve = tinted.clamp(END, 1.0 - END), self.curve[camera]
-        return tinted + (_response(inside, curve) - _response(inside, torch.zeros_like(curve)))
+        least = self.least_curve
+        return tinted + (_response(inside, curve, least) - _response(inside, torch.zeros_like(curve), least))
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return what holds the parameters near what is likely, as in the paper."""
         exposure = self.exposure[self.trained].mean()
-        moved = (self.chromaticity[self.trained] * REACH.to(exposure.device)).mean(dim=0)
+        moved = (self.chromaticity[self.trained] * self.reach).mean(dim=0)
         means = smooth_l1_loss(exposure, torch.zeros_like(exposure), beta=0.1)
         means = means + smooth_l1_loss(moved, torch.zeros_like(moved), beta=0.005)
         kinds = (torch.cat([self.middle, self.falloff], dim=-1), self.curve)
@@ -122,9 +129,8 @@ class PhysicalCamera(Correction):
 
     def _homographies(self) -> Float[Tensor, "views 3 3"]:
         # Of (r, g, i), less the identity.
-        reach, corners = REACH.to(self.chromaticity.device), CORNERS.to(self.chromaticity.device)
-        moved = _homography(corners + self.chromaticity * reach)
-        return moved - _homography(corners + torch.zeros_like(self.chromaticity) * reach)
+        moved = _homography(self.corners + self.chromaticity * self.reach)
+        return moved - _homography(self.corners + torch.zeros_like(self.chromaticity) * self.reach)
 
 
 def _homography(corners: Float[Tensor, "views 4 2"]) -> Float[Tensor, "views 3 3"]:
@@ -149,9 +155,10 @@ def _recolored(light: Float[Tensor, "*rays 3"], matrix: Float[Tensor, "*rays 3 3
     return torch.cat([change, -change.sum(dim=-1, keepdim=True)], dim=-1)
 
 
-def _response(x: Float[Tensor, "*rays 3"], curve: Float[Tensor, "*rays 3 4"]) -> Float[Tensor, "*rays 3"]:
+def _response(
+    x: Float[Tensor, "*rays 3"], curve: Float[Tensor, "*rays 3 4"], least: Float[Tensor, "3"]
+) -> Float[Tensor, "*rays 3"]:
     """Return colours under toe, shoulder and gamma, which are 1 at zero, and where the former two meet, then 1/2."""
-    least = LEAST_CURVE.to(x.device)
     toe, shoulder, gamma = (least + softplus(curve[..., :3] + torch.expm1(1.0 - least).log())).unbind(-1)
     meet = torch.sigmoid(curve[..., 3])
     height = shoulder * meet / (toe + meet * (shoulder - toe))

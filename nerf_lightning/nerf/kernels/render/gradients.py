@@ -50,7 +50,7 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "31332eae"
+COMPILED_WITH = "a43c25ec"
 """The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)

@@ -29,10 +29,14 @@ def test_it_is_bilinear_and_repeats_the_border(scale):
         torch.testing.assert_close(found[view == number], expected, atol=1e-5, rtol=1e-4)
 
 
+def chosen(*views):
+    return torch.tensor(views), views
+
+
 def test_pixels_are_found_at_their_centres():
     scene = ball_scene()
     model = looking_model(scene)
-    table = model.tables.colors([4, 1], CPU)
+    table = model.tables.colors(*chosen(4, 1))
     x, y = torch.tensor([0, 3, 11]), torch.tensor([5, 0, 11])
     found = table.look_up(torch.tensor([1, 1, 1]), torch.stack([x, y], dim=-1) + 0.5)
     torch.testing.assert_close(found, photograph(scene, 1, "white")[y, x])
@@ -41,16 +45,16 @@ def test_pixels_are_found_at_their_centres():
 def test_features_are_kept_until_a_weight_changes():
     model = looking_model()
     with torch.no_grad():
-        first = model.tables.features([0, 2], model.image_network, CPU).rows
+        first = model.tables.features(*chosen(0, 2), model.image_network).rows
         calls = []
         model.image_network.register_forward_hook(lambda *_: calls.append(1))
-        again = model.tables.features([2, 0], model.image_network, CPU).rows
+        again = model.tables.features(*chosen(2, 0), model.image_network).rows
         assert torch.equal(again, first.view(2, -1, 8).flip(0).flatten(0, 1))
         assert not calls
-        model.tables.features([0, 1], model.image_network, CPU)
+        model.tables.features(*chosen(0, 1), model.image_network)
         assert len(calls) == 1
         model.image_network.out.bias.add_(1.0)
-        torch.testing.assert_close(model.tables.features([0, 2], model.image_network, CPU).rows, first + 1.0)
+        torch.testing.assert_close(model.tables.features(*chosen(0, 2), model.image_network).rows, first + 1.0)
 
 
 def test_views_may_differ_in_size():
@@ -62,7 +66,7 @@ def test_views_may_differ_in_size():
     )
     cameras = replace(scene.cameras, height=cut.height)
     model = looking_model(replace(scene, pixels=cut, cameras=cameras), range(4))
-    table = model.tables.features([0, 1, 2, 3], model.image_network, CPU)
-    alone = model.tables.features([3], model.image_network, CPU)
+    table = model.tables.features(*chosen(0, 1, 2, 3), model.image_network)
+    alone = model.tables.features(*chosen(3), model.image_network)
     place = torch.tensor([[3.3, 2.2]])
     torch.testing.assert_close(table.look_up(torch.tensor([3]), place), alone.look_up(torch.tensor([0]), place))

@@ -1,0 +1,137 @@
+"""Rays of a picture are made a tile at a time: it has the bits that all of them at once gave it, and takes no more."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from support.scenes import LENSES, ball_scene, tiny_model
+
+from nerf_lightning.evaluation.metrics import image_metrics
+from nerf_lightning.nerf import bands
+from nerf_lightning.nerf.geometry.cameras import all_pixels, resized
+from nerf_lightning.nerf.geometry.clipping import Clip
+from nerf_lightning.nerf.geometry.ndc import world_distance
+from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
+from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.nerf.models import render_image
+from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
+from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
+from nerf_lightning.nerf.rendering.blending import background_colors, photograph
+from nerf_lightning.nerf.types.renderings import Rendering
+from nerf_lightning.nerf.types.scene import PixelStore
+from nerf_lightning.training.memory_trial import peak_bytes
+from nerf_lightning.visualization.pictures import panels
+
+TILE = 1000
+WIDTH, HEIGHT, LARGE_TILE = 1000, 700, 8192
+SCENE = ball_scene(size=41)
+FORWARD = replace(SCENE.cameras, c2w=torch.eye(4)[:3].expand(len(SCENE.near), 3, 4), ndc=torch.full((6, 2), 1.6))
+CAMERAS = {
+    "pinhole": SCENE.cameras,
+    "panorama": panorama_cameras(SCENE.cameras.c2w, 60, 30),
+    "ndc": FORWARD,
+    **{f"{kind} {lens[0]}": ball_scene(lens=lens, lens_model=kind, size=41).cameras for kind, lens in LENSES},
+}
+
+
+def through_all_at_once(place, model, generator, view):
+    """A picture as it was rendered before: all rays, then tile by tile."""
+    pixels = all_pixels(generator.cameras, view)
+    rays = generator(pixels, place, model.subpixels.per_side)
+    flat, seen = rays.map(lambda each: each.flatten(0, 1)), []
+    for part in tiles(flat.near.numel(), tile_rays_for(model, TILE)):
+        behind = background_colors("white", part.stop - part.start, torch.device("cpu"), None)
+        levels = model(flat[part], behind, None)
+        seen.append((levels[-1].rgb, levels[-1].depth, levels[-1].opacity, levels[model.first_picture].rgb))
+    columns = (torch.cat(column) for column in zip(*seen, strict=True))
+    rgb, depth, opacity, first = (column.view(*rays.near.shape, *column.shape[1:]) for column in columns)
+    if generator.ndc is not None:
+        depth = world_distance(generator.through_world(pixels, place), depth / rays.far)
+    return rgb, depth, opacity, first
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("per_side", [1, 2, 3])
+@pytest.mark.parametrize("space", ["bounded", "contracted"])
+@torch.no_grad()
+def test_a_picture_has_the_bits_that_all_its_rays_at_once_gave_it(name, per_side, space, monkeypatch):
+    monkeypatch.setattr(render_image, "threads_on", lambda device: 1)
+    model, generator = tiny_model(density_bias=0.5).eval(), RayGenerator(CAMERAS[name], SCENE.near, SCENE.far)
+    model.fit_to(replace(SCENE, space=space))
+    model.subpixels._now = per_side
+    parts = [through_all_at_once(place, model, generator, 1) for place in model.subpixels.places()]
+    picture = render_picture(model, generator, 1, "white", TILE)
+    for found, columns in zip(picture.tensors(), zip(*parts, strict=True), strict=True):
+        assert torch.equal(found, sum(columns[1:], columns[0]) / len(columns))
+        if per_side < 3:  # the order in which more are added differed at the end of a picture
+            assert torch.equal(found, torch.stack(columns).mean(dim=0))
+
+
+class Fog(RadianceModel):
+    """Sees the same everywhere, and takes no memory for it."""
+
+    first_picture = 0
+
+    def __init__(self):
+        super().__init__({})
+        self.parameter = torch.nn.Parameter(torch.zeros(()))
+
+    def points_per_ray(self, training):
+        return 1.0
+
+    def forward(self, rays, background, random):
+        seen = Rendering(rays.directions, rays.directions, rays.near, rays.near)
+        return [seen, seen]
+
+
+def large_view():
+    cameras = replace(SCENE.cameras, lens=torch.full((6, 6), 0.01), lens_model="radial_tangential")
+    side = torch.ones(6, dtype=torch.int64)
+    return RayGenerator(resized(cameras, WIDTH * side, HEIGHT * side), SCENE.near, SCENE.far)
+
+
+@pytest.mark.parametrize("clip", [None, Clip(near=2.5)], ids=["whole", "clipped"])
+@pytest.mark.parametrize("per_side", [1, 2])
+def test_no_more_rays_than_a_tile_has_are_made_at_once(clip, per_side, monkeypatch):
+    monkeypatch.setattr(render_image, "threads_on", lambda device: 1)
+    model, rays_of, made = Fog(), large_view(), []
+    model.subpixels._now = per_side
+    forward = RayGenerator.forward
+    monkeypatch.setattr(RayGenerator, "forward", lambda self, *of: made.append(of[0].x.numel()) or forward(self, *of))
+    held = peak_bytes(lambda: render_picture(model, rays_of, 1, "white", LARGE_TILE, clip), torch.device("cpu"))
+    assert 0 < max(made) <= LARGE_TILE
+    finished = 4 * (3 + 1 + 1 + 3) * WIDTH * HEIGHT
+    assert finished < held < finished + 1000 * LARGE_TILE
+
+
+def test_what_is_measured_and_shown_of_a_picture_takes_no_more_than_copies_of_it(monkeypatch):
+    monkeypatch.setattr(bands, "BAND_PIXELS", LARGE_TILE)
+    rgb = torch.rand(HEIGHT, WIDTH, 3)
+    picture, truth = Picture(rgb, 2 + rgb[..., 0], rgb[..., 1]), rgb.flip(0)
+    rgba = torch.zeros(WIDTH * HEIGHT, 4, dtype=torch.uint8)
+    sides = torch.tensor([WIDTH]), torch.tensor([HEIGHT])
+    scene = replace(SCENE, pixels=PixelStore(rgba, torch.zeros(1, dtype=torch.int64), *sides, has_transparency=True))
+    for copies, work in {
+        12: lambda: photograph(scene, 0, "white"),
+        24: lambda: image_metrics(rgb, truth),
+        16: lambda: picture_surface(large_view(), 1, picture),
+        13: lambda: normals_from_depth(rgb),
+        6: lambda: [picture.shape for _, picture in panels(truth, rgb, picture.depth, picture.opacity)],
+    }.items():
+        assert peak_bytes(work, torch.device("cpu")) < copies * WIDTH * HEIGHT + 1000 * LARGE_TILE
+
+
+def test_metrics_are_those_of_the_whole_picture(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    render, truth = torch.rand(2, 50, 40, 3, generator=generator)
+    kept = torch.rand(50, 40, generator=generator) > 0.3
+    for mask in (None, kept):
+        whole = image_metrics(render, truth, mask)
+        with monkeypatch.context() as patch:
+            patch.setattr(bands, "BAND_PIXELS", 7 * 40)
+            assert image_metrics(render, truth, mask) == pytest.approx(whole, rel=1e-6)
+    normals = normals_from_depth(render)
+    monkeypatch.setattr(bands, "BAND_PIXELS", 3 * 40)
+    assert torch.equal(normals_from_depth(render), normals)

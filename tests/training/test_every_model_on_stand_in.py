@@ -1,0 +1,158 @@
+"""Every model yaml trained and rendered on devices that are not there (`support.stand_in_device`).
+
+Once a run is warm, no step may wait but where a function is named here, with how often. Pictures may: their rays are
+followed in rounds, until none is left.
+"""
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from support.configs import composed, options
+from support.gpu_training import step_by_step
+from support.stand_in_device import StandInDevice
+
+from nerf_lightning.nerf.kernels import backends
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.render_image import render_picture
+from nerf_lightning.nerf.models.view_transformer.model import ViewTransformer
+
+WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
+SETTINGS = {
+    "num_samples": 16,
+    "log2_table_size": 10,
+    # Of grids, which are updated after 3 and after 6 steps, then half of them.
+    "resolution": 16,
+    "num_steps": 32,
+    "update_every": 3,
+    "warmup_steps": 4,
+}
+TILE_POINTS = 128
+
+# At the first update the host reads which cells there are, and how large; it sends their numbers.
+CELLS = {"OccupancySampler.update": 3}
+# At each update it asks whether samples were counted, and then how many a ray has, by which tiles are cut.
+TALLY = {"PackedLevel.update": 2, "PackedLevel.points_per_ray": 2}
+# In each step it reads where rays come from, how many photographs shall be looked at, and whether there are any; and
+# which they are, since it is the host that holds them.
+SOURCES = {"choose_sources": 3 * (STEPS - WARM), "ViewTransformer._looked_up": 2 * (STEPS - WARM)}
+# Each of the 12 that are trained is sent once, when it is first looked at.
+SENT, PHOTOGRAPHS = "ViewTables._pictures.<locals>.make", 12
+
+# `auto` is `fast` until a scene is read.
+MODELS = [name for name in options("model") if name != "auto"]
+SLOW, QUICK = ("nerf", "view_transformer"), ("fast_small", "nerf_tiny")
+
+
+def marked(*model):
+    return pytest.param(*model, marks=pytest.mark.slow if model[0] in SLOW else ())
+
+
+def small(model):
+    """Return the changes that make a model quick."""
+
+    def within(place, settings):
+        for name, value in settings.items():
+            if isinstance(value, dict):
+                yield from within(f"{place}.{name}", value)
+            elif name in SETTINGS:
+                yield f"{place}.{name}={SETTINGS[name]}"
+
+    config = OmegaConf.to_container(composed("train", f"model={model}"), resolve=False)
+    return ["data.batch_rays=8", *within("model", config["model"]), *within("encoder", config["encoder"])]
+
+
+def run_on(there, model, precision):
+    looks = model.startswith("view_transformer")  # by whole batches, so that what it reads can be counted
+    return step_by_step(model, there.device, precision, None if looks else TILE_POINTS, *small(model))
+
+
+def named_waits(model):
+    """Return how often functions may wait in the steps after the first."""
+    parts = {type(part) for part in model.modules()}
+    of_grids = CELLS if parts & {PackedLevel, MaskedLevel} else {}
+    return of_grids | (TALLY if PackedLevel in parts else {}) | (SOURCES if ViewTransformer in parts else {})
+
+
+def step_and_render(there, run, waits):
+    for step in range(STEPS):
+        if step < WARM:
+            run.step()
+        else:
+            with there.in_step(*waits):
+                run.step()
+    render_picture(run.training.model.eval(), run.training.rays, 0, "white", 1 << 14)
+    assert bool(run.all_losses().isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("model", "precision"),
+    [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in QUICK],
+)
+def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
+    with StandInDevice("cuda") as there, backends.without("hash_grid.cuda", "mlp.cuda"):
+        run = run_on(there, model, precision)
+        waits = named_waits(run.training.model)
+        step_and_render(there, run, (*waits, SENT))
+    assert there.waited.pop(SENT, 0) <= PHOTOGRAPHS
+    assert there.waited == waits
+
+
+@pytest.mark.parametrize("model", [marked(model) for model in MODELS])
+def test_every_model_trains_and_renders_on_mps(model):
+    with StandInDevice("mps") as there:
+        run = run_on(there, model, "32-true")
+        for _ in range(STEPS):
+            run.step()
+        render_picture(run.training.model.eval(), run.training.rays, 0, "white", 1 << 14)
+        assert bool(run.all_losses().isfinite().all())
+
+
+BESIDE = [f"{group}={option}" for group in ("correction", "refinement", "loss") for option in options(group)]
+
+
+@pytest.mark.parametrize("kind", ["cuda", "mps"])
+@pytest.mark.parametrize("part", [part for part in BESIDE if part not in ("correction=auto", "loss=proposal")])
+def test_what_learns_beside_a_model_neither_waits_nor_lies_apart(part, kind):
+    with StandInDevice(kind) as there:
+        run = step_by_step("nerf_tiny", there.device, "32-true", None, *small("nerf_tiny"), part)
+        for _ in range(WARM):
+            run.step()
+        with there.in_step() if kind == "cuda" else nullcontext():  # which has one memory for both
+            run.step()
+
+
+class NoKernel:
+    """In the place of a triton kernel: takes what lies on the device, and leaves a small number where results go."""
+
+    def __init__(self, *results):
+        self.results, self.launched = results, 0
+
+    def __getitem__(self, grid):
+        def launch(*arguments, **options):
+            assert all(each.is_cuda for each in arguments if isinstance(each, torch.Tensor))
+            for result in self.results:
+                arguments[result].fill_(1e-3)
+            self.launched += 1
+
+        return launch
+
+
+@pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
+def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
+    pytest.importorskip("triton")
+    from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
+    from nerf_lightning.nerf.kernels.mlp import cuda as mlp
+
+    kernels = {hash_grid: (NoKernel(6), NoKernel(0)), mlp: (NoKernel(2, 3), NoKernel(3, 4))}
+    for module, (forward, backward) in kernels.items():
+        monkeypatch.setattr(module, "_forward", forward)
+        monkeypatch.setattr(module, "_backward", backward)
+    twins = {"hash_grid.cuda": hash_grid, "mlp.cuda": mlp}
+    monkeypatch.setattr(backends, "twin", twins.get)
+    with StandInDevice("cuda") as there:
+        run = run_on(there, model, "bf16-mixed")
+        step_and_render(there, run, named_waits(run.training.model))
+    assert all(kernel.launched >= STEPS for pair in kernels.values() for kernel in pair)
