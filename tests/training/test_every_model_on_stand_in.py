@@ -18,6 +18,7 @@ from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.view_transformer.model import ViewTransformer
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
 SETTINGS = {
@@ -156,3 +157,17 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
         run = run_on(there, model, "bf16-mixed")
         step_and_render(there, run, named_waits(run.training.model))
     assert all(kernel.launched >= STEPS for pair in kernels.values() for kernel in pair)
+
+
+@pytest.mark.parametrize("model", ["fast", "fast_small", "fast_large", "nerf_occupancy"])
+def test_arrays_of_samples_hold_twice_what_a_step_is_made_to_have(model):
+    with StandInDevice("cuda") as there:
+        budget = composed("train", f"model={model}").data.sample_budget
+        given = f"data.sample_budget={'null' if budget is None else budget}"
+        run = step_by_step(model, there.device, "32-true", None, *small(model), given)
+        (sampler,) = [part for part in run.training.model.modules() if isinstance(part, OccupancySampler)]
+        pixels = run.loader.at(0, 0).pixels
+        few, many = (run.training.rays(pixels.map(lambda each, n=n: each.repeat(n))) for n in (1, 1 << 13))
+        assert sampler.capacity_for(many) == (1 << 20 if budget is None else 2 * budget)
+        # No more than there are intervals, where those are fewer.
+        assert sampler.capacity_for(few) == 8 * (sampler.lattice.numel() - 2)
