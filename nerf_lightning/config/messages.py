@@ -50,8 +50,8 @@ def paragraph(error: BaseException, command: str) -> str | None:
         return (
             f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
-    if isinstance(error, RuntimeError) and _is_out_of_memory(error):
-        reason = " ".join(str(error).split()).partition(". ")[0]
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _is_out_of_memory(error)):
+        reason = " ".join(str(error).split()).partition(". ")[0] or "Python got none"
         return (
             f"There is no memory for this: {reason}. Use a smaller model or smaller pictures, smaller tiles "
             "(trainer.tile_points), or another device (trainer=cpu); on a GPU, nvidia-smi shows who else uses it."

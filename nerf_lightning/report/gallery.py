@@ -16,6 +16,7 @@ from PIL import Image
 
 from nerf_lightning.config.key_meanings import meaning_of
 from nerf_lightning.console import StageProgress, say, spoken
+from nerf_lightning.data.pixels.images import MOST_SCANS, jpeg_scans
 from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.export.base import RunsExport
@@ -130,8 +131,9 @@ def _thumbnail(page: Path) -> str:
     try:
         if not found:
             return ""
-        image = Image.open(io.BytesIO(base64.b64decode(found[1], validate=True)), formats=["JPEG"])
-        if image.width * image.height > MOST_PIXELS:
+        still = base64.b64decode(found[1], validate=True)
+        image = Image.open(io.BytesIO(still), formats=["JPEG"])
+        if image.width * image.height > MOST_PIXELS or jpeg_scans(still) > MOST_SCANS:
             return ""
         image.thumbnail((THUMBNAIL, THUMBNAIL))
         content = io.BytesIO()

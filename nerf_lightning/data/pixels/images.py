@@ -36,8 +36,11 @@ MOST_IN_32_BITS = (2**32 - 1) // (255 * (2 * 255 + 1))
 """Pixels of a block whose weighted sums, doubled and rounded, fit into 32 bits."""
 JPEG_BLOCK = 64
 """Pixels of a block."""
-JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-"""Between the pixels, where 0xff is followed by 0, markers stand alone; those of 0xd0 to 0xd7 are among them."""
+JPEG_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd9-\xfe]")
+"""Those with a length. Decoders pass over the others, which have none: restarts among the pixels (0xd0 to 0xd7), TEM
+(0x01), and what is no marker at all."""
+JPEGS = ("JPEG", "MPO")
+"""Pillow's names: the latter carries other pictures behind its own."""
 JPEG_SCAN, JPEG_END = 0xDA, 0xD9
 SOUND_SCANS, MOST_SCANS = 20, 100
 """Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
@@ -232,7 +235,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             ) from error
         except (UnidentifiedImageError, *DECODER_ERRORS) as error:
             raise InputError(_unreadable(path, error)) from error
-        if image.format == "JPEG":
+        if image.format in JPEGS:
             _check_jpeg(image, file, path)
         _check_plain(image, path)
         with _one_large_picture if image.width * image.height > LARGE else nullcontext():
@@ -292,7 +295,7 @@ def _check_plain(image: Image.Image, path: Path) -> None:
 
 def _num_frames(image: Image.Image, path: Path) -> int:
     """Return how many pictures the file shows; what a JPEG carries beside its own (previews, depth) is none."""
-    if image.format in ("JPEG", "MPO"):
+    if image.format in JPEGS:
         return 1
     try:
         return getattr(image, "n_frames", 1)
