@@ -5,6 +5,7 @@ From Python: `read` a capture, `load` a trained model, `train` one; with Lightni
 """
 
 import importlib
+import zlib  # noqa: F401  before pycolmap, which brings another that Pillow's PNGs would be mixed with
 from typing import Any
 
 __version__ = "0.1.0"

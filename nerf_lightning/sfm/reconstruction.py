@@ -145,6 +145,8 @@ def _find_features(
 ) -> None:
     """Find features a few photographs at a time, so that progress shows and Ctrl-C is heard."""
     options = colmap.FeatureExtractionOptions()
+    # Whatever the default: where the wheel has no ONNX, learned features end the process.
+    options.type = colmap.FeatureExtractorType.SIFT
     options.use_gpu, options.num_threads = False, settings.threads
     options.max_image_size, options.sift.max_num_features = settings.max_image_size, settings.num_features
     shared, alone = groups
@@ -176,6 +178,7 @@ def _match(
 ) -> None:
     """Match and verify pairs of photographs."""
     options = colmap.FeatureMatchingOptions()
+    options.type = colmap.FeatureMatcherType.SIFT_BRUTEFORCE
     options.use_gpu, options.num_threads = False, settings.threads
     pairing = colmap.ImportedPairingOptions()
     pairing.match_list_path = str(pair_list)
