@@ -1,6 +1,7 @@
-"""One of several processes that `nerf` has started: `python -m nerf_lightning.cli.worker COMMAND FOLDER`.
+"""One of several processes that `nerf` has started: `python -m nerf_lightning.cli.worker COMMAND FOLDER LAUNCHER`.
 
-The folder holds the config that the first process composed, and Hydra's; the command line is not repeated.
+The folder holds the config that the first process composed, and Hydra's; the command line is not repeated. LAUNCHER is
+the number of that process.
 """
 
 import importlib
@@ -15,12 +16,12 @@ from nerf_lightning.cli.process import quick_end
 
 def main() -> None:
     """Join the other workers and run the command."""
-    command, folder = sys.argv[1], Path(sys.argv[2])
+    command, folder, launcher = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     with quick_end(), explained(command):
-        _run(command, folder)
+        _run(command, folder, launcher)
 
 
-def _run(command: str, folder: Path) -> None:
+def _run(command: str, folder: Path, launcher: int) -> None:
     from hydra.conf import HydraConf
     from hydra.core.hydra_config import HydraConfig
     from hydra.core.utils import configure_log, setup_globals
@@ -28,8 +29,9 @@ def _run(command: str, folder: Path) -> None:
 
     from nerf_lightning import ranks
     from nerf_lightning.training.launch.devices import choose_device
-    from nerf_lightning.training.launch.processes import joined
+    from nerf_lightning.training.launch.processes import end_with, joined
 
+    end_with(launcher)
     setup_globals()
     config = OmegaConf.load(folder / "config.yaml")
     allow(Budgets(**config.budgets))

@@ -4,6 +4,7 @@ import json
 import signal
 import time
 
+import psutil
 import pytest
 import torch
 from support.ports import unused_port
@@ -98,6 +99,29 @@ def test_a_run_of_two_processes_is_stopped_and_goes_on_in_one(capture, tmp_path,
     code, output = finished(start("train", f"resume={tmp_path}", "trainer=cpu", "trainer.max_steps=50"))
     assert code == 0, output
     assert_close(tmp_path, alone)
+
+
+def is_alive(process):
+    # In a container, nobody may ask what became of an orphan.
+    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.slow
+def test_workers_end_with_the_process_that_has_started_them(capture, tmp_path):
+    process = start(*arguments(capture, *TWO, "trainer.max_steps=1000000", f"paths.output_dir={tmp_path}"))
+    while process.poll() is None and saved(tmp_path)["global_step"] == 0:
+        time.sleep(0.02)
+    workers = [each for each in psutil.Process(process.pid).children() if "nerf_lightning.cli.worker" in each.cmdline()]
+    process.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 30
+    while living := [worker for worker in workers if is_alive(worker)]:
+        if time.monotonic() > deadline:
+            for worker in living:
+                worker.kill()
+            pytest.fail(f"{len(living)} workers live on")
+        time.sleep(0.05)
+    code, output = finished(process)
+    assert (code, len(workers)) == (-signal.SIGKILL, 2), output
 
 
 @pytest.mark.exhaustive

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -36,6 +37,7 @@ HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_loggi
 LONGEST_WAIT = timedelta(hours=2)
 # So long another process may take to say what is wrong, before this one says it too.
 PATIENCE_SECONDS = 3.0
+WATCH_SECONDS = 1.0
 
 
 def on_all_processes(command: str, config: DictConfig, work: Callable[[DictConfig], Any]) -> Any:
@@ -135,12 +137,25 @@ def launch(command: str, config: DictConfig, count: int) -> Any:
             signals_to_handle="SIGTERM,SIGINT,SIGHUP,SIGUSR1" if os.name == "posix" else "SIGTERM,SIGINT",
         )
         try:
-            elastic_launch(settings, sys.executable)("-m", "nerf_lightning.cli.worker", command, folder)
+            start_workers = elastic_launch(settings, sys.executable)
+            start_workers("-m", "nerf_lightning.cli.worker", command, folder, str(os.getpid()))
         except ChildFailedError as error:
             raise SystemExit(_exit_code([failure.exitcode for failure in error.failures.values()])) from None
         except SignalException as stopped:
             raise SystemExit(128 + stopped.sigval) from None
         return json.loads((Path(folder) / "result.json").read_text())
+
+
+def end_with(launcher: int) -> None:
+    """Let a worker end soon after its launcher, which cannot stop it any more where it was killed itself."""
+
+    def watch() -> None:
+        while os.getppid() == launcher:
+            time.sleep(WATCH_SECONDS)
+        os._exit(128 + signal.SIGTERM)
+
+    if os.name == "posix":  # elsewhere the number of a parent says nothing
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _exit_code(codes: list[int]) -> int:
