@@ -34,7 +34,12 @@ def twin(module: str) -> ModuleType | None:
         found = _imported(module)
         # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
         with _told_if_long(library):
-            found.trial()
+            try:
+                found.trial()
+            except Exception:  # a damaged cache, perhaps: unpickling raises anything
+                if library != "numba" or not _forget_compiled(found):
+                    raise
+                found.trial()
         return found
     except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
         _reasons[module] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
@@ -76,6 +81,16 @@ def _imported(module: str) -> ModuleType:
         "that is set). Set NUMBA_CACHE_DIR to a folder that can be written."
     )
     return importlib.import_module(name)
+
+
+def _forget_compiled(module: ModuleType) -> int:
+    """Let numba forget what it keeps of a module's kernels, and return of how many."""
+    from numba.core.dispatcher import Dispatcher
+
+    kernels = [each for each in vars(module).values() if isinstance(each, Dispatcher)]
+    for kernel in kernels:
+        kernel._cache.flush()
+    return len(kernels)
 
 
 @functools.cache

@@ -117,3 +117,30 @@ def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
     result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
     assert "adam/cpu.py" in result.stdout, result.stderr
     assert "Set NUMBA_CACHE_DIR" in result.stderr
+
+
+KEPT = """
+import logging
+logging.basicConfig()
+from nerf_lightning.nerf.kernels.backends import twin
+print(twin("adam.cpu"))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_a_damaged_cache_is_compiled_anew(suffix, tmp_path):
+    def found():
+        result = subprocess.run([sys.executable, "-c", KEPT], env=environment, capture_output=True, text=True)
+        assert "adam/cpu.py" in result.stdout, result.stderr
+        assert "cannot be used" not in result.stderr
+        return {file: file.stat().st_mtime_ns for file in tmp_path.rglob(f"*.{suffix}")}
+
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    tmp_path.chmod(0o700)
+    first = found()
+    assert first
+    for file in first:
+        file.write_bytes(file.read_bytes()[:40])
+    mended = found()
+    assert found() == mended  # nothing was compiled again
