@@ -91,6 +91,11 @@ def for_file_name(name: str) -> str:
     return plain.encode()[:LONGEST_FILE_NAME].decode(errors="ignore")
 
 
+def is_plain(name: str) -> bool:
+    """Tell whether a name is UTF-8 and holds no control characters."""
+    return not any(map(_is_unprintable, name))
+
+
 def require_printable(name: str, where: str) -> None:
     """Refuse a name that is not UTF-8 or holds control characters, before anything is called by it.
 
@@ -101,7 +106,7 @@ def require_printable(name: str, where: str) -> None:
     Raises:
         InputError: with the name, escaped.
     """
-    if any(map(_is_unprintable, name)):
+    if not is_plain(name):
         raise InputError(
             f"{where} has the name '{for_terminal(name[:200])}', which holds control characters or is not UTF-8. "
             "Rename it, in the files that list it too."

@@ -1,5 +1,6 @@
 """Photographs as they come from a camera: found, checked, and put upright beside the poses that will be found."""
 
+import logging
 import os
 import shutil
 from collections import Counter
@@ -19,7 +20,7 @@ from nerf_lightning.data.pixels.images import (
     read_rgba,
 )
 from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed, require_printable
+from nerf_lightning.escaping import is_plain, listed
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
@@ -30,6 +31,8 @@ SMALLEST_SIDE = 64
 JPEG_QUALITY = 95
 LENS_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
 LONGEST_TAG = 200
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,14 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             "Give the folder in which the photographs lie."
         ) from error
     pictures = pictures_among(files)
+    odd = [path.name for path in pictures if not is_plain(path.name)]
+    if odd:
+        log.warning(
+            "%d of %d photographs are left out, since their names are not UTF-8 or hold control characters: %s. Rename "
+            "them, and they are taken.",
+            *(len(odd), len(pictures), listed(odd, 5)),
+        )
+        pictures = [path for path in pictures if is_plain(path.name)]
     _require_no_heic(folder, pictures, files)
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
@@ -138,7 +149,6 @@ def check_one_camera(photographs: list[FoundPhotograph]) -> None:
 
 
 def _photograph(path: Path) -> FoundPhotograph:
-    require_printable(path.name, f"A photograph in {path.parent}")
     width, height = image_size(path)
     if min(width, height) < SMALLEST_SIDE:
         raise InputError(

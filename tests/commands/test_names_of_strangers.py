@@ -58,12 +58,12 @@ def test_a_view_of_such_a_name_is_refused(tmp_path, kind, name):
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_photograph_without_a_pose_has_a_name_too(tmp_path, name):
+def test_a_photograph_without_a_pose_is_left_out_whatever_its_name(tmp_path, name, caplog):
     root = write_colmap(tmp_path / "capture", Known())
     (root / "images" / "p_0.png").rename(root / "images" / name)
     Image.new("RGB", (16, 12)).save(root / "images" / "p_0.png")
-    with pytest.raises(InputError, match=r"has the name 'p_\\.*', which holds control characters"):
-        read("colmap", root)
+    assert read("colmap", root).left_out == (name,)
+    assert "1 photographs have no pose and are left out: p_\\" in caplog.text
 
 
 @pytest.mark.parametrize("name", BAD[:3])
@@ -90,11 +90,15 @@ def test_a_frame_of_the_blender_format_is_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_photograph_to_find_the_pose_of_is_refused(tmp_path, name):
+def test_a_photograph_to_find_the_pose_of_is_left_out(tmp_path, name, caplog):
     for photograph in ("a.png", "b.png", name):
         Image.new("RGB", (80, 80)).save(tmp_path / photograph)
-    with pytest.raises(InputError, match=r"has the name 'p_\\.*', which holds control characters"):
+    with pytest.raises(InputError, match=r"holds only a\.png, b\.png"):
         find_photographs(tmp_path)
+    Image.new("RGB", (80, 80)).save(tmp_path / "c.png")
+    caplog.clear()
+    assert [each.path.name for each in find_photographs(tmp_path)] == ["a.png", "b.png", "c.png"]
+    assert ["1 of 4 photographs are left out" in text and "p_\\" in text for text in caplog.messages] == [True]
 
 
 def test_names_of_all_languages_are_read_and_exported(tmp_path):

@@ -143,7 +143,7 @@ def check_capture(capture: Capture) -> None:
         raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
     names = [view.name for view in capture.views]
     require_within("name_characters", max(map(len, names)), str(capture.source), "characters in a name")
-    for name in (*names, *capture.left_out):
+    for name in names:  # those that are left out are shown, and nothing is called by them
         require_printable(name, f"A photograph of {capture.source}")
     require_different(names, str(capture.source))
     for view in capture.views:

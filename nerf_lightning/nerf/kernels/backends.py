@@ -89,7 +89,7 @@ def _forget_compiled(module: ModuleType) -> int:
 
     kernels = [each for each in vars(module).values() if isinstance(each, Dispatcher)]
     for kernel in kernels:
-        kernel._cache.flush()
+        kernel._cache.flush()  # type: ignore[attr-defined]
     return len(kernels)
 
 
