@@ -25,7 +25,7 @@ from nerf_lightning.training.memory_trial import peak_bytes
 from nerf_lightning.visualization.pictures import panels
 
 TILE = 1000
-WIDTH, HEIGHT, LARGE_TILE = 1000, 700, 8192
+WIDTH, HEIGHT, LARGE_TILE = 500, 350, 4096
 SCENE = ball_scene(size=41)
 FORWARD = replace(SCENE.cameras, c2w=torch.eye(4)[:3].expand(len(SCENE.near), 3, 4), ndc=torch.full((6, 2), 1.6))
 CAMERAS = {
