@@ -48,7 +48,7 @@ SLOW, QUICK = ("nerf", "view_transformer"), ("fast_small", "nerf_tiny")
 
 
 def marked(*model):
-    return pytest.param(*model, marks=pytest.mark.slow if model[0] in SLOW else ())
+    return pytest.param(*model, marks=pytest.mark.minutes if model[0] in SLOW else ())
 
 
 def small(model):
