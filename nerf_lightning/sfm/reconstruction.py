@@ -29,6 +29,8 @@ class NothingFoundError(InputError):
 
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
 FEWEST_REGISTERED = 3
+LEAST_ROOM = 1 << 20
+"""Bytes; an empty database takes less."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,13 @@ def reconstruct(
     Raises:
         InputError: no pycolmap, or photographs of several sizes for one camera.
         NothingFoundError: nothing can be reconstructed.
+        OSError: the disk is full.
     """
     colmap = require_pycolmap()
     names = [photograph.path.name for photograph in photographs]
     groups = _camera_groups(photographs, settings.camera_mode)
     database = work / "database.db"
-    with _quiet(colmap):
+    with _quiet(colmap), _room_asked_for(work):
         colmap.set_random_seed(settings.seed)
         _find_features(colmap, database, folder, groups, settings, report)
         _match(colmap, database, names, work / "pairs.txt", settings, report)
@@ -121,6 +124,16 @@ def _quiet(colmap: Any) -> Iterator[None]:
         yield
     finally:
         colmap.logging.minloglevel = before
+
+
+@contextmanager
+def _room_asked_for(work: Path) -> Iterator[None]:
+    """Find out whether the disk is full where COLMAP fails, which does not say so."""
+    try:
+        yield
+    except RuntimeError:
+        (work / "room").write_bytes(bytes(LEAST_ROOM))
+        raise
 
 
 def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
