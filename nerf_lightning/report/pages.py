@@ -23,4 +23,4 @@ def address_from(file: Path, folder: Path) -> str:
     './../a%20b/page.html'
     """
     # Behind a dot, no name is taken for a scheme such as javascript.
-    return f"./{quote(Path(os.path.relpath(file, folder)).as_posix())}"
+    return f"./{quote(os.fsencode(Path(os.path.relpath(file, folder)).as_posix()))}"
