@@ -32,4 +32,4 @@ def picture_psnr(
         error = (render[rows] - truth[rows]).square()
         error = error if kept is None else error[kept[rows]]
         total, count = total + float(error.sum(dtype=torch.float64)), count + error.numel()
-    return float(psnr(torch.tensor(total / count, dtype=torch.float64)))
+    return float(psnr(torch.tensor(total, dtype=torch.float64) / count))  # NaN where none is kept

@@ -87,3 +87,8 @@ def test_median_and_worst_know_which_way_is_worse():
     for function in (mean_over_images, median_over_images, worst_of_images):
         with pytest.raises(ValueError, match="no image"):
             function([])
+
+
+def test_of_no_pixel_the_psnr_is_no_number():
+    picture = torch.rand(12, 12, 3)
+    assert math.isnan(image_metrics(picture, picture, torch.zeros(12, 12, dtype=torch.bool))["psnr"])
