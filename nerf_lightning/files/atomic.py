@@ -15,7 +15,9 @@ try:
 except ImportError:  # Windows: what killed processes leave there stays
     fcntl = None  # type: ignore[assignment]
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL = (errno.ENOSPC, errno.EDQUOT)
+NO_ROOM = (*FULL, errno.EFBIG)
+"""A file may also be larger than is allowed."""
 _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 
 
@@ -35,6 +37,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         with full_disk_named(path), _held(part):
             yield part
             os.replace(part, path)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)  # what is wrong with a disk is not said of any file
+        raise
     finally:
         part.unlink(missing_ok=True)
 
@@ -43,7 +49,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 def full_disk_named(place: Path) -> Iterator[None]:
     """Say of a full disk, a spent quota, or a file that may not grow, where it is.
 
-    The system says it when something is written, and then of no file; a copy says it of the file that it reads.
+    The system says it of no file; a copy says it of the file that it reads.
 
     Args:
         place: the file or folder that is written, where nothing nearer is known.
@@ -51,7 +57,7 @@ def full_disk_named(place: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in FULL:
+        if error.errno in NO_ROOM:
             error.filename, error.filename2 = str(error.filename2 or error.filename or place), None
         raise
 

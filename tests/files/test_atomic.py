@@ -6,7 +6,7 @@ import pytest
 from support.running import start_code
 
 from nerf_lightning.files import atomic
-from nerf_lightning.files.atomic import FULL, full_disk_named, whole_file
+from nerf_lightning.files.atomic import NO_ROOM, full_disk_named, whole_file
 
 KILLED = """
 import os, signal, sys
@@ -84,7 +84,7 @@ def write_half(path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("number", FULL)
+@pytest.mark.parametrize("number", NO_ROOM)
 def test_a_full_disk_is_said_of_what_is_written(tmp_path, number):
     cases = {
         (): tmp_path,  # something was written, and nobody knows what
@@ -95,6 +95,12 @@ def test_a_full_disk_is_said_of_what_is_written(tmp_path, number):
         with pytest.raises(OSError, match="full") as caught:
             fail_in(tmp_path, OSError(number, "full", *names))
         assert (caught.value.filename, caught.value.filename2) == (str(said), None)
+
+
+def test_whatever_befalls_a_file_is_said_of_it(tmp_path):
+    with pytest.raises(OSError, match="broken") as caught, whole_file(tmp_path / "a.txt"):
+        raise OSError(errno.EIO, "broken")
+    assert caught.value.filename == str(tmp_path / "a.txt")
 
 
 def test_another_error_is_said_of_no_other_file(tmp_path):
