@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.budgets import require_within
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, WIDEST, degrees_across, require_different
+from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, impossible_lens, require_different
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import downscaled_size
 from nerf_lightning.errors import InputError
@@ -102,21 +102,17 @@ def without_impossible_lenses(capture: Capture) -> Capture:
     """
     if capture.lens_model not in ("pinhole", "radial_tangential"):
         return capture
-    degrees = [max(map(degrees_across, view.size, view.focal)) for view in capture.views]
-    odd = [number for number, across in enumerate(degrees) if across > WIDEST]
+    reasons = [impossible_lens(view.size, view.focal) for view in capture.views]
+    odd = [(view.name, reason) for view, reason in zip(capture.views, reasons, strict=True) if reason]
     if not odd:
         return capture
-    first = capture.views[odd[0]]
-    reason = (
-        f"a focal length of {min(first.focal):g} pixels for {first.size[0]:g} x {first.size[1]:g} is a field of view "
-        f"of {degrees[odd[0]]:.1f} degrees, which no perspective lens has"
-    )
+    first, reason = odd[0]
     cure = "The focal length must be in pixels of the width and height beside it, not a share of them."
-    if len(odd) == len(degrees):
-        raise InputError(f"{capture.source}: the view {first.name} has {reason}; so has every other. {cure}")
-    names = listed((capture.views[number].name for number in odd), cap=5)
-    log.warning("%d of %d views are left out (%s): %s. %s", len(odd), len(degrees), names, reason, cure)
-    return _with_views(capture, [number for number in range(len(degrees)) if number not in set(odd)])
+    if len(odd) == len(reasons):
+        raise InputError(f"{capture.source}: the view {first} has {reason}; so has every other. {cure}")
+    names = listed((name for name, _ in odd), cap=5)
+    log.warning("%d of %d views are left out (%s): %s. %s", len(odd), len(reasons), names, reason, cure)
+    return _with_views(capture, [number for number, reason in enumerate(reasons) if reason is None])
 
 
 def _with_views(capture: Capture, kept: Sequence[int]) -> Capture:

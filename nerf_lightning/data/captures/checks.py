@@ -35,13 +35,20 @@ def require_different(names: Iterable[str], where: str) -> None:
         raise InputError(f"{where} lists {listed(twice)} more than once. Remove all but one of each.")
 
 
-def degrees_across(pixels: int | float, focal: int | float) -> float:
-    """Return the field of view of a perspective picture, in degrees.
+def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | float, int | float]) -> str | None:
+    """Say why no perspective lens takes a picture of this size (width, height) at these focal lengths; None: some does.
 
-    >>> degrees_across(800, 400)
-    90.0
+    >>> impossible_lens((800, 600), (400, 400))
+    >>> impossible_lens((800, 600), (0.5, 0.5))
+    'a focal length of 0.5 pixels for 800 x 600 is a field of view of 179.9 degrees, which no perspective lens has'
     """
-    return math.degrees(2 * math.atan2(pixels, 2 * focal))
+    across = max(math.degrees(2 * math.atan2(side, 2 * length)) for side, length in zip(size, focal, strict=True))
+    if across <= WIDEST:
+        return None
+    return (
+        f"a focal length of {min(focal):g} pixels for {size[0]:g} x {size[1]:g} is a field of view of {across:.1f} "
+        "degrees, which no perspective lens has"
+    )
 
 
 def contents(folder: Path) -> str:

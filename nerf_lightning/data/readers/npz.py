@@ -16,12 +16,11 @@ from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import (
     FARTHEST,
     LEAST_FOCAL,
-    WIDEST,
     box_around_origin,
     check_bounds,
     check_divisible,
     check_step,
-    degrees_across,
+    impossible_lens,
     pose_from_matrix,
 )
 from nerf_lightning.data.captures.splits import every_kth, in_order
@@ -107,11 +106,8 @@ class NpzReader(Reader):
         )
         c2w = _poses(arrays["poses"], len(images), self.path)
         height, width = images.shape[1:3]
-        if (across := degrees_across(max(width, height), focal)) > WIDEST:
-            raise InputError(
-                f"{self.path}: a focal length of {focal:g} pixels for {width} x {height} is a field of view of "
-                f"{across:.1f} degrees, which no perspective lens has. It must be in pixels, not a share of them."
-            )
+        if reason := impossible_lens((width, height), (focal, focal)):
+            raise InputError(f"{self.path}: {reason}. It must be in pixels, not a share of them.")
         check_divisible(width, height, self.downscale)
         train, held = self._split(len(images))
         full = pinhole_cameras(c2w, focal, width, height)
