@@ -57,7 +57,7 @@ test: setup ## Run the tests, but for the exhaustive ones: five minutes on two q
 test-all: setup ## Run every test, the exhaustive ones included
 	@$(PYTEST) -m ""
 
-test-slow: setup ## Run the tests that take minutes: kernels compiled for GPUs that are not here, large models on a stand-in
+test-slow: setup ## Run the tests that take minutes together: kernels compiled for GPUs that are not here, models on a stand-in
 	@$(PYTEST) -m minutes
 
 test-fast: setup ## Run the tests that take less than a few seconds each

@@ -43,7 +43,7 @@ def test_a_process_started_with_m_imports_nothing_from_it(strange_folder):
     assert "logger" in output_of(start_cold("nerf_lightning", "train", "--cfg", "job", cwd=strange_folder))
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_neither_do_the_processes_of_one_run(strange_folder, tmp_path):
     write_npz(tmp_path / "ball.npz")
     settings = ["scene=npz", f"scene.path={tmp_path}/ball.npz", *FAST, "final.evaluate=false", "final.video=false"]

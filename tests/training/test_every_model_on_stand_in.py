@@ -44,11 +44,12 @@ SENT, PHOTOGRAPHS = "ViewTables._pictures.<locals>.make", 12
 
 # `auto` is `fast` until a scene is read.
 MODELS = [name for name in options("model") if name != "auto"]
-SLOW, QUICK = ("nerf", "view_transformer"), ("fast_small", "nerf_tiny")
+SINGLE = ("fast_small", "nerf_tiny")  # in float32, too
+ALWAYS = (*SINGLE, "fast_proposal", "view_transformer_tiny")  # one of each kind; make test-slow has the others
 
 
 def marked(*model):
-    return pytest.param(*model, marks=pytest.mark.minutes if model[0] in SLOW else ())
+    return pytest.param(*model, marks=() if model[0] in ALWAYS else pytest.mark.minutes)
 
 
 def small(model):
@@ -90,7 +91,7 @@ def step_and_render(there, run, waits):
 
 @pytest.mark.parametrize(
     ("model", "precision"),
-    [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in QUICK],
+    [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in SINGLE],
 )
 def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
     with StandInDevice("cuda") as there, backends.without("hash_grid.cuda", "mlp.cuda"):

@@ -127,7 +127,7 @@ print(twin("adam.cpu"))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 def test_a_damaged_cache_is_compiled_anew(suffix, tmp_path):
     def found():
