@@ -3,6 +3,7 @@
 import inspect
 
 import pytest
+import torch
 from hydra.errors import HydraException
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
@@ -85,6 +86,14 @@ def test_a_model_writes_no_size_into_the_parts_that_it_chose(model):
     for level in yaml.get("model", {}).get("levels", {}).values():
         assert level.keys() <= {"_target_", "field", "learn_every", "whole_gradients_from"}
         assert level.get("field", "${field}") == "${field}"
+
+
+@pytest.mark.parametrize("model", options("model"))
+def test_every_model_builds_without_memory(model):
+    """As a checkpoint's model is built first, to compare its sizes."""
+    config = composed("train", f"model={model}").model
+    with torch.device("meta"):
+        assert all(weight.is_meta for weight in build(config).parameters())
 
 
 @pytest.mark.parametrize("model", options("model"))

@@ -31,7 +31,9 @@ class RadianceModel(Model):
         super().__init__()
         self.subpixels = Subpixels(subpixels, subpixels_from)
         self.levels = nn.ModuleDict(levels)
-        self.points_per_ray(training=False)  # levels that do not fit each other are refused here
+        # Levels that do not fit each other are refused here; without memory (`meta`) a lattice cannot be counted.
+        if not any(buffer.is_meta for buffer in self.buffers()):
+            self.points_per_ray(training=False)
 
     @property
     def level_names(self) -> tuple[str, ...]:
