@@ -17,18 +17,18 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.training.step_output import StepOutput
 
 # The first round compiles kernels and allocates what stays; CUDA's guide asks for a few.
 WARM_UPS = 3
 
-Seen = dict[str, Tensor]
-Gradients = Callable[[Batch, Tensor, Tensor], Seen]
+Gradients = Callable[[Batch, Tensor, Tensor], StepOutput]
 """Takes a batch, the sum of the weights of all of its shares, and the step's key; leaves gradients in parameters."""
-Recorder = Callable[[Callable[[], Seen]], tuple[Callable[[], None], Seen]]
+Recorder = Callable[[Callable[[], StepOutput]], tuple[Callable[[], None], StepOutput]]
 """Takes work; returns what does it again on the same memory, and what the work returned, which is written to anew."""
 
 
-def cuda_graph(work: Callable[[], Seen]) -> tuple[Callable[[], None], Seen]:
+def cuda_graph(work: Callable[[], StepOutput]) -> tuple[Callable[[], None], StepOutput]:
     """Record work as a CUDA graph, after a few rounds of it on a stream of their own."""
     graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -50,7 +50,7 @@ class _Recording:
     weight: Tensor
     key: Tensor
     replay: Callable[[], None]
-    seen: Seen
+    seen: StepOutput
     gradients: list[Tensor | None]
 
 
@@ -74,7 +74,7 @@ class RecordedGradients:
         self.compute, self.parameters, self.counts, self.record = compute, parameters, counts, record
         self.recordings: dict[int, _Recording] = {}
 
-    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: Int[Tensor, ""]) -> Seen:
+    def __call__(self, batch: Batch, weight: Float[Tensor, ""], key: Int[Tensor, ""]) -> StepOutput:
         """Return what a batch's rays have shown; its gradients are in the parameters, in the place of former ones."""
         if batch.num_rays not in self.recordings:
             self.recordings[batch.num_rays] = self._recorded(batch, weight, key)
@@ -87,7 +87,7 @@ class RecordedGradients:
         for parameter, gradient in zip(self.parameters, kept.gradients, strict=True):
             parameter.grad = gradient
         # The next replay writes over what it has returned.
-        return {name: value.clone() for name, value in kept.seen.items()}
+        return kept.seen.map(Tensor.clone)
 
     def _recorded(self, batch: Batch, weight: Tensor, key: Tensor) -> _Recording:
         batch, weight, key = batch.map(Tensor.clone), weight.clone(), key.clone()
@@ -96,7 +96,7 @@ class RecordedGradients:
                 parameter.grad = torch.zeros_like(parameter)
         before = [count.clone() for count in self.counts()]
 
-        def work() -> Seen:
+        def work() -> StepOutput:
             for parameter in self.parameters:
                 if parameter.grad is not None:
                     parameter.grad.zero_()

@@ -19,9 +19,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.corrections.none import NoCorrection
-from nerf_lightning.nerf.encoders.base import follow_run, tables_of
+from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.threads import threads_on
-from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.models.base import Model
@@ -29,6 +28,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.subpixels import for_each_ray, mean_over_pixels, random_of_rays
 from nerf_lightning.nerf.models.tiles import is_out_of_memory, tile_rays_for, tiles
 from nerf_lightning.nerf.optimizers.schedule import Schedule
+from nerf_lightning.nerf.part import Part, StepContext, parts_of
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.samplers.base import PackedSampler
@@ -38,7 +38,8 @@ from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.training.recorded_gradients import RecordedGradients, Recorder, cuda_graph
 from nerf_lightning.training.step_guard import StepGuard, first_not_finite
-from nerf_lightning.training.tile_gradients import Backward, TileLoss, in_turn, side_by_side
+from nerf_lightning.training.step_output import StepOutput
+from nerf_lightning.training.tile_gradients import Backward, TileLoss, parallel_backward, sequential_backward
 
 # The number of rays per step changes no more often.
 BATCH_STEPS = 16
@@ -52,10 +53,12 @@ def _backward(loss: Tensor) -> None:
     loss.backward()
 
 
-def _penalties(renderings: list[Rendering]) -> Tensor | float:
-    # A number per level; no tensor where there is none, so that nothing is added.
+def _penalties(renderings: list[Rendering]) -> dict[str, Tensor]:
+    """Return the penalties of levels as one more term of the loss; no term where no level has one."""
+    if all(each.penalty is None for each in renderings):
+        return {}
     means = [torch.zeros_like(each.depth[0]) if each.penalty is None else each.penalty.mean() for each in renderings]
-    return torch.stack(means) if any(each.penalty is not None for each in renderings) else 0.0
+    return {"penalty": torch.stack(means)}
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,7 @@ class TrainStep:
         """
         learnt = [name for name, part in self.parts.items() if part is not self.model and list(part.parameters())]
         decides = ["refinement" if name == "rays" else name for name in learnt]
+        decides += ["a penalty"] if any(part.penalty() is not None for part in self._parts()) else []
         decides += ["loss"] if list(self.loss.buffers()) else []
         decides += ["model.subpixels"] if self.model.subpixels.side > 1 else []
         decides += ["encoder.blend_in"] if any(getattr(each, "blend_in", 0) for each in self.model.modules()) else []
@@ -172,7 +176,7 @@ class TrainStep:
                 f"learn, {cause}. Leave it out."
             )
 
-        def compute(batch: Batch, weight: Tensor, key: Tensor) -> dict[str, Tensor]:
+        def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
             return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
 
         self._recorded = RecordedGradients(compute, self._parameters(), self.model.counts, record)
@@ -224,12 +228,12 @@ class TrainStep:
         """
         tables = tables_of(self.model)
         groups: list[dict[str, Any]] = [{"params": tables, "weight_decay": 0.0}] if tables else []
-        within = [part for part in self.model.modules() if isinstance(part, LearntPart)]
-        for part in (*within, *self._beside_the_model()):
-            own = list(part.parameters())
+        known = set(map(id, tables))
+        for part in self._parts():
+            own = [parameter for parameter in part.parameters() if id(parameter) not in known]
             if own and part.learning_rate is not None:
                 groups.append({"params": own, "weight_decay": 0.0, "lr": part.learning_rate})
-        known = {id(parameter) for group in groups for parameter in group["params"]}
+                known |= set(map(id, own))
         groups.insert(0, {"params": [p for p in self._parameters() if id(p) not in known]})
         try:
             return self.build_optimizer(groups)
@@ -240,7 +244,7 @@ class TrainStep:
 
     def __call__(
         self, batch: Batch, optimizer: Any, backward: Backward = _backward, measure_gradients: bool = False
-    ) -> dict[str, Any]:
+    ) -> StepOutput:
         """Take one step: gradients tile by tile, clipped, update.
 
         Args:
@@ -248,21 +252,16 @@ class TrainStep:
             optimizer: torch's, or Lightning's wrapper of it.
             backward: adds a loss's gradients to the parameters'.
             measure_gradients: whether to measure the gradients' norms, before they are clipped.
-
-        Returns:
-            What `gradients` returns, with the losses and errors of all processes; the `pixels` of the batch; and
-            `gradient_norms` by level, where they were measured and the step was taken.
         """
         progress = self.progress
         optimizer.zero_grad()
         if self.num_steps is not None:
-            taken = progress.step / self.num_steps
-            follow_run(self.model, taken)
-            self.model.subpixels.follow(taken)
-            self.rays.follow(taken)
+            context = StepContext(progress.step / self.num_steps, progress.step, self._key)
+            for part in self._parts():
+                part.on_step(context)
             key = fold(self.seed, progress.attempt, progress.step, "correction")
             tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
-            self.correction.follow(taken, self.model, self.rays, tile_points, key)
+            self.correction.follow(context.progress, self.model, self.rays, tile_points, key)
         self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
         share = self._share(ranks.total(batch.weight.sum()))
@@ -270,13 +269,13 @@ class TrainStep:
             seen = self.gradients(batch, backward, share)
         else:
             seen = self._recorded(batch, share.weight, torch.full((), self._key, device=batch.weight.device))
-        ranks.add_up([seen["losses"], seen["color_errors"]])
+        ranks.add_up([seen.losses, seen.color_errors, *seen.terms.values()])
         ranks.add_up_gradients(self._parameters())
         norms: dict[str, Tensor] = {}
-        if self.guard.allows(seen["losses"], self._named_parameters()):
+        if self.guard.allows(seen.losses, self._named_parameters()):
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
-            self.loss.learn(seen["rgb"], seen["target"], seen["weight"])
+            self.loss.learn(seen.rgb, seen.target, seen.weight)
             ranks.average(self.loss.measurements())
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
@@ -286,9 +285,9 @@ class TrainStep:
                 progress.batch_rays = batch_size(
                     progress.largest_batch, self.sample_budget / points, self.rays_together
                 )
-        return seen | {"pixels": batch.pixels, "gradient_norms": norms}
+        return replace(seen, gradient_norms=norms)
 
-    def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> dict[str, Tensor]:
+    def gradients(self, batch: Batch, backward: Backward = _backward, share: Share | None = None) -> StepOutput:
         """Send a batch forward and backward, tile by tile; smaller tiles where there is no memory for these.
 
         Args:
@@ -297,8 +296,7 @@ class TrainStep:
             share: what part of the step's batch this is; None: all of it.
 
         Returns:
-            `losses` and `color_errors` (mean squared) per level, detached, which add up over all shares to the batch's;
-            and of each ray its `foreground` light, its last level's `rgb`, its `target` colour and its `weight`.
+            What this share saw; its losses and errors add up over all shares to the batch's.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
         counts = [count.clone() for count in self.model.counts()]
@@ -315,8 +313,8 @@ class TrainStep:
                 part.zero_grad(set_to_none=False)
             for count, before in zip(self.model.counts(), counts, strict=True):
                 count.copy_(before)
-        for penalty in [part.penalty() for part in self._beside_the_model()]:
-            if penalty is not None:
+        for part in self._parts():
+            if (penalty := part.penalty()) is not None:
                 backward(penalty * (batch.num_rays / share.num_rays))  # all shares add up to one penalty
         return seen
 
@@ -362,8 +360,9 @@ class TrainStep:
         if self._recorded is not None:
             self._recorded.recordings.clear()
 
-    def _beside_the_model(self) -> list[LearntPart]:
-        return [part for part in self.parts.values() if part is not self.model]
+    def _parts(self) -> Iterator[Part]:
+        """Return the parts of the model, then those beside it."""
+        return parts_of(*self.parts.values())
 
     def _parameters(self) -> list[Parameter]:
         return [parameter for _, parameter in self._named_parameters()]
@@ -374,7 +373,7 @@ class TrainStep:
 
     def _in_tiles(
         self, batch: Batch, backward: Backward, share: Share, key: int | Tensor, tile_rays: int
-    ) -> dict[str, Tensor]:
+    ) -> StepOutput:
         num_rays, device = batch.num_rays, batch.weight.device
         random = batch_random(key, num_rays, device, share.first) if self.jitter else None
         behind = background_colors(self.background, num_rays, device, random, batch.rgba)
@@ -391,24 +390,31 @@ class TrainStep:
             background = None if behind is None else for_each_ray(behind[tile], several.per_pixel)
             renderings = [mean_over_pixels(each, several.per_pixel) for each in self.model(rays, background, numbers)]
             shown = [self.correction.photographed(each, pixels) for each in renderings]
-            levels = torch.stack(list(self.loss(shown, target[tile]))) + _penalties(renderings)
+            terms = self.loss(shown, target[tile]) | _penalties(renderings)
+            levels = torch.stack(list(terms.values())).sum(dim=0) if len(terms) > 1 else next(iter(terms.values()))
             part = (tile.stop - tile.start) / share.num_rays
             with torch.no_grad():
                 errors = torch.stack([squared_error(each.rgb, target[tile]) for each in shown])
-            return TileLoss(levels * part, errors * part, renderings[-1].foreground, shown[-1].rgb)
+                terms = {name: values.detach() * part for name, values in terms.items()}
+            return TileLoss(levels * part, terms, errors * part, renderings[-1].foreground, shown[-1].rgb)
 
         together = self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
         if threads > 1:
             parts = list(tiles(num_rays, tile_rays, together, multiple=threads))
-            lost = side_by_side(lose, parts, backward, self._parameters())
+            lost = parallel_backward(lose, parts, backward, self._parameters())
         else:
-            lost = in_turn(lose, list(tiles(num_rays, tile_rays, together)), backward)
-        seen = {name: torch.cat([getattr(each, name) for each in lost]) for name in ("foreground", "rgb")}
-        seen |= {"target": target.rgb, "weight": batch.weight}
-        for name, of in (("losses", "levels"), ("color_errors", "errors")):
-            seen[name] = torch.stack([getattr(each, of) for each in lost]).sum(0)
-        return seen
+            lost = sequential_backward(lose, list(tiles(num_rays, tile_rays, together)), backward)
+        return StepOutput(
+            losses=torch.stack([each.levels for each in lost]).sum(0),
+            terms={name: torch.stack([each.terms[name] for each in lost]).sum(0) for name in lost[0].terms},
+            color_errors=torch.stack([each.errors for each in lost]).sum(0),
+            foreground=torch.cat([each.foreground for each in lost]),
+            rgb=torch.cat([each.rgb for each in lost]),
+            target=target.rgb,
+            weight=batch.weight,
+            pixels=batch.pixels,
+        )
 
     def _take_smaller_tiles(self, batch: Batch, error: RuntimeError) -> None:
         if self.tile_points is None or self._tile_rays(batch.num_rays, training=True) <= self.rays_together:

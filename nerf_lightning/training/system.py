@@ -34,8 +34,8 @@ from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 class RadianceFieldSystem(LightningModule):
     """Train a radiance field on ray batches with Lightning.
 
-    A step cuts its batch into tiles whose gradients add up, hence the optimisation is manual. What a step returns, its
-    losses among them, reaches callbacks as `outputs` of `on_train_batch_end`.
+    A step cuts its batch into tiles whose gradients add up, hence the optimisation is manual. What a step returns
+    reaches callbacks as `outputs["step"]` of `on_train_batch_end` (`StepOutput`).
 
     Args:
         step: takes the steps.
@@ -85,16 +85,16 @@ class RadianceFieldSystem(LightningModule):
         self.step.num_steps = length_of_run(self.trainer, self.step.progress)
 
     def training_step(self, batch: Batch, batch_index: int) -> Mapping[str, Any]:
-        """Take one step, and return what it saw, with the sum of the levels' losses as `loss`.
+        """Take one step, and return the sum of the levels' losses as `loss`, and what it saw (`StepOutput`) as `step`.
 
         Logs `train/loss` and `train/psnr` (dB, of the step's rays) where no callback of `nerf train` does.
         """
         watched = any(each.wants_gradients(self.trainer, self) for each in self.monitors())
         seen = self.step(batch, self.optimizers(), self.manual_backward, measure_gradients=watched)
-        loss = seen["losses"].sum()
+        loss = seen.losses.sum()
         if not any(isinstance(each, Monitor | TrainingProgress) for each in self.trainer.callbacks):  # type: ignore[attr-defined]
-            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen["color_errors"][-1])}, prog_bar=True)
-        return seen | {"loss": loss}
+            self.log_dict({"train/loss": loss, "train/psnr": psnr(seen.color_errors[-1])}, prog_bar=True)
+        return {"loss": loss, "step": seen}
 
     def monitors(self) -> list[Monitor]:
         """Return the callbacks that log scalars."""

@@ -13,18 +13,21 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, add_all, hold_back
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import TableGradient, add_all, defer_table_grads
 from nerf_lightning.nerf.kernels.threads import in_parallel
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Backward = Callable[[Tensor], None]
 
 
 @dataclass(frozen=True)
-class TileLoss:
-    """What a tile of rays has lost."""
+class TileLoss(TensorStruct):
+    """What a tile of rays adds to the loss of its batch."""
 
     levels: Float[Tensor, "levels"]
     """Each level's loss."""
+    terms: dict[str, Float[Tensor, "levels"]]
+    """The same by term, detached."""
     errors: Float[Tensor, "levels"]
     """Each level's mean squared error of colour, whatever its loss is; of one that shows none it means nothing."""
     foreground: Float[Tensor, "rays 3"]
@@ -32,22 +35,20 @@ class TileLoss:
     rgb: Float[Tensor, "rays 3"]
     """What was compared with the photographs."""
 
-    def detached(self) -> "TileLoss":
-        """Return the same without what the backward pass needs."""
-        return TileLoss(self.levels.detach(), self.errors.detach(), self.foreground.detach(), self.rgb.detach())
 
-
-def in_turn(lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward) -> list[TileLoss]:
+def sequential_backward(
+    lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward
+) -> list[TileLoss]:
     """Send one tile after the other forward and backward, and return what they have lost, in order."""
     losses = []
     for tile in tiles:
         lost = lose(tile)
         backward(lost.levels.sum())
-        losses.append(lost.detached())
+        losses.append(lost.map(Tensor.detach))
     return losses
 
 
-def side_by_side(
+def parallel_backward(
     lose: Callable[[slice], TileLoss], tiles: Sequence[slice], backward: Backward, parameters: Sequence[Parameter]
 ) -> list[TileLoss]:
     """Do the same on as many threads as torch has; sums are taken in the order of the tiles, so their bits are fixed.
@@ -57,17 +58,17 @@ def side_by_side(
     learnt = [parameter for parameter in parameters if parameter.requires_grad]
 
     def work(tile: slice) -> tuple[TileLoss, Sequence[Tensor | None], Sequence[TableGradient]]:
-        with hold_back() as held:
+        with defer_table_grads() as held:
             lost = lose(tile)
             gradients = torch.autograd.grad(lost.levels.sum(), learnt, allow_unused=True)
-        return lost.detached(), gradients, held
+        return lost.map(Tensor.detach), gradients, held
 
     found = in_parallel(work, tiles)
     losses = [lost for lost, _, _ in found]
     total = torch.stack([lost.levels for lost in losses]).sum()
     held = [each for _, _, of_tile in found for each in of_tile]
     sums = [_sum([gradients[number] for _, gradients, _ in found]) for number in range(len(learnt))]
-    backward(_Found.apply(total, sums, held, *learnt))
+    backward(_PrecomputedGradients.apply(total, sums, held, *learnt))
     return losses
 
 
@@ -76,7 +77,7 @@ def _sum(gradients: Sequence[Tensor | None]) -> Tensor | None:
     return torch.stack(found).sum(dim=0) if found else None
 
 
-class _Found(torch.autograd.Function):
+class _PrecomputedGradients(torch.autograd.Function):
     """A loss whose gradients are known already."""
 
     @staticmethod

@@ -8,12 +8,15 @@ from PIL import Image
 from support import extensions
 from support.captures import picture
 from support.configs import composed
+from support.extensions.dssim import DSSIM
 from support.running import refused
 from support.scenes import ball_scene
 from support.steps import rays_of
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
@@ -32,6 +35,8 @@ ADDED = {
         "encoder=frequency_small",
     ],
     "a code for each photograph": ["model=nerf_tiny", "field=nerf_mlp_with_codes"],
+    "an encoder with a penalty": ["model=fast_small", "encoder=kplanes"],
+    "a structural loss beside the squared error": ["model=nerf_tiny", "loss=mse_dssim", "field.width=16"],
     "a model of its own kind": ["model=voxels", "model.resolution=12", "sampler@model.sampler=stratified_32"],
 }  # fmt: skip
 
@@ -50,14 +55,44 @@ def a_step(overrides) -> TrainStep:
 def test_it_learns_renders_and_is_saved(added):
     scene = ball_scene(num_views=8, size=16, background="random")
     step = a_step(ADDED[added])
-    loader, optimizer = RayBatches(scene, step.progress, 0, 96), step.new_optimizer()
-    losses = [step(loader.at(0, step.progress.rays_seen), optimizer)["losses"][-1] for _ in range(60)]
+    loader, optimizer = RayBatches(scene, step.progress, 0, 96, patch=step.loss.patch), step.new_optimizer()
+    losses = [step(loader.at(0, step.progress.rays_seen), optimizer).losses[-1] for _ in range(60)]
     assert float(torch.stack(losses[-5:]).mean()) < 0.8 * float(torch.stack(losses[:5]).mean())
     assert step.guard.skipped == 0
     again = a_step(ADDED[added])
     again.model.load_state_dict(step.model.state_dict())
     ours, theirs = (render_picture(each.model.eval(), each.rays, 0, "white", 4096) for each in (step, again))
     assert torch.equal(ours.rgb, theirs.rgb)
+
+
+@pytest.mark.parametrize("tile_points", [None, 256])
+def test_the_penalty_of_an_encoder_inside_the_model_reaches_its_gradients_once(tile_points):
+    scene, gradients = ball_scene(num_views=8, size=16, background="random"), []
+    for weight in (0.0, 1.0):
+        step = a_step([*ADDED["an encoder with a penalty"], f"encoder.total_variation={weight}"])
+        step.tile_points = tile_points
+        step.gradients(RayBatches(scene, step.progress, 0, 96).at(0, 0))
+        gradients.append(step.model.last.field.position_encoder.planes.grad)
+    encoder = step.model.last.field.position_encoder
+    (expected,) = torch.autograd.grad(encoder.penalty(), [encoder.planes])
+    assert float(expected.abs().max()) > 1e-4
+    torch.testing.assert_close(gradients[1] - gradients[0], expected, rtol=1e-3, atol=1e-6)
+
+
+def test_each_term_of_a_weighted_sum_is_told_apart_and_their_sum_is_minimised():
+    scene, step = ball_scene(num_views=8, size=16), a_step(ADDED["a structural loss beside the squared error"])
+    seen = step.gradients(RayBatches(scene, step.progress, 0, 96, patch=4).at(0, 0))
+    assert list(seen.terms) == ["mse", "dssim"]
+    assert float(seen.terms["dssim"].min()) > 0
+    torch.testing.assert_close(seen.losses, seen.terms["mse"] + seen.terms["dssim"])
+    torch.testing.assert_close(seen.terms["mse"], seen.color_errors)
+
+
+def test_a_weighted_sum_refuses_what_does_not_fit():
+    with pytest.raises(ValueError, match="weights names ssim, which is no loss: there are mse"):
+        WeightedSum({"mse": MeanSquaredError()}, {"ssim": 1.0})
+    with pytest.raises(ValueError, match=r"squares of \[4, 8\] pixels"):
+        WeightedSum({"a": DSSIM(4), "b": DSSIM(8)})
 
 
 def test_a_packed_sampler_without_a_grid_renders_as_it_trains():

@@ -34,7 +34,7 @@ class StepByStep:
         """Make a batch and take a step."""
         progress = self.training.progress
         batch = self.loader.at(progress.attempt, progress.rays_seen)
-        self.losses.append(self.training(batch.to(self.training.device), self.optimizer)["losses"].sum())
+        self.losses.append(self.training(batch.to(self.training.device), self.optimizer).losses.sum())
 
     def all_losses(self) -> torch.Tensor:
         """Return the losses so far, on the host."""

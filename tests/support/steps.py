@@ -49,4 +49,4 @@ def gradients(step, scene, steps=1):
     loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
     for _ in range(steps):
         seen = step(loader.at(0, step.progress.rays_seen), optimizer)
-    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen["losses"]
+    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen.losses

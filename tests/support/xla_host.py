@@ -36,8 +36,8 @@ class Counters(Callback):
     on_the_host: set = field(default_factory=set)
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        self.weight = outputs["weight"]
-        self.losses.append(outputs["losses"])
+        self.weight = outputs["step"].weight
+        self.losses.append(outputs["step"].losses)
         if pl_module.device.type != "xla":
             return
         from torch_xla.debug import metrics

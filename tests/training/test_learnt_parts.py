@@ -98,7 +98,7 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
         step = make_step(tile_points, model)
         batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
         seen = step.gradients(batch)
-        losses.append(seen["losses"])
+        losses.append(seen.losses)
         gradients.append(torch.cat([each.grad.flatten() for each in model.parameters()]))
     random = batch_random(fold(0, 0, 0), 64)
     rays = replace(step.rays(batch.pixels), photograph=batch.pixels.view)

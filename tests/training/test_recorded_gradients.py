@@ -15,6 +15,7 @@ from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.recorded_gradients import cuda_graph
+from nerf_lightning.training.step_output import StepOutput
 
 CPU = torch.device("cpu")
 KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "packed.cpu")
@@ -117,5 +118,5 @@ def test_other_threads_may_pin_memory_while_a_graph_is_captured(monkeypatch):
     for name, stand_in in {"graph": graph, "stream": nullcontext, "Stream": Mock, "CUDAGraph": Mock}.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(torch.cuda, "current_stream", Mock())
-    cuda_graph(dict)
+    cuda_graph(lambda: Mock(spec=StepOutput))
     assert asked == {"capture_error_mode": "thread_local"}

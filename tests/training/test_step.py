@@ -36,11 +36,11 @@ def test_the_gradients_of_each_level_are_measured_when_asked_for_and_before_they
     batch = RayBatches(scene, clipped.progress, 0, 64).at(0, 0)
     seen = clipped(batch, clipped.new_optimizer(), measure_gradients=True)
     RayBatches(scene, whole.progress, 0, 64)
-    assert whole(batch, whole.new_optimizer())["gradient_norms"] == {}
+    assert whole(batch, whole.new_optimizer()).gradient_norms == {}
     for name, level in whole.model.levels.items():
         expected = torch.cat([parameter.grad.flatten() for parameter in level.parameters()]).norm()
         assert float(expected) > 1e-3
-        torch.testing.assert_close(seen["gradient_norms"][name], expected)
+        torch.testing.assert_close(seen.gradient_norms[name], expected)
 
 
 def test_batch_norm_with_tiles_is_refused_by_name():
@@ -184,7 +184,7 @@ def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
         loader = RayBatches(scene, step.progress, 0, 64, patch=4)
         seen = step(loader.at(0, 0), step.new_optimizer())
         flat = torch.cat([p.grad.flatten() for p in step.model.parameters()])
-        found.append((flat, seen["losses"], step.loss.threshold))
+        found.append((flat, seen.losses, step.loss.threshold))
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
     assert float(found[0][2]) != pytest.approx(0.05)
     plain = make_step(None)

@@ -12,7 +12,7 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.hybrid import HybridEncoder
-from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, hold_back, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 
@@ -51,29 +51,29 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     optimizer = step.new_optimizer()
     optimizer.zero_grad()
     seen = step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), backward)
-    seen["counts"] = torch.cat([count.float() for count in step.model.counts()] or [torch.zeros(1)])
-    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen
+    counts = torch.cat([count.float() for count in step.model.counts()] or [torch.zeros(1)])
+    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen, counts
 
 
 def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads):
-    alone, seen_alone = gradients_of(model, 1, threads)
-    beside, seen = gradients_of(model, 3, threads)
+    alone, seen_alone, counts_alone = gradients_of(model, 1, threads)
+    beside, seen, counts = gradients_of(model, 3, threads)
     assert float(alone.norm()) > 0
     torch.testing.assert_close(beside, alone, rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(seen["losses"], seen_alone["losses"])
-    torch.testing.assert_close(seen["foreground"], seen_alone["foreground"])
-    assert torch.equal(seen["counts"], seen_alone["counts"])
+    torch.testing.assert_close(seen.losses, seen_alone.losses)
+    torch.testing.assert_close(seen.foreground, seen_alone.foreground)
+    assert torch.equal(counts, counts_alone)
 
 
 def test_their_bits_are_the_same_every_time(model, threads):
-    first, _ = gradients_of(model, 3, threads)
+    first, *_ = gradients_of(model, 3, threads)
     for _ in range(5):
         assert torch.equal(gradients_of(model, 3, threads)[0], first)
 
 
 def test_a_trainer_that_scales_the_loss_scales_the_gradients(model, threads):
-    wanted, _ = gradients_of(model, 2, threads)
-    got, _ = gradients_of(model, 2, threads, lambda loss: (4.0 * loss).backward())
+    wanted, *_ = gradients_of(model, 2, threads)
+    got, *_ = gradients_of(model, 2, threads, lambda loss: (4.0 * loss).backward())
     assert torch.equal(got, 4.0 * wanted)
 
 
@@ -84,7 +84,7 @@ def test_the_gradients_of_a_table_can_be_held_back_and_added_later():
     points = torch.rand(40, 3, generator=generator)
     interpolate(table, points, layout).square().sum().backward()
     wanted, table.grad = table.grad, None
-    with hold_back() as held:
+    with defer_table_grads() as held:
         interpolate(table, points, layout).square().sum().backward()
     assert table.grad is None
     add_all(held)

@@ -111,9 +111,9 @@ def test_two_processes_follow_one(monkeypatch):
         part = make_step(scene, lr=0.0)
         _, of_part = train(part, scene, 1)
         total = total + torch.cat([parameter.grad.flatten() for parameter in part.model.parameters()])
-        losses = losses + of_part["losses"]
+        losses = losses + of_part.losses
     assert torch.allclose(total, whole, atol=1e-6)
-    assert torch.allclose(losses, seen["losses"], rtol=1e-5)
+    assert torch.allclose(losses, seen.losses, rtol=1e-5)
 
 
 def test_rays_know_their_capture_and_whose_pixels_they_are():

@@ -7,16 +7,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
-class Correction(LearntPart, ABC):
+class Correction(Part, ABC):
     """Map the colours that a model renders to those that a photograph shows of them.
 
     A step of training applies it after compositing and before the loss, so that the model need not explain what

@@ -6,10 +6,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.products import Products
 
 
-class Encoder(nn.Module, ABC):
+class Encoder(Part, ABC):
     """Map coordinates to features that an MLP can resolve. `in_dim` is 3: positions or unit directions."""
 
     in_dim: int = 3
@@ -32,9 +33,6 @@ class Encoder(nn.Module, ABC):
     ) -> Float[Tensor, "*points features"]:
         """Return the features of points, with gradients, where they have been computed without them before."""
         return self(points)
-
-    def follow(self, share: float) -> None:
-        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
 
     def tables(self) -> list[nn.Parameter]:
         """Return those of its own parameters that are tables to look up in, not matrices to multiply with.
@@ -88,13 +86,6 @@ def tables_of(model: nn.Module) -> list[nn.Parameter]:
     """Return the tables of the encoders within a model, each once."""
     encoders = [module for module in model.modules() if isinstance(module, Encoder)]
     return list({id(table): table for encoder in encoders for table in encoder.tables()}.values())
-
-
-def follow_run(model: nn.Module, share: float) -> None:
-    """Tell the encoders within a model how far the run is, as a share of its steps."""
-    for module in model.modules():
-        if isinstance(module, Encoder):
-            module.follow(share)
 
 
 def matrices_of(model: nn.Module) -> list[nn.Parameter]:

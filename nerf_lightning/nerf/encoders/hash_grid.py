@@ -12,6 +12,7 @@ from nerf_lightning.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.ranges import require_ranges
 
 INITIAL_RANGE = 1e-4
@@ -96,10 +97,10 @@ class HashGridEncoder(Encoder):
         # While levels are blended in they are computed again: what is known has been weighted.
         return self._interpolate(points, None if self._blends else features.reshape(-1, self.out_dim))
 
-    def follow(self, share: float) -> None:
+    def on_step(self, context: StepContext) -> None:
         """Blend the levels in that are due: level l (from 0) rises over the l-th part of `blend_in`."""
         if self.blend_in:
-            self._set_weights(blending_weights(len(self.layout.resolutions), share / self.blend_in))
+            self._set_weights(blending_weights(len(self.layout.resolutions), context.progress / self.blend_in))
 
     def require_sound_state(self) -> None:
         """Look at what was loaded.

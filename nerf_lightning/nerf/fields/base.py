@@ -4,10 +4,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -24,7 +25,7 @@ class HiddenLayer:
     """Matrices whose first columns read them, one each; columns that read something else follow."""
 
 
-class Field(nn.Module, ABC):
+class Field(Part, ABC):
     """A radiance field: it answers what is asked of points (`types.points`)."""
 
     needs_whole_batch: bool = False

@@ -1,4 +1,4 @@
-"""The contract of a loss: what the levels saw against what the photograph shows."""
+"""The contract of a loss: what the levels saw against what the photographs show, as a sum of named terms."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -23,8 +23,8 @@ class Loss(nn.Module, ABC):
     """Whether it looks at the weights and samples of renderings, which levels may leave out otherwise."""
 
     @abstractmethod
-    def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
-        """Return one number per level, first level first; training minimises their sum.
+    def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
+        """Return named terms, each with a number per level; training minimises the sum of all, and logs each.
 
         Args:
             renderings: one per level.

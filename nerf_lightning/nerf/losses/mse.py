@@ -1,5 +1,6 @@
 """The photometric loss of the original NeRF (Eq. 6, arXiv 2003.08934)."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -11,9 +12,9 @@ from nerf_lightning.nerf.types.renderings import Rendering
 class MeanSquaredError(Loss):
     """Mean squared error of the colour, every level alike, so that the coarse level learns where to look."""
 
-    def forward(self, renderings: list[Rendering], target: Target) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[Rendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return the weighted mean over rays and channels, per level."""
-        return [squared_error(rendering.rgb, target) for rendering in renderings]
+        return {"color": torch.stack([squared_error(rendering.rgb, target) for rendering in renderings])}
 
 
 def squared_error(rgb: Float[Tensor, "rays 3"], target: Target) -> Float[Tensor, ""]:

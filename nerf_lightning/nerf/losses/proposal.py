@@ -32,14 +32,20 @@ class ProposalLoss(Loss):
         super().__init__()
         self.interlevel, self.distortion = interlevel, distortion
 
-    def forward(self, renderings: list[DenseRendering], target: Target) -> list[Float[Tensor, ""]]:
-        """Return the weighted mean over the rays for each level: interlevel losses, then colour with distortion."""
+    def forward(self, renderings: list[DenseRendering], target: Target) -> dict[str, Float[Tensor, "levels"]]:
+        """Return weighted means over rays: interlevel of each proposal, colour and distortion of the last level."""
         last, weight = renderings[-1], target.weight
-        losses = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
-        color = squared_error(last.rgb, target)
-        if not self.distortion:
-            return [*losses, color]
-        return [*losses, color + self.distortion * (distortion_loss(last) * weight).mean()]
+        none = torch.zeros_like(last.depth[0])
+        bounds = [self.interlevel * (interlevel_loss(last, proposal) * weight).mean() for proposal in renderings[:-1]]
+        before = [none] * len(bounds)
+        terms = {
+            "interlevel": torch.stack([*bounds, none]),
+            "color": torch.stack([*before, squared_error(last.rgb, target)]),
+        }
+        if self.distortion:
+            spread = self.distortion * (distortion_loss(last) * weight).mean()
+            terms["distortion"] = torch.stack([*before, spread])
+        return terms
 
 
 def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Tensor, "*rays"]:

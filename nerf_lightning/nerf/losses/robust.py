@@ -56,7 +56,7 @@ class RobustLoss(Loss):
     threshold: Tensor
     """Greatest residual of a pixel that is kept for itself."""
 
-    def forward(self, renderings: list[Any], target: Target) -> list[Float[Tensor, ""]]:
+    def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
         """Return what the other loss does for the rays that are kept; the others weigh 0."""
         error = residuals(renderings[-1].rgb.detach(), target.rgb)
         # What a mask leaves out speaks against no neighbour.

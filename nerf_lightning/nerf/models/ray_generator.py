@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
-from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.refinements.carry import carry_along
 from nerf_lightning.nerf.refinements.none import NoRefinement
@@ -20,7 +20,7 @@ from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 MOVED = ("c2w", "focal", "center", "lens", "width", "height", "ndc")
 
 
-class RayGenerator(LearntPart):
+class RayGenerator(Part):
     """Make the rays through pixels of views, on the device that it was moved to.
 
     It is a module so that cameras may be learnt: they are a function of the parameters of its refinement. What it is
@@ -51,7 +51,6 @@ class RayGenerator(LearntPart):
     ):
         super().__init__()
         self.refinement = NoRefinement() if refinement is None else refinement
-        self.learning_rate = self.refinement.learning_rate
         self.lens_model = cameras.lens_model
         for name in MOVED:
             self.register_buffer(name, getattr(cameras, name), persistent=False)
@@ -104,14 +103,6 @@ class RayGenerator(LearntPart):
         place = subpixels.places(pixels.x.device).repeat(pixels.x.numel(), 1)
         each = pixels.map(lambda of_pixel: for_each_ray(of_pixel, subpixels.per_pixel))
         return self(each, place, subpixels.per_side)
-
-    def follow(self, share: float) -> None:
-        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
-        self.refinement.follow(share)
-
-    def penalty(self) -> Float[Tensor, ""] | None:
-        """Return what keeps the cameras from moving far."""
-        return self.refinement.penalty()
 
     def reset_parameters(self) -> None:
         """Put the cameras back to where they were given."""

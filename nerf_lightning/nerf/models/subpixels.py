@@ -9,9 +9,10 @@ from dataclasses import fields
 
 import torch
 from jaxtyping import Float, Shaped
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.nerf.part import Part, StepContext
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.renderings import Rendering
@@ -19,7 +20,7 @@ from nerf_lightning.nerf.types.renderings import Rendering
 MOST = 8
 
 
-class Subpixels(nn.Module):
+class Subpixels(Part):
     """How many rays go through each pixel now, along each of its sides.
 
     Args:
@@ -52,16 +53,16 @@ class Subpixels(nn.Module):
         """Return where in a pixel its rays go through, in pixels from its centre (x, y), row by row.
 
         >>> halves = Subpixels(2)
-        >>> halves.follow(0.9)
+        >>> halves.on_step(StepContext(progress=0.9, step=9, key=0))
         >>> halves.places().tolist()
         [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]
         """
         along = (torch.arange(self._now, device=device) + 0.5) / self._now - 0.5
         return torch.cartesian_prod(along, along).view(-1, 2).flip(-1)
 
-    def follow(self, share: float) -> None:
-        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
-        self._set(self.side if share >= self.start else 1)
+    def on_step(self, context: StepContext) -> None:
+        """Take several rays a pixel from `start` on."""
+        self._set(self.side if context.progress >= self.start else 1)
 
     def reset(self) -> None:
         """Begin with one ray through each pixel's centre, for a new attempt."""

@@ -2,11 +2,11 @@
 
 from abc import ABC, abstractmethod
 
-from nerf_lightning.nerf.learnt_part import LearntPart
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 
-class Refinement(LearntPart, ABC):
+class Refinement(Part, ABC):
     """Cameras that learn: where they start from, every parameter is zero and nothing is changed."""
 
     def fit_to(self, scene: Scene) -> None:
@@ -15,9 +15,6 @@ class Refinement(LearntPart, ABC):
         Raises:
             InputError: a scene whose cameras cannot be learnt.
         """
-
-    def follow(self, share: float) -> None:
-        """Take note of how far the run is, before each step of training: `share` of its steps have been taken."""
 
     @abstractmethod
     def forward(self, cameras: Cameras) -> Cameras:

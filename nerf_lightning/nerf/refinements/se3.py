@@ -11,6 +11,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import which_camera
 from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.products import own_precision
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.refinements.base import Refinement
@@ -66,9 +67,9 @@ class SmallMotions(Refinement):
         self.learning_rate, self.hold, self.weight = learning_rate, hold, weight
         self.is_held = False
 
-    def follow(self, share: float) -> None:
+    def on_step(self, context: StepContext) -> None:
         """Let the cameras go when it is time."""
-        self.is_held = share < self.hold
+        self.is_held = context.progress < self.hold
 
     def fit_to(self, scene: Scene) -> None:
         """Take note of the cameras and of the scene's extent, once, before training.

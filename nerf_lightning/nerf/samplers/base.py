@@ -5,9 +5,10 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
@@ -17,7 +18,7 @@ DensityFn = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 """A field's density (per unit length) at positions."""
 
 
-class Sampler(nn.Module):
+class Sampler(Part):
     """What chooses where along rays a field is asked, in whatever layout."""
 
     max_intervals: int = 1 << 17

@@ -12,7 +12,7 @@ Struct = TypeVar("Struct", bound="TensorStruct")
 
 
 class TensorStruct:
-    """Mixin of the frozen dataclasses of this room: move or index every tensor at once, nested structs included."""
+    """Mixin of frozen dataclasses: move or index every tensor at once, in nested structs and dicts, too."""
 
     def map(self: Struct, fn: Callable[[Tensor], Tensor]) -> Struct:
         """Return a copy with `fn` applied to each tensor."""
@@ -23,6 +23,8 @@ class TensorStruct:
                 changed[each.name] = fn(value)
             elif isinstance(value, TensorStruct):
                 changed[each.name] = value.map(fn)
+            elif isinstance(value, dict):
+                changed[each.name] = {name: fn(tensor) for name, tensor in value.items()}
         return replace(self, **changed)  # type: ignore[type-var]
 
     def tensors(self) -> list[Tensor]:

@@ -11,6 +11,7 @@ from nerf_lightning import ranks
 from nerf_lightning.errors import require_positive
 from nerf_lightning.files.schema import Record, Whole
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
+from nerf_lightning.training.step_output import StepOutput
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +57,7 @@ class CollapseGuard(Callback):
         after_crop = (progress.rays_seen - batches.crop_rays(progress.restarts)) / batches.batch_rays
         if progress.step % self.every_steps or after_crop > self.until_step:
             return
-        seen = whole_batch(outputs)
+        seen = whole_batch(outputs["step"])
         self.failed = self.failed + 1 if is_constant(seen, self.ratio) else 0
         if self.failed >= self.patience:
             self.failed = 0
@@ -93,9 +94,9 @@ class CollapseGuard(Callback):
             writer.add_text("collapse_guard", message, step)
 
 
-def whole_batch(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def whole_batch(output: StepOutput) -> dict[str, torch.Tensor]:
     """Return what all processes saw of a step's rays."""
-    parts = ranks.gather({name: outputs[name].cpu() for name in ("foreground", "target", "weight")})
+    parts = ranks.gather({name: getattr(output, name).cpu() for name in ("foreground", "target", "weight")})
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 

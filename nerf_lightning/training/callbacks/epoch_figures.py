@@ -35,7 +35,7 @@ class EpochFigures(Callback):
         """Collect the loss; draw when an epoch has ended."""
         if trainer.global_step % self.every_steps == 0:
             self.steps.append(trainer.global_step)
-            self.losses.append(float(outputs["losses"].cpu().sum()))
+            self.losses.append(float(outputs["step"].losses.cpu().sum()))
         batches = trainer.datamodule.batches  # type: ignore[attr-defined]
         per_figure = self.every_epochs * batches.whole.num_rays
         progress = pl_module.step.progress

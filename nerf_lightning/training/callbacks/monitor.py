@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.callbacks.watcher import Watcher
+from nerf_lightning.training.step_output import StepOutput
 
 GIGABYTE = 1e9
 
@@ -53,17 +54,20 @@ class Monitor(Watcher):
         names = system.model.level_names
         first = system.model.first_picture
         pictures = names[-1:] if first is None else names[first:]
-        values = level_scalars(names, outputs["losses"], outputs["color_errors"], pictures)
+        output: StepOutput = outputs["step"]
+        values = level_scalars(names, output.losses, output.color_errors, pictures)
+        if len(output.terms) > 1:
+            values |= {f"train/loss_{name}": float(term.sum()) for name, term in output.terms.items()}
         values |= system.model.statistics()
         values["train/learning_rate"] = system.optimizers().param_groups[0]["lr"]
         if rays > 0 and seconds > 0:
             values["speed/rays_per_second"] = rays / seconds
-        values["speed/rays_per_step"] = outputs["weight"].numel()
+        values["speed/rays_per_step"] = output.weight.numel()
         values["train/skipped_steps"] = system.step.guard.skipped
         values["memory/resident_gigabytes"] = psutil.Process().memory_info().rss / GIGABYTE
         if system.device.type == "cuda":
             values["memory/gpu_peak_gigabytes"] = torch.cuda.max_memory_allocated() / GIGABYTE
-        values |= {f"gradients/norm_{name}": float(norm) for name, norm in outputs["gradient_norms"].items()}
+        values |= {f"gradients/norm_{name}": float(norm) for name, norm in output.gradient_norms.items()}
         for logger in trainer.loggers:
             logger.log_metrics(values, step)
 

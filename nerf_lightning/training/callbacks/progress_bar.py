@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from nerf_lightning.console import DAY, spoken
 from nerf_lightning.nerf.psnr import psnr
+from nerf_lightning.training.step_output import StepOutput
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +68,8 @@ class TrainingProgress(ProgressBar):
         rays_per_second = max(0.0, (pl_module.step.progress.rays_seen - self.rays_seen) / (now - self.shown))
         self.shown, self.rays_seen = now, pl_module.step.progress.rays_seen
         self._warn_of_days((pl_module.step.num_steps - step) / per_second)
-        loss, quality = torch.stack([outputs["losses"].sum(), psnr(outputs["color_errors"][-1])]).tolist()
+        output: StepOutput = outputs["step"]
+        loss, quality = torch.stack([output.losses.sum(), psnr(output.color_errors[-1])]).tolist()
         text = f"loss {loss:.4f}  PSNR {quality:.1f} dB  {rays_per_second:,.0f} rays/s"
         if self.bar is not None:
             self.bar.update(self.task, completed=step, total=pl_module.step.num_steps, description=text)

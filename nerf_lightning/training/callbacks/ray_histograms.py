@@ -41,7 +41,7 @@ class RayHistograms(Watcher):
         if not writers:
             return
         step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
-        seen = look_along(system.step, outputs["pixels"][: self.num_rays], step, endless)
+        seen = look_along(system.step, outputs["step"].pixels[: self.num_rays], step, endless)
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:

@@ -37,7 +37,7 @@ def test_as_it_begins_it_changes_no_bit_of_a_step(option, background):
     for name in ("none", option):
         step = a_step(name, scene, background, tile_points=200)
         batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
-        losses = step(batch, step.new_optimizer())["losses"]
+        losses = step(batch, step.new_optimizer()).losses
         found.append([losses, *(parameter.grad for parameter in step.model.parameters())])
     for ours, theirs in zip(*found, strict=True):
         assert torch.equal(ours, theirs)
@@ -88,8 +88,8 @@ def test_the_background_looks_the_same_to_all(option, background):
         for parameter in step.correction.parameters():
             parameter.uniform_(-1, 1)
     seen = step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
-    torch.testing.assert_close(seen["rgb"], seen["target"])
-    behind = seen["target"]
+    torch.testing.assert_close(seen.rgb, seen.target)
+    behind = seen.target
     assert background == "random" or torch.equal(behind, torch.full_like(behind, float(background == "white")))
 
 

@@ -4,6 +4,7 @@ import torch
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.part import StepContext
 
 
 def test_tables_that_cannot_fit_are_refused_before_they_are_allocated():
@@ -19,7 +20,7 @@ def test_it_starts_near_zero():
 @pytest.mark.parametrize(("blend_in", "levels_on"), [(0.0, 3), (0.5, 2)])
 def test_known_features_have_the_gradients_of_computed_ones(blend_in, levels_on):
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40, blend_in=blend_in)
-    encoder.follow(0.2)
+    encoder.on_step(StepContext(0.2, 0, 0))
     points, grad = torch.rand(50, 3), torch.randn(50, 12)
     with torch.no_grad():
         known = encoder(points)
@@ -46,7 +47,7 @@ def test_levels_are_blended_in_from_coarse_to_fine():
     points = torch.rand(50, 3)
     whole = encoder(points)
     for share, weights in {0.0: (1, 0, 0), 0.25: (1, 1, 0), 0.375: (1, 1, 0.5), 0.5: (1, 1, 1), 1.0: (1, 1, 1)}.items():
-        encoder.follow(share)
+        encoder.on_step(StepContext(share, 0, 0))
         torch.testing.assert_close(encoder(points), whole * torch.tensor(weights).repeat_interleave(2))
         assert encoder.level_weights.tolist() == list(weights)
 
@@ -54,7 +55,7 @@ def test_levels_are_blended_in_from_coarse_to_fine():
 def test_a_grid_whose_levels_are_all_on_holds_nothing_else():
     plain, blended = (HashGridEncoder(num_levels=2, log2_table_size=8, blend_in=share) for share in (0.0, 0.3))
     assert list(plain.state_dict()) == ["table"]
-    plain.follow(0.1)
+    plain.on_step(StepContext(0.1, 0, 0))
     blended.load_state_dict(plain.state_dict() | {"level_weights": torch.ones(2)})
     points = torch.rand(9, 3)
     assert torch.equal(plain(points), blended(points))

@@ -16,6 +16,7 @@ from nerf_lightning.nerf.geometry.cones import to_matrix
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -109,7 +110,7 @@ def test_gradients_are_those_of_differences(cones):
 @pytest.mark.parametrize("blend_in", [0.0, 0.5])
 def test_known_features_have_the_gradients_of_computed_ones(settings, blend_in):
     encoder = HybridEncoder(FrequencyEncoder(2), a_grid(blend_in=blend_in), width=8, **settings)
-    encoder.fine.follow(0.2)
+    encoder.fine.on_step(StepContext(0.2, 0, 0))
     points, grad = torch.rand(50, 3), torch.randn(50, encoder.out_dim)
     given = (CONE.expand(50, 6),) if encoder.sees_cones else ()
     with torch.no_grad():

@@ -8,6 +8,7 @@ from support.scenes import some_rays
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render.whole_rays import whole_rays
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 
@@ -77,7 +78,7 @@ def test_fields_of_other_kinds_are_not_taken():
     level = a_level()
     level.field.position_encoder = HashGridEncoder(num_levels=4, log2_table_size=8, max_resolution=32, blend_in=0.5)
     assert level.field.parts() is not None
-    level.field.position_encoder.follow(0.1)
+    level.field.position_encoder.on_step(StepContext(0.1, 0, 0))
     assert level.field.parts() is None
 
 

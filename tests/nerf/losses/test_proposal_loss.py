@@ -66,20 +66,25 @@ def as_target(rgb, weight=None):
     return Target(rgb, weight, PixelIndex(places, places, places))
 
 
-def test_the_levels_losses_are_named_in_order():
+def test_each_level_has_its_own_terms():
     proposal, _ = rendering(random_edges(4, 9), torch.rand(4, 8))
     last, _ = rendering(random_edges(4, 12), torch.rand(4, 11))
     target = torch.rand(4, 3)
-    first, second = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], as_target(target))
-    torch.testing.assert_close(first, 2.0 * interlevel_loss(last, proposal).mean())
-    torch.testing.assert_close(second, (last.rgb - target).square().mean() + 0.5 * distortion_loss(last).mean())
+    terms = ProposalLoss(interlevel=2.0, distortion=0.5)([proposal, last], as_target(target))
+    none = torch.tensor(0.0)
+    expected = {
+        "interlevel": [2.0 * interlevel_loss(last, proposal).mean(), none],
+        "color": [none, (last.rgb - target).square().mean()],
+        "distortion": [none, 0.5 * distortion_loss(last).mean()],
+    }
+    torch.testing.assert_close(terms, {name: torch.stack(values) for name, values in expected.items()})
 
 
 def test_a_ray_without_weight_teaches_no_level_anything():
     proposal, density = rendering(random_edges(4, 9), 0.1 * torch.rand(4, 8), requires_grad=True)
     last, last_density = rendering(random_edges(4, 12), torch.rand(4, 11), requires_grad=True)
     weight = torch.tensor([2.0, 0.0, 2.0, 0.0])
-    sum(ProposalLoss()([proposal, last], as_target(torch.rand(4, 3), weight))).backward()
+    torch.cat(list(ProposalLoss()([proposal, last], as_target(torch.rand(4, 3), weight)).values())).sum().backward()
     for gradient in (density.grad, last_density.grad):
         assert (gradient.abs().sum(dim=1) > 0).tolist() == [True, False, True, False]
 

@@ -109,7 +109,7 @@ def test_with_room_for_all_samples_the_capacity_changes_nothing_but_rounding():
         optimizer = step.new_optimizer()
         for _ in range(20):
             seen = step(loader.at(0, progress.rays_seen), optimizer)
-        losses.append(seen["losses"])
+        losses.append(seen.losses)
         dropped.append(step.model.statistics()["train/dropped_samples"])
     torch.testing.assert_close(losses[0], losses[1], rtol=1e-4, atol=0)
     assert dropped == [0, 0]

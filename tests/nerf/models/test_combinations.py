@@ -94,7 +94,7 @@ def test_it_learns(model, field, position, direction):
     loader = RayBatches(scene, progress, 0, 64)
     losses = []
     for _ in range(30):
-        losses.append(float(step(loader.at(0, progress.rays_seen), optimizer)["losses"][-1]))
+        losses.append(float(step(loader.at(0, progress.rays_seen), optimizer).losses[-1]))
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
     assert step.guard.skipped == 0
 

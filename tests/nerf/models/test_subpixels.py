@@ -14,6 +14,7 @@ from nerf_lightning.nerf.losses.proposal import ProposalLoss
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray, mean_over_pixels, random_of_rays
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import blend
 from nerf_lightning.training.step import TrainStep
@@ -34,7 +35,7 @@ def test_a_picture_is_the_mean_of_one_that_many_times_as_large(side):
     enlarged = replace(scene, cameras=resized(scene.cameras, side * scene.cameras.width, side * scene.cameras.height))
     large = render_picture(model, rays_of(enlarged), 1, "white", 1 << 16)
     before = render_picture(model, rays_of(scene), 1, "white", 1 << 16)
-    model.subpixels.follow(0.5)
+    model.subpixels.on_step(StepContext(0.5, 0, 0))
     picture = render_picture(model, rays_of(scene), 1, "white", 1 << 16)
     for name in ("rgb", "depth", "opacity"):
         image = getattr(large, name).reshape(*getattr(large, name).shape[:2], -1).permute(2, 0, 1)
@@ -48,7 +49,7 @@ def test_rays_share_a_pixel_and_its_area():
     subpixels = Subpixels(2)
     rays, pixels = rays_of(scene), RayBatches(scene, make_step(None).progress, 0, 5).at(0, 0).pixels
     centre = rays(pixels)
-    subpixels.follow(1.0)
+    subpixels.on_step(StepContext(1.0, 0, 0))
     several = rays.of_pixels(pixels, subpixels)
     torch.testing.assert_close(several.pixel_side[::4], centre.pixel_side / 2, rtol=2e-2, atol=1e-6)
     mean = several.directions.unflatten(0, (5, 4)).mean(dim=1)
@@ -92,7 +93,7 @@ def test_the_last_part_of_the_run_has_several_rays_and_a_new_attempt_begins_with
 
 
 def rays_at(model, share):
-    model.subpixels.follow(share)
+    model.subpixels.on_step(StepContext(share, 0, 0))
     return model.subpixels.per_pixel
 
 
@@ -108,7 +109,7 @@ def test_a_step_of_the_last_part_says_so_in_the_state_and_steps_before_do_not():
 
 def test_a_checkpoint_renders_as_its_last_step_was():
     model, other = model_with(2), model_with(2)
-    model.subpixels.follow(1.0)
+    model.subpixels.on_step(StepContext(1.0, 0, 0))
     other.load_state_dict(model.state_dict())
     assert other.subpixels.per_pixel == 4
     with pytest.raises(InputError, match="3 a side"):
@@ -117,7 +118,7 @@ def test_a_checkpoint_renders_as_its_last_step_was():
 
 def test_one_ray_a_pixel_leaves_no_trace():
     model = model_with(1)
-    model.subpixels.follow(1.0)
+    model.subpixels.on_step(StepContext(1.0, 0, 0))
     assert not [name for name in model.state_dict() if "subpixels" in name]
     pixels = RayBatches(ball_scene(), make_step(None).progress, 0, 4).at(0, 0).pixels
     rendering = model(rays_of(ball_scene())(pixels), None, None)[-1]

@@ -13,6 +13,7 @@ from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.refinements.se3 import SmallMotions
 from nerf_lightning.nerf.rendering.packed import composite_packed
@@ -32,7 +33,7 @@ def test_a_camera_before_packed_samples_has_the_gradient_of_the_reference_in_flo
     level.sampler.fit_to(scene)
     field.fit_to(scene)
     torch.nn.init.normal_(encoder.table, std=0.3)
-    encoder.follow(0.5 * blended)
+    encoder.on_step(StepContext(0.5 * blended, 0, 0))
     motion = SmallMotions()
     motion.fit_to(scene)
     rays = RayGenerator(scene.cameras, scene.near, scene.far, motion)

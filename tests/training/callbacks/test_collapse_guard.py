@@ -4,7 +4,9 @@ from types import SimpleNamespace
 import torch
 from lightning.pytorch import Trainer
 
+from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard, is_constant
+from nerf_lightning.training.step_output import StepOutput
 
 
 class StubTrainer(Trainer):
@@ -29,7 +31,9 @@ class StubSystem:
     def seen(self):
         target = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
         light = target if self.alive(self.restarts) else torch.zeros(64, 3)
-        return {"target": target, "foreground": light, "weight": torch.ones(64)}
+        number, level = torch.zeros(64, dtype=torch.int64), torch.zeros(1)
+        pixels = PixelIndex(number, number, number)
+        return {"step": StepOutput(level, {}, level, light, light, target, torch.ones(64), pixels)}
 
     def restart(self, optimizer):
         self.restarts += 1

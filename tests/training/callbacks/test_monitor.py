@@ -29,7 +29,8 @@ def test_several_levels_have_their_own_losses_beside_the_sum():
 
 class L1(Loss):
     def forward(self, renderings, target):
-        return [((each.rgb - target.rgb).abs() * target.weight[..., None]).mean() for each in renderings]
+        errors = [((each.rgb - target.rgb).abs() * target.weight[..., None]).mean() for each in renderings]
+        return {"absolute": torch.stack(errors)}
 
 
 @pytest.mark.parametrize(
@@ -50,9 +51,9 @@ def test_the_psnr_is_that_of_the_colours_whatever_the_loss_is(model, loss):
         step.loss.threshold.fill_(0.01)  # at first it leaves nothing out
     batch = RayBatches(scene, progress, 0, 128).at(0, 0)
     seen = step.gradients(batch)
-    error = (seen["rgb"] - seen["target"]).square().mean()
-    torch.testing.assert_close(psnr(seen["color_errors"][-1]), psnr(error))
+    error = (seen.rgb - seen.target).square().mean()
+    torch.testing.assert_close(psnr(seen.color_errors[-1]), psnr(error))
     if loss == "mse":
-        torch.testing.assert_close(seen["color_errors"], seen["losses"], atol=0, rtol=0)
+        torch.testing.assert_close(seen.color_errors, seen.losses, atol=0, rtol=0)
     else:
-        assert not torch.isclose(seen["color_errors"][-1], seen["losses"][-1], rtol=1e-4)
+        assert not torch.isclose(seen.color_errors[-1], seen.losses[-1], rtol=1e-4)

@@ -28,10 +28,10 @@ class BreaksAtStep(MeanSquaredError):
     step, until, limit, holder = 0, 0, 0.0, ()  # the holder hides the system, whose part the loss is
 
     def __call__(self, renderings, target):
-        coarse, fine = super().__call__(renderings, target)
+        coarse, fine = super().__call__(renderings, target)["color"]
         rate = self.holder[0].optimizers().param_groups[0]["lr"]
         broken = self.step <= self.holder[0].step.progress.step < self.until and rate > self.limit
-        return [coarse, fine * float("nan") if broken else fine]
+        return {"color": torch.stack([coarse, fine * float("nan") if broken else fine])}
 
 
 def run(folder, guard, step=12, until=10**6, limit=0.0, max_steps=30, every_steps=5, resume=None, optimizer=None):

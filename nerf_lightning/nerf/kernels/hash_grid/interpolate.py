@@ -93,7 +93,7 @@ def table_gradient(
 
 
 @contextmanager
-def hold_back() -> Iterator[Sequence[TableGradient]]:
+def defer_table_grads() -> Iterator[Sequence[TableGradient]]:
     """Let backward passes of this thread collect gradients of tables instead of adding them.
 
     Two threads must not add to one table, and a table for each would cost more than the gradients themselves.

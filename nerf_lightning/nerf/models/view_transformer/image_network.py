@@ -5,12 +5,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.nerf.learnt_part import LearntPart
 from nerf_lightning.nerf.models.view_transformer.image_norm import ImageNorm, normalized
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.products import own_precision
 
 
-class ImageNetwork(LearntPart):
+class ImageNetwork(Part):
     """Residual blocks at 1/2, 1/4, ... of the picture's size and one scale beyond that of the features, and back.
 
     The papers' is the first half of a ResNet34 with instance norm (arXiv 2102.13090). Here each scale has as many

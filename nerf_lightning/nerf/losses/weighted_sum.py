@@ -1,0 +1,60 @@
+"""Several losses side by side, each with a weight and a curve of its own."""
+
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.types.rays import Target
+
+
+class WeightedSum(Loss):
+    """Add up named losses.
+
+    Args:
+        terms: name -> loss. Those that look at squares of pixels must look at squares of one size.
+        weights: name -> factor; 1 for a loss that is not named.
+
+    Raises:
+        ValueError: a weight of no loss, or squares of several sizes.
+    """
+
+    def __init__(self, terms: dict[str, Loss], weights: dict[str, float] | None = None):
+        super().__init__()
+        self.terms, self.weights = nn.ModuleDict(terms), dict(weights or {})
+        if unknown := sorted(self.weights.keys() - terms.keys()):
+            raise ValueError(f"weights names {unknown[0]}, which is no loss: there are {', '.join(terms)}")
+        sides = {loss.patch for loss in terms.values()} - {1}
+        if len(sides) > 1:
+            raise ValueError(f"the losses look at squares of {sorted(sides)} pixels a side: give all the same patch")
+        self.patch = max([1, *sides])
+        self.needs_weights = any(loss.needs_weights for loss in terms.values())
+
+    def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:
+        """Return the terms of all losses, times their weights; several of one loss as `name_term`."""
+        found: dict[str, Tensor] = {}
+        for name, loss in self.terms.items():
+            terms = loss(renderings, target)
+            for term, values in terms.items():
+                found[name if len(terms) == 1 else f"{name}_{term}"] = self.weights.get(name, 1.0) * values
+        return found
+
+    def learn(
+        self, rgb: Float[Tensor, "rays 3"], target: Float[Tensor, "rays 3"], weight: Float[Tensor, "rays"]
+    ) -> None:
+        """Let each loss learn."""
+        for loss in self._losses():
+            loss.learn(rgb, target, weight)
+
+    def measurements(self) -> list[Tensor]:
+        """Return the measurements of all losses."""
+        return [each for loss in self._losses() for each in loss.measurements()]
+
+    def forget(self) -> None:
+        """Let each loss forget."""
+        for loss in self._losses():
+            loss.forget()
+
+    def _losses(self) -> list[Loss]:
+        return [loss for loss in self.terms.values() if isinstance(loss, Loss)]
