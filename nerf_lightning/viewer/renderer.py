@@ -95,7 +95,8 @@ class SlicedRenderer:
 
     def _slice(self, rays_of: RayGenerator, part: slice, clip: Clip | None) -> tuple[Tensor, Tensor, Tensor]:
         rays, straight = view_rays(rays_of, pixels_between(rays_of.cameras, 0, part), clip)
-        rgb, depth, opacity, *_ = render_rays(self.model, rays, self.background, self.tile_points)
+        seen = render_rays(self.model, rays, self.background, self.tile_points)
+        rgb, depth, opacity = seen.rgb, seen.depth, seen.opacity
         depth = surface_depth(depth, opacity, rays.far)
         return rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), opacity
 

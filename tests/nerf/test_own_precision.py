@@ -20,7 +20,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from support.configs import composed, loaded, options
-from support.scenes import ball_scene, some_rays, tiny_model
+from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from torch import Tensor, nn
 
 import nerf_lightning
@@ -34,7 +34,8 @@ from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.packed import composite_packed
 from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.samplers.base import PackedSampler, _AllAtOnce
+from nerf_lightning.nerf.samplers.base import PackedSampler, _OneChunk
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.types.rays import PackedSamples, RaySamples
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -164,6 +165,13 @@ def density_there(positions: Tensor) -> Tensor:
     return positions.square().sum(-1) * 5
 
 
+def _packed() -> dict[str, Any]:
+    sampler = OccupancySampler(resolution=16, num_steps=32)
+    sampler.fit_to(known()["scene"])
+    return {"sampler": sampler, "field": tiny_field().eval(), "random": None}
+
+
+PACKED = _packed()
 # Where a name means something else.
 ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.geometry.cameras.pinhole_cameras": {"focal": 19.3, "width": 12, "height": 12},
@@ -182,6 +190,9 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.rendering.blending.photograph": {"background": "white"},
     "nerf.rendering.packed.composite_packed": {"output": Known("packed output"), "samples": Known("packed samples")},
     "nerf.rendering.sample_points.packed_points": {"samples": Known("packed samples"), "first": 0},
+    "nerf.rendering.packed.sum_over_rays": {"samples": Known("packed samples"), "values": torch.rand(80, 2)},
+    "nerf.samplers.early_termination.visible_samples": PACKED,
+    "nerf.samplers.early_termination.render_until_opaque": PACKED,
     "nerf.rendering.packed.first_of_each_ray": {"samples": Known("packed samples")},
     "nerf.samplers.base.Sampler.update": {"density": density_there},
     "nerf.samplers.base.Sampler.reached_density": {"density": density_there},
@@ -270,7 +281,7 @@ def instances(tmp_path_factory) -> list[Any]:
         sampler.fit_to(known()["scene"])
     packed = [sampler for sampler in samplers if isinstance(sampler, PackedSampler)]
     walks = [
-        part for sampler in packed for part in (sampler.walk(known()["rays"]), _AllAtOnce(sampler, known()["rays"]))
+        part for sampler in packed for part in (sampler.marcher(known()["rays"]), _OneChunk(sampler, known()["rays"]))
     ]
     grid = OccupancyGrid()
     grid.allocate(8, 1)

@@ -1,19 +1,25 @@
 """Which twin of a kernel runs: numba on the CPU, triton on CUDA, plain torch elsewhere and where those are missing."""
 
 import functools
+import hashlib
 import importlib
+import importlib.util
 import logging
 import os
+import re
 import shutil
 import stat
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 
+ROOM = "nerf_lightning.nerf.kernels"
 LONG_SECONDS = 2.0
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
@@ -32,6 +38,8 @@ def twin(module: str) -> ModuleType | None:
         if library == "numba":
             _configure_numba()
         found = _imported(module)
+        if library == "numba":
+            _stamp_with_sources(found)
         # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
         with _told_if_long(library):
             try:
@@ -83,13 +91,51 @@ def _imported(module: str) -> ModuleType:
     return importlib.import_module(name)
 
 
-def _forget_compiled(module: ModuleType) -> int:
-    """Let numba forget what it keeps of a module's kernels, and return of how many."""
+def _stamp_with_sources(module: ModuleType) -> None:
+    """Let numba compile kernels anew where a file changed that they take functions or numbers from.
+
+    numba compares a kept kernel with the kernel's own file alone.
+    """
+    for kernel in _compiled(module):
+        kept, digest = getattr(kernel._cache, "_cache_file", None), _digest(kernel.py_func.__module__)
+        if kept is not None and digest not in str(kept._source_stamp):
+            kept._source_stamp = f"{kept._source_stamp!r} {digest}"
+
+
+@functools.cache
+def _digest(module: str) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(_sources(module)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _sources(module: str) -> set[Path]:
+    """Return the files of a module of kernels, and of all kernel modules that it imports from."""
+    found: set[Path] = set()
+    waiting = [module]
+    while waiting:
+        spec = importlib.util.find_spec(waiting.pop())
+        file = Path(str(spec and spec.origin))
+        if file not in found:
+            found.add(file)
+            waiting += re.findall(
+                rf"^from ({re.escape(ROOM)}\S*) import", file.read_text(encoding="utf-8"), re.MULTILINE
+            )
+    return found
+
+
+def _compiled(module: ModuleType) -> list[Any]:
     from numba.core.dispatcher import Dispatcher
 
-    kernels = [each for each in vars(module).values() if isinstance(each, Dispatcher)]
+    return [each for each in vars(module).values() if isinstance(each, Dispatcher)]
+
+
+def _forget_compiled(module: ModuleType) -> int:
+    """Let numba forget what it keeps of a module's kernels, and return of how many."""
+    kernels = _compiled(module)
     for kernel in kernels:
-        kernel._cache.flush()  # type: ignore[attr-defined]
+        kernel._cache.flush()
     return len(kernels)
 
 

@@ -1,5 +1,7 @@
 """A level that masks what an occupancy grid rules out instead of leaving it out: every shape is known beforehand."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,7 +13,7 @@ from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
-from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, Rendering
+from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
 
 
 class MaskedLevel(Level):
@@ -41,5 +43,5 @@ class MaskedLevel(Level):
         occupied, edges = occupied_intervals(rays, state, lattice, self.sampler.grid.occupied())
         samples = RaySamples(edges)
         output = self.field(points_along(rays, samples, random, self.field.sees_cones))
-        masked = FieldOutput(density=torch.where(occupied, output.density, 0.0), rgb=output.rgb)
+        masked = replace(output, density=torch.where(occupied, output.density, 0.0))
         return composite(masked, samples, rays, torch.zeros_like(rays.origins) if background is None else background)

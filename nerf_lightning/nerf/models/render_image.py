@@ -2,7 +2,8 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from threading import Lock
 
 import torch
 from jaxtyping import Float
@@ -27,14 +28,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Picture(TensorStruct):
-    """One rendered view, on the CPU."""
+    """One rendered view, or any rays, on the CPU."""
 
-    rgb: Float[Tensor, "height width 3"]
-    depth: Float[Tensor, "height width"]
+    rgb: Float[Tensor, "*pixels 3"]
+    depth: Float[Tensor, "*pixels"]
     """Expected distance along the ray; light that escapes ends at far."""
-    opacity: Float[Tensor, "height width"]
-    first_rgb: Float[Tensor, "height width 3"] | None = None
+    opacity: Float[Tensor, "*pixels"]
+    first_rgb: Float[Tensor, "*pixels 3"] | None = None
     """What the first level sees that makes pictures, where it is not the last."""
+    channels: dict[str, Float[Tensor, "*pixels _"]] = field(default_factory=dict)
+    """What else the field says, by name (`Rendering.channels`)."""
 
 
 @torch.no_grad()
@@ -60,29 +63,30 @@ def render_picture(
     """
     cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
 
-    def through(place: Float[Tensor, "2"], pixels: PixelIndex) -> list[Tensor]:
+    def through(place: Float[Tensor, "2"], pixels: PixelIndex) -> Picture:
         at = (place, subpixels.per_side)
         rays, straight = view_rays(rays_of, pixels, clip, *at)
         if seen_from is not None:
             rays = replace(rays, view_directions=view_rays(seen_from, pixels, None, *at)[1].view_directions)
         shown = rays.to(device)
-        rgb, depth, *rest = (_render_tile if clip is None else _render_what_is_left)(model, shown, background)
+        seen = (_render_tile if clip is None else _render_what_is_left)(model, shown, background)
         if cameras.ndc is not None:
             whole = rays.far if clip is None else view_rays(rays_of, pixels, None, *at)[0].far
-            depth = world_distance(straight, depth / whole)
-        return [rgb, depth, *rest]
+            seen = replace(seen, depth=world_distance(straight, seen.depth / whole))
+        return seen
 
-    def render(part: slice) -> list[Tensor]:
+    def render(part: slice) -> Picture:
         pixels = pixels_between(cameras, view, part)
         first, *others = subpixels.places()
-        totals = through(first, pixels)
+        total = through(first, pixels)
         for place in others:
-            totals = [total + each for total, each in zip(totals, through(place, pixels), strict=True)]
-        return [total / subpixels.per_pixel for total in totals] if others else totals
+            tensors = iter(through(place, pixels).tensors())
+            total = total.map(lambda each, more=tensors: each + next(more))
+        return total.map(lambda each: each / subpixels.per_pixel) if others else total
 
     height, width = int(cameras.height[view]), int(cameras.width[view])
-    columns = _in_tiles(model, height * width, tile_points, render)
-    return Picture(*(column.view(height, width, *column.shape[1:]) for column in columns))
+    picture = _in_tiles(model, height * width, tile_points, render)
+    return picture.map(lambda column: column.view(height, width, *column.shape[1:]))
 
 
 @torch.no_grad()
@@ -150,30 +154,29 @@ def surface_points(
     """
     pixels = pixels.to(rays_of.near.device)
     rays = rays_of(pixels).to("cpu")
-    _, depth, opacity, *_ = render_rays(model, rays, "black", tile_points)
+    seen = render_rays(model, rays, "black", tile_points)
     if rays_of.cameras.ndc is None:
-        return rays.origins + depth[:, None] * rays.directions, opacity
+        return rays.origins + seen.depth[:, None] * rays.directions, seen.opacity
     straight = rays_of.through_world(pixels).to("cpu")
-    return straight.origins + world_distance(straight, depth / rays.far)[:, None] * straight.directions, opacity
+    depth = world_distance(straight, seen.depth / rays.far)
+    return straight.origins + depth[:, None] * straight.directions, seen.opacity
 
 
 @torch.no_grad()
-def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> list[Tensor]:
-    """Return rays' colour, depth and opacity on the CPU, and the first level's colour where that is a picture too.
+def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> Picture:
+    """Return what rays see, as at evaluation, on the CPU.
 
     Depth is measured as the rays are. Rays of which nothing is left (far is not beyond near) see the background.
     """
     device = next(model.parameters()).device
 
-    def render(part: slice) -> list[Tensor]:
+    def render(part: slice) -> Picture:
         return _render_what_is_left(model, rays[part].to(device), background)
 
     return _in_tiles(model, rays.near.numel(), tile_points, render)
 
 
-def _in_tiles(
-    model: Model, count: int, tile_points: int, render: Callable[[slice], list[Tensor]]
-) -> list[Float[Tensor, "rays *channels"]]:
+def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slice], Picture]) -> Picture:
     """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory."""
     at_once = min(tile_rays_for(model, tile_points), count)
     if model.most_rays is not None:
@@ -188,15 +191,21 @@ def _in_tiles(
         log.warning("no memory to render so many rays at once: from now on %d", at_once)
 
 
-def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], list[Tensor]]) -> list[Tensor]:
+def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Picture]) -> Picture:
     # Made once: thousands of small results between what comes and goes would leave holes many times their size.
-    columns = [torch.empty(count, 3), torch.empty(count), torch.empty(count)]
-    if model.first_picture is not None:
-        columns.append(torch.empty(count, 3))
+    first_rgb = None if model.first_picture is None else torch.empty(count, 3)
+    picture, making = Picture(torch.empty(count, 3), torch.empty(count), torch.empty(count), first_rgb), Lock()
 
     def fill(part: slice) -> None:
-        for column, result in zip(columns, render(part), strict=True):
-            column[part] = result
+        seen = render(part)
+        with making:
+            for name, values in seen.channels.items():
+                picture.channels.setdefault(name, torch.zeros(count, values.shape[1]))
+        picture.rgb[part], picture.depth[part], picture.opacity[part] = seen.rgb, seen.depth, seen.opacity
+        if picture.first_rgb is not None and seen.first_rgb is not None:
+            picture.first_rgb[part] = seen.first_rgb
+        for name, values in seen.channels.items():
+            picture.channels[name][part] = values
 
     threads = threads_on(next(model.parameters()).device)
     if threads > 1:  # small pictures, too, are shared out
@@ -207,25 +216,28 @@ def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], list
     else:
         for part in parts:
             fill(part)
-    return columns
+    return picture
 
 
-def _render_what_is_left(model: Model, rays: RayBundle, background: Background) -> list[Tensor]:
-    behind = background_colors(background, rays.near.numel(), torch.device("cpu"), random=None)
-    empty = torch.zeros(rays.near.numel(), 3) if behind is None else behind
-    columns = [empty, rays.far.cpu().clone(), torch.zeros(rays.near.numel())]
-    if model.first_picture is not None:
-        columns.append(empty.clone())
+def _render_what_is_left(model: Model, rays: RayBundle, background: Background) -> Picture:
+    """Render the rays of which something is left; the others see the background."""
+    count = rays.near.numel()
+    behind = background_colors(background, count, torch.device("cpu"), random=None)
+    empty = torch.zeros(count, 3) if behind is None else behind
+    first_rgb = None if model.first_picture is None else empty.clone()
+    picture = Picture(empty, rays.far.cpu().clone(), torch.zeros(count), first_rgb)
     left = (rays.far > rays.near).nonzero()[:, 0]
     if left.numel():
-        for column, part in zip(columns, _render_tile(model, rays[left], background), strict=True):
-            column[left.cpu()] = part.to(column)
-    return columns
+        seen, left = _render_tile(model, rays[left], background), left.cpu()
+        picture.channels.update({name: torch.zeros(count, each.shape[1]) for name, each in seen.channels.items()})
+        for column, part in zip(picture.tensors(), seen.tensors(), strict=True):
+            column[left] = part.to(column)
+    return picture
 
 
-def _render_tile(model: Model, rays: RayBundle, background: Background) -> list[Tensor]:
+def _render_tile(model: Model, rays: RayBundle, background: Background) -> Picture:
     behind = background_colors(background, rays.near.numel(), rays.near.device, random=None)
     levels = model(rays, behind, random=None)
     last, first = levels[-1], model.first_picture
-    columns = [last.rgb.cpu(), last.depth.cpu(), last.opacity.cpu()]
-    return columns if first is None else [*columns, levels[first].rgb.cpu()]
+    first_rgb = None if first is None else levels[first].rgb
+    return Picture(last.rgb, last.depth, last.opacity, first_rgb, last.channels).to("cpu")

@@ -25,7 +25,9 @@ def soften_near_gradients(
     if whole_from == 0:
         return output
     share = (distance.detach() / whole_from).square().clamp(max=1.0)
-    return FieldOutput(_Scaled.apply(output.density, share), _Scaled.apply(output.rgb, share[..., None]))
+    channels = {name: _Scaled.apply(each, share[..., None]) for name, each in output.channels.items()}
+    density, rgb = _Scaled.apply(output.density, share), _Scaled.apply(output.rgb, share[..., None])
+    return FieldOutput(density, rgb, channels=channels)
 
 
 class _Scaled(torch.autograd.Function):

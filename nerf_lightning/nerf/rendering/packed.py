@@ -32,7 +32,14 @@ def composite_packed(
         depth=depth + escaped * rays.far,
         weights=weights,
         samples=samples,
+        channels={name: sum_over_rays(weights[:, None] * each, samples) for name, each in output.channels.items()},
     )
+
+
+def sum_over_rays(values: Float[Tensor, "capacity n"], samples: PackedSamples) -> Float[Tensor, "rays n"]:
+    """Return the sum of each ray's values."""
+    total = values.new_zeros(samples.bounds.shape[0] - 1, values.shape[1])
+    return total.index_add(0, samples.ray_index, values)
 
 
 def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:

@@ -66,4 +66,5 @@ def composite(
         depth=(weights * samples.midpoints).sum(dim=-1) + escaped * rays.far,
         weights=weights,
         samples=samples,
+        channels={name: (weights[..., None] * each).sum(dim=-2) for name, each in output.channels.items()},
     )

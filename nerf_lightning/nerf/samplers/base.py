@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import GridMarch
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
@@ -66,15 +66,15 @@ class DenseSampler(Sampler, ABC):
         """Return how many intervals come out, given how many the level before had (0 for none)."""
 
 
-class Walk(ABC):
-    """Rays on their way through the scene while a picture is rendered, a few samples at a time."""
+class RayMarcher(ABC):
+    """Rays on their way through the scene while a picture is rendered, a chunk of samples at a time."""
 
     @abstractmethod
-    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
         """Return the next samples of some of the rays, about `limit` each at most, and which rays have more of them."""
 
-    def march(self) -> tuple[March, Float[Tensor, "edges"], OccupancyCells] | None:
-        """Return where a march through a grid begins, for kernels that do all of it; None where that is no march."""
+    def grid_march(self) -> GridMarch | None:
+        """Return the whole march, for kernels that do all of it; None where it goes through no grid."""
         return None
 
 
@@ -101,21 +101,19 @@ class PackedSampler(Sampler, ABC):
         """Return the size of the arrays of samples where no size may be read on the host; None elsewhere."""
         return None
 
-    def march(
-        self, rays: RayBundle, random: RayRandom | None
-    ) -> tuple[March, Float[Tensor, "edges"], OccupancyCells] | None:
-        """Return the march that `forward` takes, for kernels that do all of it; None where there is none."""
+    def grid_march(self, rays: RayBundle, random: RayRandom | None) -> GridMarch | None:
+        """Return the march that `forward` takes, for kernels that do all of it; None where it goes through no grid."""
         return None
 
-    def walk(self, rays: RayBundle) -> Walk:
-        """Begin to render rays; who does not say otherwise takes all samples at once."""
-        return _AllAtOnce(self, rays)
+    def marcher(self, rays: RayBundle) -> RayMarcher:
+        """Begin to render rays; by default all samples come in one chunk."""
+        return _OneChunk(self, rays)
 
 
-class _AllAtOnce(Walk):
+class _OneChunk(RayMarcher):
     def __init__(self, sampler: PackedSampler, rays: RayBundle):
         self.sampler, self.rays = sampler, rays
 
-    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
         """Return all samples of these rays."""
         return self.sampler(self.rays[alive], None), torch.zeros_like(alive, dtype=torch.bool)

@@ -12,12 +12,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.carving.carve import possible_cells
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, Walk
+from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, RayMarcher
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.scene import Scene
@@ -155,15 +155,15 @@ class OccupancySampler(PackedSampler):
     def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
         """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
         rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
-        return march(rays, *self.march(rays, random), capacity=self.capacity_for(rays))[0]
+        return march(rays, *self.grid_march(rays, random), capacity=self.capacity_for(rays))[0]
 
-    def march(self, rays: RayBundle, random: RayRandom | None) -> tuple[March, Float[Tensor, "edges"], OccupancyCells]:
+    def grid_march(self, rays: RayBundle, random: RayRandom | None) -> GridMarch:
         """Return where each ray stands, and through what it goes."""
-        return self.start(rays, random), self.lattice, self.grid.occupied()
+        return GridMarch(self.start(rays, random), self.lattice, self.grid.occupied())
 
-    def walk(self, rays: RayBundle) -> Walk:
+    def marcher(self, rays: RayBundle) -> RayMarcher:
         """Begin to render rays: each march goes on where it stopped."""
-        return _Marches(self, rays)
+        return GridMarcher(self, rays)
 
     def reset(self) -> None:
         """Take every cell that may hold something for occupied."""
@@ -180,13 +180,13 @@ class OccupancySampler(PackedSampler):
         expected = CAPACITY if self.sample_budget is None else 2 * self.sample_budget
         return min(self.capacity or expected, rays.near.shape[0] * (self.lattice.numel() - 2))
 
-    def start(self, rays: RayBundle, random: RayRandom | None) -> March:
+    def start(self, rays: RayBundle, random: RayRandom | None) -> MarchState:
         """Return the beginning of a march along rays."""
         center, half = center_and_half(self.grid.aabb)
         half = half * 2.0 ** (self.grid.num_cascades - 1)
         enter, leave = distances_in_box(rays, torch.stack([center - half, center + half]))
         jitter = torch.zeros_like(rays.near) if random is None else random.uniform("occupancy", 1)[..., 0]
-        return March(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
+        return MarchState(enter, leave, jitter, torch.zeros_like(rays.near, dtype=torch.int64))
 
     def reached_density(self, density: DensityFn, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Return the density in occupied cells; elsewhere 0, whatever the field says: rays pass there."""
@@ -289,19 +289,19 @@ class OccupancySampler(PackedSampler):
         self._lattice = self._numbers = None
 
 
-class _Marches(Walk):
+class GridMarcher(RayMarcher):
     """Marches of rays through a grid, each with its place."""
 
     def __init__(self, sampler: OccupancySampler, rays: RayBundle):
         self.rays, self.state = rays, sampler.start(rays, None)
         self.lattice, self.cells = sampler.lattice_over(rays), sampler.grid.occupied()
 
-    def take(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
         """March on from where each ray stands."""
         samples, following = march(self.rays[alive], self.state[alive], self.lattice, self.cells, limit)
         self.state.next[alive] = following
         return samples, following < self.lattice.numel() - 2
 
-    def march(self) -> tuple[March, Float[Tensor, "edges"], OccupancyCells]:
+    def grid_march(self) -> GridMarch:
         """Return where each ray stands, and through what it goes."""
-        return self.state, self.lattice, self.cells
+        return GridMarch(self.state, self.lattice, self.cells)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.types.rays import PackedSamples, RaySamples
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 
@@ -17,6 +17,8 @@ class FieldOutput(TensorStruct):
     """Per unit length, >= 0."""
     rgb: Float[Tensor, "*points 3"]
     """In [0, 1]."""
+    channels: dict[str, Float[Tensor, "*points _"]] = field(default_factory=dict, kw_only=True)
+    """Whatever else a field says (features, classes, normals), by name; composited and rendered like colour."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,27 @@ class Rendering(TensorStruct):
     """Expected distance along the ray; light that escapes ends at far."""
     penalty: Float[Tensor, "*rays"] | None = field(default=None, kw_only=True)
     """What a level in training adds to the loss of each ray, whatever the loss; None: nothing."""
+    channels: dict[str, Float[Tensor, "*rays _"]] = field(default_factory=dict, kw_only=True)
+    """The field's channels, composited like colour over nothing: sums of weights times values."""
+
+    @classmethod
+    def from_light(
+        cls,
+        rays: RayBundle,
+        background: Float[Tensor, "*rays 3"] | None,
+        foreground: Float[Tensor, "*rays 3"],
+        light: Float[Tensor, "*rays"],
+        depth: Float[Tensor, "*rays"],
+        channels: dict[str, Tensor] | None = None,
+    ) -> "Rendering":
+        """Return what is seen, given the light that escapes (transmittance at the end) and the sum of w t."""
+        return cls(
+            rgb=foreground if background is None else foreground + light[..., None] * background,
+            foreground=foreground,
+            opacity=1.0 - light,
+            depth=depth + light * rays.far,
+            channels=channels or {},
+        )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.kernels.compile import CPU_TWINS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
@@ -169,7 +169,7 @@ def _march(device: torch.device, capacity: int | None) -> float:
     two, whole = torch.full((RAYS,), 2.0), torch.zeros(RAYS, dtype=torch.long)
     rays = RayBundle(eyes, along, two, 3 * two, along)
     enter, leave = distances_in_box(rays, 2.0 * box)
-    state = March(enter, leave, torch.rand(RAYS, generator=random), whole)
+    state = MarchState(enter, leave, torch.rand(RAYS, generator=random), whole)
     cells = (torch.rand(2, 16, 16, 16, generator=random) < 0.3).to(torch.uint8)
     grid = OccupancyCells(box, cells, leaps_over(blocks_of(cells)))
     lattice = torch.arange(1.9, 6.2, 0.02)

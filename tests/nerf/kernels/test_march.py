@@ -5,7 +5,7 @@ import torch
 from support.scenes import some_rays
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.kernels.march.grid import FARTHEST, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import FARTHEST, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 
@@ -16,7 +16,7 @@ def a_march(count=300, cascades=1, share=0.05, resolution=16, growth=0.0):
     rays = some_rays(count)
     cells = (torch.rand(cascades, resolution, resolution, resolution) < share).to(torch.uint8)
     enter, leave = distances_in_box(rays, AABB * 2.0 ** (cascades - 1))
-    state = March(enter, leave, torch.rand(count), torch.zeros(count, dtype=torch.long))
+    state = MarchState(enter, leave, torch.rand(count), torch.zeros(count, dtype=torch.long))
     edges = [1.9]
     while edges[-1] < 6.1:
         edges.append(edges[-1] + max(0.02, growth * edges[-1]))
@@ -121,5 +121,5 @@ def test_rays_that_miss_the_box_have_no_samples():
     rays, state, lattice, grid = a_march(count=20, share=1.0)
     rays.directions.mul_(-1.0)
     enter, leave = distances_in_box(rays, AABB)
-    samples, _ = march(rays, March(enter, leave, state.jitter, state.next), lattice, grid)
+    samples, _ = march(rays, MarchState(enter, leave, state.jitter, state.next), lattice, grid)
     assert samples.starts.numel() == 0

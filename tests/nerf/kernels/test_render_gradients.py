@@ -41,7 +41,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     rays, random = some_rays(700), batch_random(3, 700) if jitter else None
     weight, background = torch.randn(700, 8), torch.rand(700, 3)
     seen, gradients = learnt(level, rays, random, weight, background)
-    asked = int(level.tally[0])
+    asked = int(level.counter.counts[0])
     level.forget_measurements()
     with without("render.gradients"):
         expected, of_single = learnt(level, rays, random, weight, background)
@@ -51,7 +51,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     for name, gradient in gradients.items():
         assert far_apart(gradient, of_single[name]) < 5 * most, name
     # What lies behind an opaque sample is not asked about.
-    assert asked == int(level.tally[0]) if opaque_below == 0.0 else asked < int(level.tally[0])
+    assert asked == int(level.counter.counts[0]) if opaque_below == 0.0 else asked < int(level.counter.counts[0])
 
 
 def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):

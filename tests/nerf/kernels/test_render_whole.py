@@ -7,7 +7,7 @@ from support.scenes import some_rays
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.kernels.render.whole_rays import whole_rays
+from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.rendering.sample_points import packed_points
@@ -89,9 +89,9 @@ def test_other_machines_and_widths_render_round_by_round():
     with without("render.cpu"):
         assert torch.equal(narrow.rgb, rendered(level, rays).rgb)
     assert torch.isfinite(narrow.rgb).all()
-    assert whole_rays(level.field.parts(), "float32", rays.near.device) is None
+    assert not has_kernel(level.field.parts(), "float32", rays.near.device, gradients=False)
     level = a_level()
-    assert whole_rays(level.field.parts(), "float32", rays.near.device) is not None
-    assert whole_rays(level.field.parts(), "float32", torch.device("meta")) is None
+    assert has_kernel(level.field.parts(), "float32", rays.near.device, gradients=False)
+    assert not has_kernel(level.field.parts(), "float32", torch.device("meta"), gradients=False)
     if not cpu_multiplies_bfloat16():
-        assert whole_rays(level.field.parts(), "bfloat16", rays.near.device) is None
+        assert not has_kernel(level.field.parts(), "bfloat16", rays.near.device, gradients=False)

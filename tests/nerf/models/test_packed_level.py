@@ -15,6 +15,7 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.packed import first_of_each_ray
 from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.samplers.early_termination import visible_samples
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
@@ -77,7 +78,7 @@ def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
 def test_samples_end_where_the_ray_is_opaque():
     level, rays = a_level(opaque_below=1e-3), some_rays(300)
     level.field = SolidField(ball(0.5), inside=80.0)
-    samples, features = level.visible_samples(rays, batch_random(1, 300))
+    samples, features = visible_samples(level.sampler, level.field, rays, batch_random(1, 300))
     assert features is None
     assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
     density, _ = level.field.density(packed_points(rays, samples, None))
@@ -95,7 +96,7 @@ def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypa
         return plain(points)[0] * (0.5 + points.random.uniform("noise")), None
 
     monkeypatch.setattr(level.field, "density", lambda points: asked.append(points) or density_of(points))
-    found, _ = level.visible_samples(rays, random)
+    found, _ = visible_samples(level.sampler, level.field, rays, random)
     samples = level.sampler(rays, random)
     with torch.no_grad():
         density, _ = density_of(packed_points(rays, samples, random))

@@ -18,6 +18,7 @@ from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.refinements.se3 import SmallMotions
 from nerf_lightning.nerf.rendering.packed import composite_packed
 from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.samplers.early_termination import visible_samples
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 
@@ -45,7 +46,7 @@ def test_a_camera_before_packed_samples_has_the_gradient_of_the_reference_in_flo
 
     exact_rays, exact_field = copy.deepcopy(rays).double(), copy.deepcopy(field).double()
     exact_rays.zero_grad()
-    samples, features = level.visible_samples(rays(pixels), random)
+    samples, features = visible_samples(level.sampler, level.field, rays(pixels), random)
     assert features is not None
     samples = replace(samples, starts=samples.starts.double(), ends=samples.ends.double())
     bundle = exact_rays(pixels)

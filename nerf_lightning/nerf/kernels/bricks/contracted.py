@@ -33,9 +33,6 @@ from nerf_lightning.nerf.kernels.bricks.cpu import (
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
-COMPILED_WITH = "800c6651"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 MOST_STEPS = 4096
 FARTHEST = np.float32(1e4)
 """Halves of the inner cube: beyond, places in the grid are no longer told apart."""

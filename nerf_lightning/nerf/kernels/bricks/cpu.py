@@ -13,9 +13,6 @@ from numpy import ndarray
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
-COMPILED_WITH = "a22e28bc"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 OPAQUE_DEPTH = np.float32(6.0)
 """A way as opaque as this lets nothing through."""
 LEAST_LIGHT = np.float32(0.005)

@@ -12,9 +12,6 @@ from nerf_lightning.nerf.kernels.bricks.cpu import MOST_SAMPLES, ONE, SAMPLE, _c
 from nerf_lightning.nerf.kernels.bricks.layout import TILE, Bricks, Wanted
 from nerf_lightning.nerf.kernels.threads import in_parallel
 
-COMPILED_WITH = "437b9bed"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 ZERO = np.float32(0.0)
 
 

@@ -15,9 +15,6 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid.reference import PRIME_Y, PRIME_Z
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
-COMPILED_WITH = "f619108e"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 if TYPE_CHECKING:
     from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 

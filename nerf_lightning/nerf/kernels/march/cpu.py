@@ -9,19 +9,16 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
-
-COMPILED_WITH = "f300b13d"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 FAR_AWAY = np.float32(1e30)
 
 
 def march(
-    rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells, limit: int | None
+    rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells, limit: int | None
 ) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals and where each ray would go on."""
     count, edges = rays.near.shape[0], lattice.shape[0]
@@ -50,7 +47,7 @@ def trial() -> None:
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, 4, 4, 4, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
-    march(rays, March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
+    march(rays, MarchState(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12), grid, None)
 
 
 @njit(fastmath=True)

@@ -1,6 +1,7 @@
 """What a march walks through: occupied cells, blocks of them, and how far each ray is."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -47,7 +48,7 @@ def leaps_over(blocks: UInt8[Tensor, "cascades a b c"]) -> UInt8[Tensor, "cascad
 
 
 @dataclass(frozen=True)
-class March(TensorStruct):
+class MarchState(TensorStruct):
     """Where each ray's march stands: rays may be marched a few samples at a time."""
 
     enter: Float[Tensor, "rays"]
@@ -57,3 +58,12 @@ class March(TensorStruct):
     """In [0, 1)."""
     next: Int[Tensor, "rays"]
     """The lattice interval to go on with."""
+
+
+class GridMarch(NamedTuple):
+    """A march through a grid, for kernels that do all of it."""
+
+    state: MarchState
+    lattice: Float[Tensor, "edges"]
+    """Increasing distances; two more than there are intervals."""
+    cells: OccupancyCells

@@ -8,13 +8,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
 
 def march(
     rays: RayBundle,
-    state: March,
+    state: MarchState,
     lattice: Float[Tensor, "edges"],
     grid: OccupancyCells,
     limit: int | None = None,

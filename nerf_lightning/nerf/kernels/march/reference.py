@@ -5,13 +5,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 
 
 def march_torch(
     rays: RayBundle,
-    state: March,
+    state: MarchState,
     lattice: Float[Tensor, "edges"],
     grid: OccupancyCells,
     limit: int | None,
@@ -30,7 +30,7 @@ def march_torch(
 
 
 def occupied_intervals(
-    rays: RayBundle, state: March, lattice: Float[Tensor, "edges"], grid: OccupancyCells
+    rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells
 ) -> tuple[Bool[Tensor, "rays k"], Float[Tensor, "rays e"]]:
     """Tell which intervals of each ray may hold something, and return the fenceposts of all.
 

@@ -30,9 +30,6 @@ from nerf_lightning.nerf.kernels.mlp.vectors import (
 from nerf_lightning.nerf.kernels.threads import in_parallel
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16, tiles_of_rows
 
-COMPILED_WITH = "162d45c5"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 ROWS = 128
 """So many go through all layers together."""
 KINDS: dict[torch.dtype, Any] = {torch.float32: np.float32(0), torch.bfloat16: np.int32(0)}

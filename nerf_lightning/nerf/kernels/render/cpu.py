@@ -18,7 +18,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.march.cpu import edge, first_from, in_box, next_occupied
-from nerf_lightning.nerf.kernels.march.grid import BLOCK, March, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
     ROWS,
@@ -34,9 +34,6 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import over_rows
 from nerf_lightning.nerf.types.rays import RayBundle
 
-COMPILED_WITH = "c19857bc"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
-
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW = np.float32(30.0)
 """The field's own bound on what its exponential is asked for."""
@@ -45,7 +42,7 @@ LARGEST_RAW = np.float32(30.0)
 def render(
     rays: RayBundle,
     field: FieldParts,
-    state: March,
+    state: MarchState,
     lattice: Float[Tensor, "edges"],
     grid: OccupancyCells,
     least_alpha: float,
@@ -83,13 +80,13 @@ def trial() -> None:
             render(rays, field, state, lattice, grid, 1e-3, 1e-3, dtype)
 
 
-def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, OccupancyCells]]:
+def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, MarchState, Tensor, OccupancyCells]]:
     """Yield a ray, a field, and what the ray marches through, for the widths that conf/model uses."""
     one, along = torch.ones(1), torch.tensor([[0.0, 0.0, 1.0]])
     rays = RayBundle(torch.tensor([[0.0, 0.0, -2.0]]), along, one, 3 * one, along)
     cells, aabb = torch.ones(1, *[BLOCK] * 3, dtype=torch.uint8), torch.tensor([[-1.0] * 3, [1.0] * 3])
     grid = OccupancyCells(aabb, cells, leaps_over(blocks_of(cells)))
-    state, lattice = March(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
+    state, lattice = MarchState(one, 3 * one, 0 * one, 0 * one.long()), torch.linspace(1.0, 3.2, 12)
     for features in (2, 4):
         layout = hash_grid_layout(16 // features, 4, 2, 8)
         weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
@@ -99,7 +96,7 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, March, Tensor, Oc
 
 
 def along(
-    rays: RayBundle, field: FieldParts, state: March, lattice: Tensor, grid: OccupancyCells
+    rays: RayBundle, field: FieldParts, state: MarchState, lattice: Tensor, grid: OccupancyCells
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
     """Return what kernels take of rays: the march, where they run through the world, and features of directions."""
     march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)

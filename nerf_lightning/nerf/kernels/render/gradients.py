@@ -21,7 +21,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
-from nerf_lightning.nerf.kernels.march.grid import March, OccupancyCells
+from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
 from nerf_lightning.nerf.kernels.mlp.cpu import (
     KINDS,
     ROWS,
@@ -49,9 +49,6 @@ from nerf_lightning.nerf.kernels.render.cpu import (
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
-
-COMPILED_WITH = "a43c25ec"
-"""The state of the files from which something is compiled in: numba itself looks at this one alone."""
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_RAW, LARGEST_SLOPE = np.float32(30.0), np.float32(15.0)
@@ -125,7 +122,7 @@ def _give_back(rooms: list[Room]) -> None:
 def render(
     rays: RayBundle,
     field: FieldParts,
-    state: March,
+    state: MarchState,
     lattice: Float[Tensor, "edges"],
     grid: OccupancyCells,
     opaque_below: float,
@@ -168,7 +165,7 @@ class _Given:
         self,
         rays: RayBundle,
         field: FieldParts,
-        state: March,
+        state: MarchState,
         lattice: Tensor,
         grid: OccupancyCells,
         opaque_below: float,

@@ -1,18 +1,34 @@
-"""Whether rays can be rendered from end to end in one kernel: for which machine and field there is one."""
+"""Rays rendered from end to end in one kernel: the one front of these kernels, for any level that has a march."""
 
-from types import ModuleType
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin, is_on
+from nerf_lightning.nerf.kernels.march.grid import GridMarch
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.types.rays import RayBundle
+
+LEARNING, RENDERING = "render.gradients", "render.cpu"
 
 
-def whole_rays(
-    field: FieldParts | None, products: Products, device: torch.device, gradients: bool = False
-) -> tuple[ModuleType, torch.dtype] | None:
-    """Return the kernel's module and what it multiplies; None where it does not take the field, or the precision.
+class WholeRays(NamedTuple):
+    """What a kernel saw along each ray."""
+
+    rgb: Float[Tensor, "rays 3"]
+    """Sum of weights times colour."""
+    opacity: Float[Tensor, "rays"]
+    depth: Float[Tensor, "rays"]
+    """Sum of weights times distance."""
+    samples: int
+    """That the field was evaluated at, in training; 0 in rendering."""
+
+
+def has_kernel(field: FieldParts | None, products: Products, device: torch.device, gradients: bool) -> bool:
+    """Return whether there is a kernel for a field.
 
     Args:
         field: None: of a kind that no kernel knows.
@@ -20,12 +36,41 @@ def whole_rays(
         device: of its parameters, and the rays.
         gradients: whether they are wanted, for the field's parameters alone.
     """
-    module = "render.gradients" if gradients else "render.cpu"
+    module = LEARNING if gradients else RENDERING
     perceptrons = cpu_twin("mlp.cpu", device) if field is not None and is_on(module) else None
-    if field is None or perceptrons is None:
-        return None
-    dtype = torch.bfloat16 if products == "bfloat16" else torch.float32
-    if field.table.dtype != torch.float32 or not all(perceptrons.takes(each, dtype) for each in field.weights):
-        return None
-    kernels = cpu_twin(module, device)
-    return None if kernels is None else (kernels, dtype)
+    if field is None or perceptrons is None or field.table.dtype != torch.float32:
+        return False
+    if not all(perceptrons.takes(each, _dtype(products)) for each in field.weights):
+        return False
+    return cpu_twin(module, device) is not None
+
+
+def render_whole_rays(
+    rays: RayBundle,
+    field: FieldParts,
+    march: GridMarch,
+    products: Products,
+    opaque_below: float,
+    least_alpha: float,
+    samples_per_ray: float | None,
+) -> WholeRays:
+    """Render rays with the kernel that `has_kernel` found.
+
+    Args:
+        rays: unit directions.
+        field: table and weights.
+        march: where each ray stands, and through what it goes.
+        products: the precision of the field's products.
+        opaque_below: a ray ends where less light is left.
+        least_alpha: in rendering, samples less opaque than this have no colour.
+        samples_per_ray: how many are expected in training; None: render without gradients.
+    """
+    if samples_per_ray is None:
+        kernels = cpu_twin(RENDERING, rays.near.device)
+        return WholeRays(*kernels.render(rays, field, *march, least_alpha, opaque_below, _dtype(products)), 0)
+    kernels = cpu_twin(LEARNING, rays.near.device)
+    return WholeRays(*kernels.render(rays, field, *march, opaque_below, _dtype(products), samples_per_ray))
+
+
+def _dtype(products: Products) -> torch.dtype:
+    return torch.bfloat16 if products == "bfloat16" else torch.float32

@@ -1,0 +1,102 @@
+"""Early termination: sample rays in chunks until little light is left; most hidden samples are never computed."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.randomness import RayRandom
+from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
+from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.samplers.base import PackedSampler
+from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
+
+# Samples of a ray in one chunk; more where few rays are left.
+CHUNK_SAMPLES, MOST_CHUNK_SAMPLES = 6, 64
+# In rendering, samples less opaque than this keep their density and lose their colour.
+LEAST_ALPHA = 1e-3
+
+
+def visible_samples(
+    sampler: PackedSampler, field: Field, rays: RayBundle, random: RayRandom | None
+) -> tuple[PackedSamples, Float[Tensor, "capacity features"] | None]:
+    """Return the samples of each ray up to where it is opaque, and the features that were computed to see that.
+
+    Without gradients. Where sizes may not be read on the host, all samples are kept.
+    """
+    samples = sampler(rays, random)
+    if sampler.capacity_for(rays) is not None or sampler.opaque_below == 0:
+        return samples, None
+    with torch.no_grad():
+        counts, features = _until_opaque(sampler, field, rays, samples, random)
+        kept = first_of_each_ray(samples, counts)
+        return samples.at(*kept), None if features is None else features.index_select(0, kept[0])
+
+
+def render_until_opaque(
+    sampler: PackedSampler, field: Field, rays: RayBundle, background: Float[Tensor, "rays 3"] | None
+) -> Rendering:
+    """Render rays without gradients, chunk by chunk, until each is opaque or has left the scene."""
+    marcher = sampler.marcher(rays)
+    rgb, depth = torch.zeros_like(rays.origins), torch.zeros_like(rays.near)
+    channels: dict[str, Tensor] = {}
+    light = torch.ones_like(rays.near)  # what no sample has absorbed yet
+    alive = torch.arange(rays.near.shape[0], device=rays.near.device)
+    while alive.numel():
+        left = rays[alive]
+        samples, more = marcher.advance(alive, _samples_per_chunk(rays.near.shape[0], alive.numel()))
+        part = composite_packed(_visible_colors(field, left, samples), samples, left, None)
+        before = light[alive]
+        rgb[alive] += before[:, None] * part.foreground
+        depth[alive] += before * (part.depth - (1.0 - part.opacity) * left.far)
+        for name, channel in part.channels.items():
+            total = channels.setdefault(name, channel.new_zeros(rays.near.shape[0], channel.shape[1]))
+            total[alive] += before[:, None] * channel
+        light[alive] = before * (1.0 - part.opacity)
+        alive = alive[more & (light[alive] > sampler.opaque_below)]
+    return Rendering.from_light(rays, background, rgb, light, depth, channels)
+
+
+def _until_opaque(
+    sampler: PackedSampler, field: Field, rays: RayBundle, samples: PackedSamples, random: RayRandom | None
+) -> tuple[Tensor, Tensor | None]:
+    """Return how many samples of each ray are visible, and the features of all that were computed."""
+    density, features = torch.zeros_like(samples.starts), None
+    place, counts, asked = samples.place, samples.bounds.diff(), 0
+    while rays_left := int((counts > asked).sum()):
+        until = asked + _samples_per_chunk(counts.shape[0], rays_left)
+        in_chunk = (counts.clamp(max=until) - asked).clamp(min=0)
+        until_there = counts.clamp(max=until).index_select(0, samples.ray_index)
+        number = ((place >= asked) & (place < until_there)).nonzero()[:, 0]
+        part = samples.at(number, torch.cat([counts.new_zeros(1), in_chunk.cumsum(0)]))
+        found, computed = field.density(packed_points(rays, part, random, field.sees_cones, first=asked))
+        density[number] = found.float()
+        if computed is not None:
+            features = computed.new_empty(*place.shape, computed.shape[1]) if features is None else features
+            features[number] = computed
+        counts = num_visible(density, samples, sampler.opaque_below)
+        asked = until
+    return counts, features
+
+
+def _visible_colors(field: Field, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
+    # Most samples are all but transparent: their colour, which costs most, is not computed.
+    points = packed_points(rays, samples, None, field.sees_cones)
+    density, features = field.density(points)
+    if features is None:
+        return field(points)
+    seen = (-torch.expm1(-density * samples.deltas) > LEAST_ALPHA).nonzero()[:, 0]
+    output = field(points[seen], features[seen])
+
+    def of_all(values: Tensor) -> Tensor:
+        return values.new_zeros(density.shape[0], values.shape[1]).index_copy_(0, seen, values)
+
+    rgb = density.new_zeros(density.shape[0], 3)
+    rgb[seen] = output.rgb
+    return FieldOutput(density, rgb, channels={name: of_all(values) for name, values in output.channels.items()})
+
+
+def _samples_per_chunk(rays: int, rays_left: int) -> int:
+    return min(MOST_CHUNK_SAMPLES, CHUNK_SAMPLES * rays // rays_left)
