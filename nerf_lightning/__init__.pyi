@@ -10,7 +10,7 @@ from nerf_lightning.notebook.trained_model import TrainedModel as TrainedModel
 from nerf_lightning.notebook.trained_model import load as load
 from nerf_lightning.notebook.trained_run import TrainedRun as TrainedRun
 from nerf_lightning.notebook.trained_run import train as train
-from nerf_lightning.training.build import build_run as build_run
+from nerf_lightning.training.build_run import build_run as build_run
 from nerf_lightning.training.system import RadianceFieldSystem as RadianceFieldSystem
 
 __version__: str

@@ -8,7 +8,7 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn, track
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.escaping import for_terminal
 
 DAY = 86_400

@@ -29,13 +29,13 @@ from nerf_lightning.bench.stages import (
     stage_seconds,
 )
 from nerf_lightning.bench.table import min_median_max, print_table
+from nerf_lightning.compute.machine import peak_memory, seconds_of
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say, stderr_console
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.machine import peak_memory, seconds_of
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.render_image import render_rays
@@ -43,7 +43,7 @@ from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.nerf.types.scene import Scene
-from nerf_lightning.training.build import build_step
+from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.callbacks.watcher import Watcher
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

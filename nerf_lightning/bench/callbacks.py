@@ -10,8 +10,8 @@ from typing import Any
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.optim import Optimizer
 
+from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.watcher import Watcher
 from nerf_lightning.training.step import TrainStep

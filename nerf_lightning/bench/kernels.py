@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nerf_lightning.machine import seconds_of
+from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import can_compile
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout

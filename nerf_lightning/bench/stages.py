@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
-from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.rendering.sample_points import packed_points

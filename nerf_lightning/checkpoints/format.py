@@ -6,6 +6,7 @@ import torch
 
 from nerf_lightning.budgets import allowed
 from nerf_lightning.checkpoints.packing import packed_format
+from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
 from nerf_lightning.files.schema import (
     Choice,
@@ -30,7 +31,6 @@ PARTS = ("model", "rays", "correction")
 """Of a training step: what their weights' names begin with."""
 WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
 """Types of what those hold. Numbers of other types would be cast without a word."""
-MOST_THREADS = 4096
 LOOPS = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
 """Lightning's; each is held against the trainer's own (`resume_state`)."""
 VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from nerf_lightning.cli.bare_paths import named_paths
 from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.compute.slurm import was_requeued
 from nerf_lightning.errors import InputError
-from nerf_lightning.slurm import was_requeued
 
 log = logging.getLogger(__name__)
 

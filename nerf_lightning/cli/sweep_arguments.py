@@ -51,8 +51,8 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
 
 def _with_former(arguments: list[str], resuming: bool) -> list[str]:
     """Put what the sweep was started with before the user's own."""
+    from nerf_lightning.compute.slurm import was_requeued
     from nerf_lightning.files.links import require_no_way_out
-    from nerf_lightning.slurm import was_requeued
 
     folder = _value(arguments, *FOLDER_KEYS)
     if folder is None and was_requeued() and not resuming:
@@ -83,8 +83,8 @@ def _resumed(arguments: list[str], folder: str | None) -> list[str]:
 
 
 def _folder_of_this_slurm_job(arguments: list[str]) -> Path | None:
+    from nerf_lightning.compute.slurm import slurm_job
     from nerf_lightning.config.overrides import open_sections
-    from nerf_lightning.slurm import slurm_job
 
     asked = set(open_sections(argument for argument in arguments if not argument.startswith("-")))
     same = (f for f, record in _sweeps(arguments) if record.slurm_job == slurm_job() and set(record.typed()) == asked)

@@ -27,8 +27,8 @@ def _run(command: str, folder: Path, launcher: int) -> None:
     from hydra.core.utils import configure_log, setup_globals
     from omegaconf import OmegaConf
 
-    from nerf_lightning import ranks
-    from nerf_lightning.training.launch.devices import choose_device
+    from nerf_lightning.compute import ranks
+    from nerf_lightning.compute.devices import choose_device
     from nerf_lightning.training.launch.processes import end_with, joined
 
     end_with(launcher)

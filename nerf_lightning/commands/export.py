@@ -6,11 +6,12 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, ListConfig
 
-from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.commands.gallery_pages import page_maker
 from nerf_lightning.commands.page_path import page_path
+from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build, required_path
+from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.console import say
 from nerf_lightning.export.base import Beside, Export, RunsExport
 from nerf_lightning.files.json_files import read_json_object
@@ -20,7 +21,6 @@ from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.results import find_runs
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.video.paths.base import CameraPath
 
 

@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.commands.train import run as train
+from nerf_lightning.config.auto_settings import AUTO
 from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
@@ -16,7 +17,6 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.runs.output_folder import beside_checkpoint
 from nerf_lightning.runs.saved_overrides import former_overrides
-from nerf_lightning.training.auto_settings import AUTO
 
 
 def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -> list[str] | None:

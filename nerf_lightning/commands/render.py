@@ -9,13 +9,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoints, scene_to_look_at
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.training.open_checkpoint import Opened, open_checkpoints, scene_to_look_at
 from nerf_lightning.video.film import film
 from nerf_lightning.video.settings import as_list, film_settings
 from nerf_lightning.video.shots import Subject
@@ -46,7 +46,7 @@ def render(config: DictConfig) -> None:
     say(*map(str, written))
 
 
-def _scene(opened: Opened, scene: DictConfig | None) -> SceneRecord:
+def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
     """Return the scene that a model renders: its own, or for models that look at photographs the one that is named."""
     if opened.model.needs_photographs:
         return scene_record(scene_to_look_at(opened, scene))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.errors import InputError

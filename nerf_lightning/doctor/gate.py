@@ -44,6 +44,12 @@ def require_sound(scene: Scene) -> list[Check]:
     return checks
 
 
+def exposure_finding(checks: list[Check] | None) -> str | None:
+    """Return what the checks say of photographs that were exposed differently, if anything."""
+    found = [check.message for check in checks or () if check.name == "exposure" and check.verdict == "look"]
+    return found[0] if found else None
+
+
 def warn_of_faults(scene: Scene) -> None:
     """Say what is wrong with a scene as far as that is seen in no time, whether the doctor is asked or not."""
     train = scene.splits["train"]

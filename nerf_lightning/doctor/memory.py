@@ -1,8 +1,8 @@
 """What training will take."""
 
+from nerf_lightning.compute.machine import free_memory
+from nerf_lightning.data.captures.space import IN_A_BOX, PHOTOGRAPHS, model_for
 from nerf_lightning.doctor.check import Check, Evidence
-from nerf_lightning.doctor.model_choice import IN_A_BOX, PHOTOGRAPHS, model_for
-from nerf_lightning.machine import free_memory
 
 # Bytes that training takes beside the pixels, the program itself included: the most of a process on a CPU, measured.
 BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.0e9}

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.console import tracked
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.camera_fit import fitted_camera

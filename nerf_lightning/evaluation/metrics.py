@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected
 from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.products import own_precision

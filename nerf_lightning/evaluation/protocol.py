@@ -17,10 +17,10 @@ import torch
 from torch import nn
 
 from nerf_lightning import __version__
+from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.config.identity import fingerprint
 from nerf_lightning.config.key_meanings import meaning_of
 from nerf_lightning.config.overrides import leaves
-from nerf_lightning.cores import num_cores
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.rendering.blending import at_evaluation
 from nerf_lightning.nerf.types.scene import Background, Scene

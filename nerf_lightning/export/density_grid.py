@@ -10,8 +10,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.errors import InputError
-from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export, require_no_folders
@@ -17,7 +18,6 @@ from nerf_lightning.export.las_file import save_las
 from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset

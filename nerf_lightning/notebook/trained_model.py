@@ -12,6 +12,7 @@ from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
+from nerf_lightning.config.open_checkpoint import open_checkpoint
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
@@ -21,7 +22,6 @@ from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
-from nerf_lightning.training.open_checkpoint import open_checkpoint
 from nerf_lightning.video.shots import Subject, lay_path, shot_of
 
 

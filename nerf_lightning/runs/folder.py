@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.checkpoints.writing import sweep_leftovers
+from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.overrides import key_of, to_type
@@ -31,10 +32,9 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
 from nerf_lightning.files.made_folders import make_folder, make_new_folder
+from nerf_lightning.files.run_marker import require_run
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.runs.summary import folders_of_runs, read_note
-from nerf_lightning.slurm import slurm_job, was_requeued
-from nerf_lightning.training.callbacks.folder_guard import require_run
 
 log = logging.getLogger(__name__)
 

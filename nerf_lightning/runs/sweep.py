@@ -16,15 +16,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.compute.cores import num_cores
+from nerf_lightning.compute.slurm import slurm_job
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.cores import num_cores
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.made_folders import remove_empty
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
-from nerf_lightning.slurm import slurm_job
 
 log = logging.getLogger(__name__)
 

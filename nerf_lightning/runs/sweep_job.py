@@ -16,13 +16,13 @@ from typing import Any, Literal
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from nerf_lightning.compute.slurm import was_requeued
 from nerf_lightning.config.identity import settings_digest
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
-from nerf_lightning.slurm import was_requeued
 
 NUM_JOBS = "NERF_LIGHTNING_JOBS"
 """In the environment of the jobs: how many there are."""

@@ -9,13 +9,14 @@ from pathlib import Path
 import torch
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.compute.devices import DeviceType, has_tf32
+from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.selftest.runs import Runs
-from nerf_lightning.training.launch.devices import DeviceType, has_tf32
-from nerf_lightning.training.launch.trainer import PRODUCTS, TrainerSettings
+from nerf_lightning.training.launch.trainer import TrainerSettings
 
 TRAINERS: dict[DeviceType, str] = {"cpu": "cpu", "cuda": "gpu"}
 

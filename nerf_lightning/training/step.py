@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import batch_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors

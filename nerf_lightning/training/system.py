@@ -11,11 +11,12 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nerf_lightning import ranks
 from nerf_lightning.checkpoints.format import KEY, LOOPS, record
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
 from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
 from nerf_lightning.checkpoints.same_capture import require_same_capture
+from nerf_lightning.compute import ranks
+from nerf_lightning.compute.devices import use_threads
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
@@ -25,9 +26,8 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
-from nerf_lightning.training.launch.devices import use_threads
 from nerf_lightning.training.launch.fitting import length_of_run
-from nerf_lightning.training.open_checkpoint import rendering_step
+from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
 
 

@@ -3,8 +3,8 @@
 import logging
 from collections.abc import Callable, Sequence
 
+from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.machine import seconds_of
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep

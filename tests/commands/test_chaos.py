@@ -78,7 +78,7 @@ PHASES = {
         "cache/*",
     ),
     "finishing": Phase(
-        "nerf_lightning.training.evaluate_and_film:Finish.__call__",
+        "nerf_lightning.commands.train_job.evaluate_and_film:PostTraining.__call__",
         ("train", "scene=npz", "scene.path={capture}", *FAST, "trainer.num_threads=1", "logger=none", "resume=auto"),
     ),
 }  # fmt: skip

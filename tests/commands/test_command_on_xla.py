@@ -20,8 +20,8 @@ TESTS = Path(__file__).parents[1]
 
 PROGRAM = """
 from support.xla_host import XLAHostAccelerator
-from nerf_lightning.training.launch import xla
-xla.ACCELERATOR = XLAHostAccelerator
+from nerf_lightning.compute import xla_device
+xla_device.ACCELERATOR = XLAHostAccelerator
 from nerf_lightning.cli import main as cli
 cli.main()
 """

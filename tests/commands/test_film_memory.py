@@ -10,12 +10,12 @@ from support.scenes import ball_scene
 from torch import nn
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf import bands
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.types.renderings import Rendering
-from nerf_lightning.training.memory_trial import peak_bytes
 from nerf_lightning.video.film import bytes_per_pixel, film, require_room
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.settings import FilmSettings

@@ -23,6 +23,7 @@ from support.posed_captures import Known, read, ring, write_colmap, write_llff, 
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
 from nerf_lightning.console import say
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.doctor.check import Check
@@ -37,7 +38,6 @@ from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.report.page import Report, page
 from nerf_lightning.report.pages import address_from
 from nerf_lightning.sfm.photograph_folder import find_photographs
-from nerf_lightning.training.evaluate_and_film import metric_lines
 from nerf_lightning.visualization.figures import new_figure, picture_of
 from nerf_lightning.visualization.pictures import with_caption
 

@@ -9,7 +9,7 @@ from support.planted import in_config, write_checkpoint
 from support.running import FAST, refused, said
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
-from nerf_lightning.commands.train import _resume_command
+from nerf_lightning.commands.train_job.fit import resume_command
 from nerf_lightning.config.compose import composed_job
 from nerf_lightning.config.load_model import load_model
 
@@ -60,7 +60,7 @@ def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(ne
 
 def test_the_command_that_goes_on_names_where_ones_own_yamls_lie():
     with composed_job("train", [SEARCHED, "model=voxels"]):
-        assert _resume_command(Path("run")) == f"nerf train resume=run {shlex.quote(SEARCHED)}"
+        assert resume_command(Path("run")) == f"nerf train resume=run {shlex.quote(SEARCHED)}"
 
 
 def test_a_module_that_python_does_not_find_is_told(tmp_path):

@@ -244,7 +244,7 @@ def test_a_run_with_a_link_out_of_it_is_not_taken(tmp_path):
 
 def test_pictures_in_a_run_folder_start_no_program(tmp_path):
     """PIL's own choice of a decoder would take this for EPS, and start Ghostscript."""
-    from nerf_lightning.training.evaluate_and_film import _film_progress
+    from nerf_lightning.commands.train_job.evaluate_and_film import _film_progress
 
     for step in (1, 2):
         path = tmp_path / "images" / "progress" / f"step_{step}.png"

@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.running import FAST, start
 
-from nerf_lightning.slurm import requeue, slurm_job, was_requeued
+from nerf_lightning.compute.slurm import requeue, slurm_job, was_requeued
 from nerf_lightning.training.launch.preemption import preemptible, wants_restart
 
 # What srun sets for a job of one task; by SLURM_NTASKS Lightning recognises Slurm.

@@ -221,7 +221,7 @@ def test_a_full_disk_is_said_of_the_run_where_a_logger_does_not_name_its_file(ne
     def full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("nerf_lightning.commands.train.describe_run", full)
+    monkeypatch.setattr("nerf_lightning.commands.train_job.fit.describe_run", full)
     result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/here")
     assert result.code == 2
     assert f"nerf: {tmp_path}/here: No space left on device. See that the place" in result.err.splitlines()[-1]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.errors import InputError

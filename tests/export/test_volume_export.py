@@ -12,6 +12,7 @@ from support.known_fields import INSIDE, ball, solid
 from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.density_grid import CHUNK
 from nerf_lightning.export.surface import PAIRS, looks_from_facing, looks_from_nearest
@@ -25,7 +26,6 @@ from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.training.memory_trial import peak_bytes
 
 CENTER = (0.3, 0.0, -0.2)
 

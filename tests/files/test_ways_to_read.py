@@ -11,7 +11,7 @@ LOADERS = {"np", "torch", "OmegaConf"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
     "config/compose.py": ["load"],
-    "training/callbacks/live_view.py": ["print"],  # the address, which is ours
+    "commands/train_job/live_view.py": ["print"],  # the address, which is ours
     "cli/main.py": ["load", "read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
     "cli/process.py": ["print"],

@@ -9,8 +9,8 @@ import os
 import pytest
 import torch
 
+from nerf_lightning.compute.devices import prepare_machine
 from nerf_lightning.selftest.scene import write_npz
-from nerf_lightning.training.launch.devices import prepare_machine
 
 CHOSEN = os.environ.get("NERF_LIGHTNING_GPU_TESTS_ON", "cuda")
 

@@ -6,14 +6,15 @@ import torch
 from support.configs import composed
 from support.scenes import ball_scene as many_views
 
+from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
-from nerf_lightning.training.build import build_step
-from nerf_lightning.training.launch.trainer import PRODUCTS, TrainerSettings
+from nerf_lightning.training.build_step import build_step
+from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 
 RAYS = 48

@@ -10,8 +10,8 @@ import torch
 from support.altered import Altered
 from support.running import FAST, start
 
+from nerf_lightning.commands.train_job.build import assemble_job
 from nerf_lightning.config.compose import compose_config
-from nerf_lightning.training.build import build_parts
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.system import RadianceFieldSystem
 
@@ -35,7 +35,7 @@ class Resumed:
     def __init__(self, run: Path, capture: Path, folder: Path, *model: str):
         settings = ("scene=npz", f"scene.path={capture}", *FAST, *model, *SHORT, "trainer.max_steps=25")
         config, choices = compose_config("train", settings)
-        parts = build_parts(config, choices, ())
+        parts = assemble_job(config, choices, ())
         self.system: RadianceFieldSystem = parts.system
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"

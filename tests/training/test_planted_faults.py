@@ -14,7 +14,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.training.build import build_step
+from nerf_lightning.training.build_step import build_step
 
 pytestmark = pytest.mark.exhaustive
 TILE = 16384

@@ -7,7 +7,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.captures.joined import joined
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.evaluator import Scoring

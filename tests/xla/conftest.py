@@ -19,6 +19,6 @@ def _xla_on_the_cpu(monkeypatch):
         torch_xla.device()
     from support.xla_host import XLAHostAccelerator
 
-    from nerf_lightning.training.launch import xla
+    from nerf_lightning.compute import xla_device
 
-    monkeypatch.setattr(xla, "ACCELERATOR", XLAHostAccelerator)
+    monkeypatch.setattr(xla_device, "ACCELERATOR", XLAHostAccelerator)

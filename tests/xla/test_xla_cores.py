@@ -16,9 +16,9 @@ import sys
 from pathlib import Path
 import torch
 from support.xla_host import XLAHostAccelerator, train
-from nerf_lightning.training.launch import xla
+from nerf_lightning.compute import xla_device
 
-xla.ACCELERATOR = XLAHostAccelerator
+xla_device.ACCELERATOR = XLAHostAccelerator
 folder = Path(sys.argv[1])
 there = train(folder / "xla", "nerf", "tpu", steps=8, devices="auto")
 here = train(folder / "cpu", "nerf", "cpu", steps=8)

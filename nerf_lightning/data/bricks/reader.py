@@ -14,8 +14,8 @@ from numpy import ndarray
 from rich.progress import Progress
 from torch import Tensor
 
+from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.console import ProgressLines, progress_bar
-from nerf_lightning.cores import num_cores
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.family import Model, model
 from nerf_lightning.data.bricks.solids import Solids

@@ -1,4 +1,4 @@
-"""How much of space is modelled: a box, what lies in front of a near plane, or everything."""
+"""How much of space is modelled: a box, what lies in front of a near plane, or everything; and which model suits it."""
 
 from dataclasses import replace
 from typing import Literal
@@ -10,10 +10,12 @@ from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, least_agreement
-from nerf_lightning.nerf.types.scene import Cameras, Space
+from nerf_lightning.nerf.types.scene import Cameras, Scene, Space
 
 # The same of all pixels' rays, one of which would never reach infinity in normalised device coordinates at 0.
 LEAST_AHEAD = 0.1
+IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
+"""The models of model=auto."""
 
 
 def choose_space(
@@ -47,3 +49,10 @@ def least_ahead(cameras: Cameras) -> float:
     zeros = torch.zeros(cameras.c2w.shape[0])
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
     return float((rays.directions @ -functional.normalize(cameras.c2w[:, :, 2].mean(dim=0), dim=0)).min())
+
+
+def model_for(scene: Scene) -> tuple[str, str]:
+    """Return the model that suits a scene, as model=auto chooses it, and why."""
+    if scene.space == "bounded":
+        return IN_A_BOX, "the scene stands in a box"
+    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"

@@ -8,8 +8,8 @@ from jaxtyping import Shaped
 from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
 from torch import Tensor
 
+from nerf_lightning.compute.machine import free_memory
 from nerf_lightning.console import progress_bar
-from nerf_lightning.machine import free_memory
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9

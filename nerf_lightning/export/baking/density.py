@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
+from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.contraction import Contraction, is_place, num_values
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
-from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
+from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.data.ray_batches import PixelDomain, gather_batch
 from nerf_lightning.export.baking.baked_field import LEAST_MET, BakedField, tiles_of
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.baking.seen_colors import in_coarse_steps
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.machine import require_memory
 from nerf_lightning.nerf.kernels.adam.step import adam_step
 from nerf_lightning.nerf.kernels.bricks.layout import Bricks, Wanted, kernels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator

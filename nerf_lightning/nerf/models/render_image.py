@@ -80,8 +80,7 @@ def render_picture(
         first, *others = subpixels.places()
         total = through(first, pixels)
         for place in others:
-            tensors = iter(through(place, pixels).tensors())
-            total = total.map(lambda each, more=tensors: each + next(more))
+            total = _sum(total, through(place, pixels))
         return total.map(lambda each: each / subpixels.per_pixel) if others else total
 
     height, width = int(cameras.height[view]), int(cameras.width[view])
@@ -217,6 +216,11 @@ def _fill(model: Model, count: int, at_once: int, render: Callable[[slice], Pict
         for part in parts:
             fill(part)
     return picture
+
+
+def _sum(one: Picture, other: Picture) -> Picture:
+    more = iter(other.tensors())
+    return one.map(lambda each: each + next(more))
 
 
 def _render_what_is_left(model: Model, rays: RayBundle, background: Background) -> Picture:

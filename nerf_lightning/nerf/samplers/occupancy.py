@@ -11,7 +11,6 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.nerf.geometry.contraction import Contracted
-from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
@@ -19,6 +18,7 @@ from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, RayMarcher
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
+from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam.step import adam_step, adam_step_torch
-from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.kernels.compile import CPU_TWINS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
@@ -24,6 +23,7 @@ from nerf_lightning.nerf.kernels.packed.reference import integrate_torch, transm
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.products import TILE_ROWS as TILE
 from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.selftest.check import (
     UNIT,

@@ -7,7 +7,7 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.errors import require_positive
 from nerf_lightning.files.schema import Record, Whole
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers

@@ -6,7 +6,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.run_marker import require_run
 
 
 class FolderGuard(Callback):
@@ -20,16 +20,3 @@ class FolderGuard(Callback):
         """
         if trainer.is_global_zero:
             require_run(Path(trainer.default_root_dir))
-
-
-def require_run(folder: Path) -> None:
-    """Refuse to write to the folder of a run that is gone.
-
-    Raises:
-        InputError: there is no run in it any more.
-    """
-    if not (folder / "run.json").is_file():
-        raise InputError(
-            f"The run folder {folder} was deleted, moved or renamed while the run was going on, so it stops here. If "
-            "the folder has another name now, go on with resume=NEW_NAME."
-        )

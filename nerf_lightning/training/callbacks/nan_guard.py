@@ -8,8 +8,8 @@ from typing import Any, Literal
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import last_good_checkpoint
+from nerf_lightning.compute import ranks
 from nerf_lightning.errors import InputError, require_positive
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints, writer
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers

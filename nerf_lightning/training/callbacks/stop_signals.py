@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.training.launch.preemption import stop_signals
 
 

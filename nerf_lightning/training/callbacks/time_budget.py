@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.schema import Number, Record
 

@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from torch import distributed
 
-from nerf_lightning.slurm import requeue
+from nerf_lightning.compute.slurm import requeue
 
 
 @contextmanager

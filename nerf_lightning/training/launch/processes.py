@@ -25,15 +25,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torch import distributed
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
+from nerf_lightning.compute.devices import choose_device
+from nerf_lightning.compute.settings import Launcher, cluster_environment
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.errors import InputError
-from nerf_lightning.training.launch.devices import choose_device
-from nerf_lightning.training.launch.strategy import Launcher, cluster_environment
-from nerf_lightning.training.launch.trainer import MOST_PROCESSES
 
 # What of Hydra's own config a worker may ask for.
 HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_logging"]
+MOST_PROCESSES = 1024
+"""Of one machine; each takes half a gigabyte and more."""
 LONGEST_WAIT = timedelta(hours=2)
 # So long another process may take to say what is wrong, before this one says it too.
 PATIENCE_SECONDS = 3.0

@@ -1,13 +1,7 @@
 """Several devices under Lightning: its DDP strategy, without the wrapper that sums gradients in every backward."""
 
-from typing import Literal
-
-from lightning.pytorch.plugins.environments import ClusterEnvironment, SLURMEnvironment, TorchElasticEnvironment
 from lightning.pytorch.strategies import DDPStrategy
-from torch import distributed
 from torch.nn import Module
-
-Launcher = Literal["nerf", "torchrun", "slurm"]
 
 
 class OneSumPerStep(DDPStrategy):
@@ -21,10 +15,3 @@ class OneSumPerStep(DDPStrategy):
 
     def _register_ddp_hooks(self) -> None:
         pass
-
-
-def cluster_environment() -> ClusterEnvironment:
-    """Return Lightning's view of who started the processes; requeueing on Slurm is ours."""
-    if distributed.is_torchelastic_launched():
-        return TorchElasticEnvironment()
-    return SLURMEnvironment(auto_requeue=False)

@@ -1,48 +1,27 @@
-"""The machine's part of a config: devices, precision, tiles, threads; and Lightning's Trainer made from it."""
+"""How and for how long to train, and Lightning's Trainer made from it."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 from torch import distributed
 
-from nerf_lightning import ranks
-from nerf_lightning.checkpoints.format import MOST_THREADS
+from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precision
+from nerf_lightning.compute.ranks import processes_here
+from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.products import Products
-from nerf_lightning.ranks import processes_here
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
-from nerf_lightning.training.launch.devices import (
-    LIGHTNING_NAMES,
-    Accelerator,
-    Precision,
-    choose_device,
-    choose_precision,
-    prepare_machine,
-    suited,
-    working_device,
-)
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to
-from nerf_lightning.training.launch.strategy import Launcher, OneSumPerStep, cluster_environment
+from nerf_lightning.training.launch.strategy import OneSumPerStep
 
-PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
 MOST_EPOCHS = 1 << 31
-MOST_PROCESSES = 1024
-"""Of one machine; each takes half a gigabyte and more."""
-CPU_TILE_POINTS = 8_192
-GPU_TILE_POINTS = 1 << 20
-MOST_CPU_TILE_POINTS = 1 << 18
-MOST_GPU_TILE_POINTS = 1 << 22
-LEAST_TILE_POINTS = 1 << 10
 
 
-class TrainerSettings:
+class TrainerSettings(ComputeSettings):
     """How and for how long to train.
 
     Args:
@@ -93,13 +72,9 @@ class TrainerSettings:
             raise InputError(
                 f"trainer.max_epochs={max_epochs}: give a positive number up to {MOST_EPOCHS}, or null for no bound."
             )
-        if num_threads is not None and not 1 <= num_threads <= MOST_THREADS:
-            raise InputError(f"trainer.num_threads={num_threads}: give a number from 1 to {MOST_THREADS}, or null.")
-        if isinstance(tile_points, int) and tile_points < 1:
-            raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
+        super().__init__(accelerator, precision, tile_points, num_threads, devices)
         self.max_steps, self.max_epochs = max_steps, max_epochs
         self.lightning = passed_through(lightning)
-        self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
         if self.device_type == "xla":
             xla.refuse(compile, launched_by)
         if cuda_graph and self.device_type != "cuda":
@@ -108,16 +83,9 @@ class TrainerSettings:
                 f"({self.device_reason}). Leave it out."
             )
         self.cuda_graph = cuda_graph
-        self._chosen = choose_precision(precision, self.device_type)
-        self.precision, self.reason = self._chosen
-        default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
-        # On XLA each size would be compiled first.
-        self.measures_tile = tile_points == "auto" and self.device_type != "xla"
-        self.tile_points = default_tile if tile_points == "auto" else tile_points
         self.clip_norm, self.val_every_steps = clip_norm, val_every_steps
-        self.num_threads = num_threads
         self.compile, self.deterministic = compile, deterministic
-        self.devices, self.launched_by = devices, launched_by  # read before the processes are (commands/processes.py)
+        self.launched_by = launched_by  # read before the processes are (launch/processes.py)
 
     def num_steps(self, num_rays: int, batch_rays: int, crop_steps: int) -> int:
         """Return the length of the run in steps, for a training split of `num_rays` rays; the crop is no epoch."""
@@ -125,12 +93,6 @@ class TrainerSettings:
         if self.max_epochs is None:
             return most
         return min(most, crop_steps - (-int(self.max_epochs * num_rays) // batch_rays))
-
-    def prepare_machine(self) -> None:
-        """Set threads and the allocator, once per process."""
-        prepare_machine(self.num_threads)
-        if self.device_type == "xla":
-            self.devices = xla.use_cores(self.devices)
 
     def build(self, folder: Path, num_steps: int, callbacks: Sequence[Callback], loggers: Sequence[Logger]) -> Trainer:
         """Return Lightning's Trainer for this process's device, one of several where processes are joined."""
@@ -163,39 +125,3 @@ class TrainerSettings:
             "precision": "32-true",  # Lightning's would lower whatever stands in a step; fields know their own
             "plugins": [AtomicCheckpointIO(), *environment],
         }
-
-    def keep_tile(self, measured: int | None) -> None:
-        """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
-        if self.measures_tile and measured is not None:
-            # The number comes out of a file: ever smaller tiles take hours, ever larger ones the memory.
-            most = MOST_CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
-            self.tile_points = min(max(measured, LEAST_TILE_POINTS), most)
-
-    @property
-    def device(self) -> torch.device:
-        """The device that models go to."""
-        if self.device_type == "cuda" and distributed.is_initialized():
-            return torch.device("cuda", cluster_environment().local_rank())
-        return torch.device(self.device_type)
-
-    @property
-    def inference_tile_points(self) -> int:
-        """Most points at once when rendering without gradients."""
-        return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
-
-    def prepare(self, model: Model) -> Model:
-        """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
-        self.precision, self.reason = suited(*self._chosen, self.device_type, model)
-        model.multiply_in(PRODUCTS[self.precision])
-        return model.to(self.device)
-
-    def describe(self) -> str:
-        """Say device and precision, with the reason where they were chosen."""
-        threads = f", {torch.get_num_threads()} threads" if self.device_type == "cpu" else ""
-        processes = f"{ranks.world_size()} processes, each " if ranks.world_size() > 1 else ""
-        return f"{processes}{self.device_type}{threads} ({self.device_reason}), {self.precision} ({self.reason})"
-
-    def keep_precision(self, former: Any) -> None:
-        """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
-        if self.reason != "as asked":
-            self._chosen = self.precision, self.reason = former, "as the run began"

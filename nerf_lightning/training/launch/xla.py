@@ -4,41 +4,17 @@ The cores run one program: rays are spread over them, weights are copied to each
 gradients (SPMD, single program, multiple data). So nothing else has to know how many there are.
 """
 
-import importlib.util
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from lightning.pytorch.accelerators import XLAAccelerator
 from lightning.pytorch.plugins import XLACheckpointIO, XLAPrecision
 from lightning.pytorch.strategies import SingleDeviceXLAStrategy
 from torch import Tensor
 
+from nerf_lightning.compute import xla_device
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
-
-ACCELERATOR: type[XLAAccelerator] = XLAAccelerator
-"""Lightning's, which counts TPU chips; tests put one here that takes XLA's CPU device."""
-
-
-def require_device() -> str:
-    """Return what kind of device XLA drives here.
-
-    Raises:
-        InputError: torch_xla is not installed, or finds no TPU.
-    """
-    if importlib.util.find_spec("torch_xla") is None:
-        raise InputError(
-            "trainer=tpu needs torch_xla, which is not installed here. It runs on a TPU's host (Linux, x86-64), and "
-            "its newest release, 2.9, goes with torch 2.9 alone: `make xla` installs both into an environment of their "
-            "own, where .venv-xla/bin/nerf is the command. Elsewhere use trainer=auto."
-        )
-    if not ACCELERATOR.is_available():
-        raise InputError("trainer=tpu: torch_xla finds no TPU on this machine. Use trainer=auto, or a TPU's host.")
-    import torch_xla
-    from torch_xla import runtime
-
-    return f"{runtime.device_type()}, torch_xla {torch_xla.__version__}"
 
 
 def refuse(compiles: bool, launched_by: str) -> None:
@@ -68,32 +44,9 @@ def require_static_shapes(model: Model) -> None:
         )
 
 
-def use_cores(wanted: int | Literal["auto"]) -> int:
-    """Prepare this process for so many cores, and return their number; before anything is put on them.
-
-    Raises:
-        InputError: the machine has another number.
-    """
-    from torch_xla import backends, runtime
-
-    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (products.py).
-    backends.set_mat_mul_precision("highest")
-    if wanted == 1:
-        runtime.global_runtime_device_count()  # autograd must see the device before its first backward
-        return 1
-    runtime.use_spmd()
-    found = runtime.global_runtime_device_count()
-    if wanted not in ("auto", found):
-        raise InputError(
-            f"trainer.devices={wanted}: XLA finds {found} cores on this machine. Give trainer.devices=auto for all of "
-            "them, or 1."
-        )
-    return found
-
-
 def trainer_arguments(cores: int) -> dict[str, Any]:
     """Return what Lightning's Trainer has to know."""
-    return {"accelerator": ACCELERATOR(), "devices": 1, "strategy": ManyCores(cores)}
+    return {"accelerator": xla_device.ACCELERATOR(), "devices": 1, "strategy": ManyCores(cores)}
 
 
 class ManyCores(SingleDeviceXLAStrategy):

@@ -13,8 +13,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, masked_out
 from nerf_lightning.evaluation.protocol import split_hash
-from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.collapse_guard import is_constant
 

@@ -13,8 +13,8 @@ from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.carving import cpu as carving_cpu
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
-from nerf_lightning.nerf.kernels.carving.carve import possible_cells
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.space_carving import possible_cells
 
 
 def cells(scene, resolution=24):

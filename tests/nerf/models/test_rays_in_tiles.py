@@ -6,6 +6,7 @@ import pytest
 import torch
 from support.scenes import LENSES, ball_scene, tiny_model
 
+from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf import bands
 from nerf_lightning.nerf.geometry.cameras import all_pixels, resized
@@ -21,7 +22,6 @@ from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph
 from nerf_lightning.nerf.types.renderings import Rendering
 from nerf_lightning.nerf.types.scene import PixelStore
-from nerf_lightning.training.memory_trial import peak_bytes
 from nerf_lightning.visualization.pictures import panels
 
 TILE = 1000

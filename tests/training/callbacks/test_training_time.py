@@ -6,10 +6,10 @@ from unittest.mock import create_autospec
 from filelock import FileLock
 from lightning.pytorch import Trainer
 
+from nerf_lightning.commands.train_job.live_view import Clocked
 from nerf_lightning.runs import folder as folders
 from nerf_lightning.runs.folder import RunFolder
 from nerf_lightning.training.callbacks import training_time
-from nerf_lightning.training.callbacks.live_view import Clocked
 from nerf_lightning.training.callbacks.training_time import TrainingTime
 
 

@@ -6,11 +6,11 @@ import platform
 import pytest
 import torch
 
+from nerf_lightning.compute.devices import working_device
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
-from nerf_lightning.training.launch.devices import working_device
 
 CHOSEN = ("cuda", "Old GPU, found")
 

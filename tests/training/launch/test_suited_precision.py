@@ -5,8 +5,8 @@ import torch
 from support.scenes import tiny_model
 from support.static_models import fast_model
 
+from nerf_lightning.compute import devices
 from nerf_lightning.nerf import products
-from nerf_lightning.training.launch import devices
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 

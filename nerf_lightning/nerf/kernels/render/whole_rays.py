@@ -1,6 +1,6 @@
 """Rays rendered from end to end in one kernel: the one front of these kernels, for any level that has a march."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -65,10 +65,10 @@ def render_whole_rays(
         least_alpha: in rendering, samples less opaque than this have no colour.
         samples_per_ray: how many are expected in training; None: render without gradients.
     """
+    kernels: Any = cpu_twin(RENDERING if samples_per_ray is None else LEARNING, rays.near.device)
     if samples_per_ray is None:
-        kernels = cpu_twin(RENDERING, rays.near.device)
-        return WholeRays(*kernels.render(rays, field, *march, least_alpha, opaque_below, _dtype(products)), 0)
-    kernels = cpu_twin(LEARNING, rays.near.device)
+        rgb, opacity, depth = kernels.render(rays, field, *march, least_alpha, opaque_below, _dtype(products))
+        return WholeRays(rgb, opacity, depth, samples=0)
     return WholeRays(*kernels.render(rays, field, *march, opaque_below, _dtype(products), samples_per_ray))
 
 

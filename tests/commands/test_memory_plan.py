@@ -11,14 +11,14 @@ import torch
 from support.configs import composed, options
 from support.scenes import ball_scene
 
+from nerf_lightning.commands.train_job import memory_plan
+from nerf_lightning.commands.train_job.memory_plan import MemoryPlan, Row
+from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.training import memory_plan
-from nerf_lightning.training.build import build_step
+from nerf_lightning.training.build_step import build_step
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.memory_plan import MemoryPlan, Row
-from nerf_lightning.training.memory_trial import peak_bytes
 from nerf_lightning.training.step import TrainStep
 
 CPU = torch.device("cpu")
@@ -32,8 +32,8 @@ import torch
 from support.configs import composed
 from support.scenes import ball_scene
 
-from nerf_lightning.config.instantiate import build; from nerf_lightning.training.build import build_step
-from nerf_lightning.training.memory_plan import memory_plan
+from nerf_lightning.config.instantiate import build; from nerf_lightning.training.build_step import build_step
+from nerf_lightning.commands.train_job.memory_plan import memory_plan
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.models.render_image import render_picture

@@ -9,8 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.compute import ranks
 from nerf_lightning.console import spoken
 from nerf_lightning.data.captures.joined import one_capture
 from nerf_lightning.errors import InputError

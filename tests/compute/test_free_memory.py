@@ -3,8 +3,8 @@
 import psutil
 import pytest
 
-from nerf_lightning import machine
-from nerf_lightning.machine import free_memory
+from nerf_lightning.compute import machine
+from nerf_lightning.compute.machine import free_memory
 
 UNLIMITED = 9223372036854771712
 """How version 1 says that there is no limit."""

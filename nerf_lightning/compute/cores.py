@@ -2,6 +2,8 @@
 
 import os
 
+MOST_THREADS = 4096
+
 
 def num_cores() -> int:
     """Return how many cores are ours.

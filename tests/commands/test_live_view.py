@@ -14,8 +14,8 @@ from support.ports import unused_port
 from support.running import FAST, start
 from support.viser_client import ViserClient
 
+from nerf_lightning.commands.train_job.live_view import LiveView
 from nerf_lightning.errors import InputError
-from nerf_lightning.training.callbacks.live_view import LiveView
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.viewer import training_switch
@@ -134,7 +134,7 @@ class FakeSystem:
 
 @pytest.mark.parametrize("slice_seconds", [0.01, 0.2, 2.0])
 def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, trainer, slice_seconds):
-    from nerf_lightning.training.callbacks import live_view
+    from nerf_lightning.commands.train_job import live_view
 
     clock = Clock()
     monkeypatch.setattr(live_view, "time", clock)

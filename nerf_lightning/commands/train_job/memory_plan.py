@@ -3,16 +3,16 @@
 import logging
 from dataclasses import dataclass, replace
 
+from nerf_lightning.commands.train_job.memory_trial import Trial, try_out
+from nerf_lightning.compute.machine import free_memory, held_memory
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.mapped_store import MappedPixelStore
 from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
-from nerf_lightning.machine import free_memory, held_memory
 from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.memory_trial import Trial, try_out
 from nerf_lightning.training.step import TrainStep
 
 # What glibc's heap takes beyond what is held, in gaps between blocks of different sizes: 0 to 0.5 of a step, measured.

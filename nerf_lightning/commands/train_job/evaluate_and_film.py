@@ -8,8 +8,8 @@ import torch
 from lightning.pytorch import Trainer
 from omegaconf import DictConfig
 
-from nerf_lightning import ranks
 from nerf_lightning.checkpoints.reading import scene_record
+from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.console import say
 from nerf_lightning.data.captures.joined import shown_capture
@@ -36,7 +36,7 @@ MOST_NAMED = 10
 
 
 @dataclass
-class Finish:
+class PostTraining:
     """What happens after training; built before it, so that bad input shows at once."""
 
     scoring: Scoring | None
@@ -45,7 +45,7 @@ class Finish:
     """Is made after all that happens here, by the command."""
 
     @classmethod
-    def from_config(cls, config: DictConfig) -> "Finish":
+    def from_config(cls, config: DictConfig) -> "PostTraining":
         """Build what the config asks for.
 
         Raises:

@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from nerf_lightning.cores import num_cores
+from nerf_lightning.compute.cores import num_cores
 
 
 @pytest.fixture(autouse=True)

@@ -3,12 +3,13 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint, read_checkpoint
 from nerf_lightning.checkpoints.recorded_frame import as_trained
+from nerf_lightning.compute.settings import ComputeSettings
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.load_model import load_model
@@ -16,24 +17,18 @@ from nerf_lightning.config.overrides import quoted
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
-from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.scene import Scene
-from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.step import TrainStep
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Opened:
+class LoadedModel:
     """What a command needs of a checkpoint."""
 
-    settings: TrainerSettings
+    settings: ComputeSettings
     checkpoint: Checkpoint
     model: Model
 
@@ -43,7 +38,7 @@ class Opened:
         return self.settings.inference_tile_points
 
 
-def open_checkpoint(config: DictConfig, float32: bool = False) -> Opened:
+def open_checkpoint(config: DictConfig, float32: bool = False) -> LoadedModel:
     """Open `ckpt` as the config's trainer says.
 
     Args:
@@ -56,14 +51,14 @@ def open_checkpoint(config: DictConfig, float32: bool = False) -> Opened:
     return open_checkpoints(config, [config.ckpt], float32)[0]
 
 
-def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = False) -> list[Opened]:
+def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = False) -> list[LoadedModel]:
     """Open several; the tiles are those of the first."""
-    settings: TrainerSettings = build(config.trainer)
+    settings: ComputeSettings = build(config.trainer)
     settings.prepare_machine()
     trusted = trusted_modules(config.trust)
     checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in paths]
     settings.keep_tile(checkpoints[0].tile_points)
-    return [Opened(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
+    return [LoadedModel(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
 
 
 def trusted_modules(trust: Any) -> list[str]:
@@ -79,12 +74,12 @@ def trusted_modules(trust: Any) -> list[str]:
     return named
 
 
-def _model(settings: TrainerSettings, checkpoint: Checkpoint, trusted: Sequence[str], float32: bool) -> Model:
+def _model(settings: ComputeSettings, checkpoint: Checkpoint, trusted: Sequence[str], float32: bool) -> Model:
     model = load_model(checkpoint, trusted)
     return model.to(settings.device) if float32 else settings.prepare(model)
 
 
-def scene_to_look_at(opened: Opened, scene: DictConfig | None) -> Scene:
+def scene_to_look_at(opened: LoadedModel, scene: DictConfig | None) -> Scene:
     """Show an opened model that looks at photographs those of a scene, and return the scene.
 
     Args:
@@ -102,7 +97,7 @@ def scene_to_look_at(opened: Opened, scene: DictConfig | None) -> Scene:
     return shown
 
 
-def as_known(scene: Scene, opened: Opened) -> Scene:
+def as_known(scene: Scene, opened: LoadedModel) -> Scene:
     """Return a scene as an opened model knows it: in the frame of its training, if it was trained in a frame.
 
     Raises:
@@ -111,7 +106,7 @@ def as_known(scene: Scene, opened: Opened) -> Scene:
     return scene if opened.model.needs_photographs else as_trained(scene, opened.checkpoint)
 
 
-def read_photographs(config: DictConfig, opened: Opened) -> Scene | None:
+def read_photographs(config: DictConfig, opened: LoadedModel) -> Scene | None:
     """Return the capture that `scene` names, as the checkpoint's model knows it.
 
     None, and a warning, where it cannot be read.
@@ -123,32 +118,3 @@ def read_photographs(config: DictConfig, opened: Opened) -> Scene | None:
     except OSError as error:
         log.warning("The cameras are shown without their photographs, which cannot be read: %s", error)
     return None
-
-
-def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> TrainStep:
-    """Return a step that renders and validates, and takes no step.
-
-    The loss, the optimizer and the schedule of a run come from its person's own config alone, never from a file.
-    """
-
-    def no_optimizer(parameters: object) -> NoReturn:
-        raise InputError(
-            f"This system was loaded from a checkpoint ({checkpoint.path}), which holds neither the photographs nor "
-            "how it was trained, so it only renders. To go on training: run = build_run(...) with the settings of the "
-            f"run, then trainer.fit(run.system, run.data, ckpt_path='{checkpoint.path}')."
-        )
-
-    scene, model, settings = checkpoint.scene, load_model(checkpoint, trusted), TrainerSettings(accelerator="cpu")
-    settings.keep_tile(checkpoint.tile_points)
-    return TrainStep(
-        model=model,
-        rays=RayGenerator.of_views(scene, model),
-        loss=MeanSquaredError(),
-        optimizer=no_optimizer,
-        schedule=ExponentialDecay(),
-        progress=Progress(),
-        seed=0,
-        background=scene.background,
-        tile_points=None if model.needs_whole_batch else settings.tile_points,
-        start_weights=checkpoint.weights,
-    )

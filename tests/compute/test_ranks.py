@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.scenes import ball_scene
 from support.steps import gradients, make_step
 
-from nerf_lightning import ranks
+from nerf_lightning.compute import ranks
 from nerf_lightning.data.ray_batches import RayBatches
 
 

@@ -10,11 +10,11 @@ from typing import Any, Literal, cast, get_args
 import torch
 from torch import distributed
 
-from nerf_lightning.cores import num_cores
+from nerf_lightning.compute import xla_device
+from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Linear, cpu_gains_by_bfloat16, cpu_multiplies_bfloat16
-from nerf_lightning.training.launch import xla
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def choose_device(accelerator: Accelerator) -> tuple[DeviceType, str]:
         log.warning("trainer=mps has never been tried: compare its first losses with those of trainer=cpu.")
         return "mps", "as asked, untested"
     if accelerator == "tpu":
-        return "xla", f"{xla.require_device()}, as asked"
+        return "xla", f"{xla_device.require_device()}, as asked"
     if torch.cuda.is_available():
         return "cuda", f"{torch.cuda.get_device_name()}, {'as asked' if accelerator == 'gpu' else 'found'}"
     if accelerator == "gpu":

@@ -12,8 +12,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.console import spoken
-from nerf_lightning.doctor.check import Check
-from nerf_lightning.doctor.model_choice import model_for
+from nerf_lightning.data.captures.space import model_for
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
@@ -26,7 +25,7 @@ PHOTOS_SECONDS = 300
 log = logging.getLogger(__name__)
 
 
-def settled(
+def resolve_auto(
     config: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], scene: Scene
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config in which nothing is left open, and the names picked from each group.
@@ -57,11 +56,11 @@ def settled(
     return config, chosen(choices)
 
 
-def corrected(
+def resolve_correction(
     config: DictConfig,
     choices: Mapping[str, Any],
     overrides: Sequence[str],
-    checks: Sequence[Check] | None,
+    finding: str | None = None,
     former: Mapping[str, Any] | None = None,
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config and the names picked from each group, with the correction that the photographs want.
@@ -72,21 +71,21 @@ def corrected(
         config: with its model chosen.
         choices: the names picked from each group.
         overrides: what it was composed with.
-        checks: what the doctor says of the scene; None where it was not asked.
+        finding: what the doctor says of the photographs' exposure; None: nothing.
         former: the config of the run that is gone on with; None: it is a new one.
     """
     picked = chosen(choices)
     if picked.get("correction") != AUTO:
         return config, picked
     if former is None:
-        found = [check.message for check in checks or () if check.name == "exposure" and check.verdict == "look"]
+        cause = finding
     else:
         section = former.get("correction")
         kept = isinstance(section, dict) and section.get("_target_") == EXPOSURE
-        found = ["the run began with it"] if kept else []
-    picked["correction"] = "exposure" if found else "none"
-    if found:
-        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", found[0])
+        cause = "the run began with it" if kept else None
+    picked["correction"] = "exposure" if cause else "none"
+    if cause:
+        log.info("correction: exposure, since %s (correction=none takes the colours as they are)", cause)
         config = copy.deepcopy(config)
         config.correction = compose_config("train", [*overrides, "correction=exposure"])[0].correction
     return config, picked

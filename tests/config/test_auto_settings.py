@@ -8,12 +8,13 @@ from support.configs import composed
 from support.running import FAST
 from support.scenes import ball_scene
 
+from nerf_lightning.commands.train_job.build import assemble_job
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.gate import exposure_finding
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.folder import former_config
-from nerf_lightning.training.auto_settings import corrected, settled
-from nerf_lightning.training.build import build_parts
 
 IN_A_BOX = ball_scene()
 PHOTOGRAPHS = replace(IN_A_BOX, space="contracted")
@@ -22,7 +23,7 @@ FORWARD_FACING = replace(IN_A_BOX, space="ndc")
 
 def chosen_for(scene, *overrides):
     config, choices = compose_config("train", overrides)
-    return settled(config, choices, overrides, scene)
+    return resolve_auto(config, choices, overrides, scene)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,7 @@ def corrected_for(verdict, *overrides):
     config, choices = compose_config("train", overrides)
     said = "2 of 20 differ in brightness"
     checks = [Check("sharpness", "look", "blurred"), Check("exposure", verdict, said)] if verdict else None
-    return corrected(config, choices, overrides, checks)
+    return resolve_correction(config, choices, overrides, exposure_finding(checks))
 
 
 @pytest.mark.parametrize("overrides", [(), ("correction=auto",)])
@@ -109,7 +110,9 @@ def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(
         OmegaConf.save(chosen, tmp_path / ".hydra" / "config.yaml")
         config, choices = compose_config("train", goes_on.format(tmp_path, tmp_path).split())
         checks = [Check("exposure", verdict, "one differs")] if verdict else None
-        config, choices = corrected(config, choices, [], checks, former_config(config, job_folder=None))
+        config, choices = resolve_correction(
+            config, choices, [], exposure_finding(checks), former_config(config, job_folder=None)
+        )
         assert choices["correction"] == named
         assert config.correction == chosen.correction
 
@@ -121,10 +124,10 @@ def test_a_new_run_knows_of_no_former_one(tmp_path):
 
 def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):
     found = [Check("exposure", "look", "one differs")]
-    monkeypatch.setattr("nerf_lightning.training.build.require_sound", lambda scene: found)
+    monkeypatch.setattr("nerf_lightning.commands.train_job.build.require_sound", lambda scene: found)
     monkeypatch.setattr("nerf_lightning.data.bricks.reader.BricksReader.read", lambda reader: IN_A_BOX)
     for doctor, learnt in (("on", True), ("off", False)):
         overrides = [*FAST, f"doctor={doctor}", "trainer.precision=32-true"]
-        parts = build_parts(*compose_config("train", overrides), overrides)
+        parts = assemble_job(*compose_config("train", overrides), overrides)
         assert bool(list(parts.system.step.correction.parameters())) == learnt
         assert parts.system.record["choices"]["correction"] == ("exposure" if learnt else "none")

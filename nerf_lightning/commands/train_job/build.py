@@ -1,0 +1,125 @@
+"""What `nerf train` adds to a run: callbacks, loggers, the doctor, and what follows the training."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback
+from omegaconf import DictConfig
+
+from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
+from nerf_lightning.compute import ranks
+from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.tree import print_tree
+from nerf_lightning.console import StdoutConsole
+from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.gate import exposure_finding, require_sound
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.runs.folder import former_config, job_folder
+from nerf_lightning.training.build_run import Run, assemble
+from nerf_lightning.training.callbacks.checkpoints import Checkpoints
+from nerf_lightning.training.callbacks.folder_guard import FolderGuard
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.callbacks.training_time import TrainingTime
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.loggers import WeightsAndBiases
+
+
+@dataclass
+class TrainJob(Run):
+    """What `nerf train` adds, but for its place on the disk."""
+
+    config: DictConfig
+    """Nothing in it is left open."""
+    checks: list[Check] | None
+    """What the doctor says of the scene, where it was asked."""
+    num_steps: int
+    signals: StopSignals
+    clock: TrainingTime
+    """One of the callbacks."""
+    callbacks: list[Callback]
+    loggers: dict[str, Any]
+    """What opens them in the run's folder."""
+    post_training: PostTraining
+
+
+def build_job(asked: DictConfig) -> TrainJob:
+    """Build what a command's config asks for, and read its scene; nothing is written (`assemble_job`)."""
+    hydra = HydraConfig.get()
+    # What is left open is composed again, and may lie where the command line has said.
+    overrides = [*searchpath_override(), *hydra.overrides.task]
+    former = ranks.from_first(lambda: former_config(asked, job_folder()))
+    return assemble_job(asked, hydra.runtime.choices, overrides, former)
+
+
+def assemble_job(
+    asked: DictConfig,
+    choices: Mapping[str, Any],
+    overrides: Sequence[str],
+    former: Mapping[str, Any] | None = None,
+) -> TrainJob:
+    """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
+
+    Args:
+        asked: the config of the run; what it leaves open is chosen for the scene.
+        choices: the names picked from each group, which its checkpoints keep.
+        overrides: what the config was composed with.
+        former: the config of the run that is gone on with, as its folder keeps it; None: it is a new one.
+
+    Raises:
+        InputError: anything in the config or in the capture that makes no run.
+    """
+    settings: TrainerSettings = build(asked.trainer)
+    settings.prepare_machine()
+    post_training, loggers = PostTraining.from_config(asked), build(asked.logger)
+    for each in loggers.values() if ranks.is_first() else ():
+        if isinstance(each, WeightsAndBiases):
+            each.require_access()
+    scene: Scene = build(asked.scene).read()
+    post_training.require_film(scene)
+    config, picked = resolve_auto(asked, choices, overrides, scene)
+    checks = ranks.from_first(lambda: require_sound(scene)) if config.doctor else None
+    config, picked = resolve_correction(config, picked, overrides, exposure_finding(checks), former)
+    run = assemble(config, picked, settings, scene)
+    num_rays, data = run.data.batches.whole.num_rays, config.data
+    signals, clock = StopSignals(), TrainingTime()
+    if config.print_config and ranks.is_first():
+        print_tree(config, StdoutConsole())
+    return TrainJob(
+        **vars(run),
+        config=config,
+        checks=checks,
+        num_steps=settings.num_steps(num_rays, data.batch_rays, data.crop_steps),
+        signals=signals,
+        clock=clock,
+        callbacks=_callbacks(config, signals, clock),
+        loggers=loggers,
+        post_training=post_training,
+    )
+
+
+def searchpath_override() -> list[str]:
+    """Return the override that names folders with yamls of a person's own, if there is one."""
+    return [each for each in HydraConfig.get().overrides.hydra if each.startswith("hydra.searchpath=")]
+
+
+def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) -> list[Callback]:
+    callbacks: list[Callback] = [signals, clock, FolderGuard(), *_chosen_callbacks(config)]
+    if "live_view" in config.viewer:
+        callbacks.append(build(config.viewer.live_view))
+    if config.budget.seconds is not None:
+        callbacks.append(TimeBudget(float(config.budget.seconds)))
+    # Checkpoints come last, so that they save what the others left.
+    return sorted(callbacks, key=lambda callback: isinstance(callback, Checkpoints))
+
+
+def _chosen_callbacks(config: DictConfig) -> list[Callback]:
+    chosen = build(config.callbacks)
+    for name, callback in chosen.items():
+        if not isinstance(callback, Callback):
+            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
+    return list(chosen.values())

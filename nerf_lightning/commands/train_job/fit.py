@@ -1,0 +1,96 @@
+"""Fit a job's system: precision and tile are settled, the run is announced, and Lightning's Trainer takes the steps."""
+
+import logging
+import shlex
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Trainer
+from omegaconf import OmegaConf
+
+from nerf_lightning.checkpoints.trusted_classes import modules_to_trust
+from nerf_lightning.commands.train_job.build import TrainJob, searchpath_override
+from nerf_lightning.commands.train_job.memory_plan import announce_memory
+from nerf_lightning.commands.train_job.run_folder import HeldFolder
+from nerf_lightning.compute import ranks
+from nerf_lightning.config.overrides import to_type
+from nerf_lightning.console import spoken
+from nerf_lightning.runs.saved_overrides import to_give_again
+from nerf_lightning.training.callbacks.hparams import describe_run
+from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile
+
+log = logging.getLogger(__name__)
+
+
+def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
+    """Train from the beginning, or from where the folder's run stopped, and return the trainer.
+
+    Raises:
+        SystemExit: a signal stopped the training, which was saved (128 + signal).
+    """
+    former = folder.former
+    _prepare(job, folder)
+    trainer = job.settings.build(folder.path, job.num_steps, job.callbacks, folder.loggers)
+    _announce(job, folder)
+    if former is None:
+        describe_run(trainer.loggers, job.config)
+    checkpoint = None if former is None else former.checkpoint
+    trainer.fit(job.system, job.data, ckpt_path=checkpoint, weights_only=True)
+    if ranks.is_first():
+        steps = trainer.global_step - (0 if former is None else former.step)
+        log.info("%d steps in %s", steps, spoken(job.clock.seconds))
+    if job.signals.received is not None:
+        log.info("stopped at step %d; go on with: %s", trainer.global_step, resume_command(folder.path))
+        raise SystemExit(128 + job.signals.received)
+    return trainer
+
+
+def _prepare(job: TrainJob, folder: HeldFolder) -> None:
+    """Put the model on its device, in the precision and with the tile that suit it, or that the run began with."""
+    step, settings, former = job.system.step, job.settings, folder.former
+    if former is not None:
+        log.info("going on from step %d of %s", former.step, folder.path)
+        settings.keep_precision(former.precision)
+        settings.keep_tile(former.tile_points)
+        step.tile_points = settings.tile_points
+    settings.prepare(step.model)
+    job.system.record["precision"] = settings.precision
+    measures_tile = settings.measures_tile and job.num_steps > SHORT_RUN
+    if former is None and measures_tile and not step.model.needs_whole_batch:
+        tile = ranks.from_first(lambda: measured_tile(settings, step, job.data.batches))
+        step.tile_points = settings.tile_points = tile
+    if ranks.is_first():
+        announce_memory(settings, step, job.data)
+    if settings.compile:
+        log.info("compiled levels: %s", ", ".join(step.model.compile_fields()) or "none has static shapes")
+    if settings.cuda_graph:
+        step.record_gradients()
+
+
+def _announce(job: TrainJob, folder: HeldFolder) -> None:
+    parameters = sum(parameter.numel() for parameter in job.system.model.parameters())
+    tile = job.system.step.tile_points
+    seconds = job.config.budget.seconds
+    log.info(
+        "run folder %s: %s of %d rays, %s parameters, %s, %s",
+        folder.path,
+        f"{job.num_steps} steps" if seconds is None else f"{spoken(seconds)} (budget.seconds) of steps",
+        job.data.batches.batch_rays,
+        f"{parameters:,}",
+        job.settings.describe(),
+        "whole batches" if tile is None else f"tiles of {tile} points",
+    )
+    if folder.former is None and job.config.resume == "auto":
+        log.info("resume=auto: there is no unfinished run of this config to go on with; this one begins anew")
+    own = modules_to_trust(OmegaConf.to_container(job.config.model, resolve=True))
+    if own:
+        log.info(
+            "the model has parts of your own: a command that opens its checkpoints builds them only with trust=%s",
+            own[0] if len(own) == 1 else f"[{','.join(own)}]",
+        )
+
+
+def resume_command(folder: Path) -> str:
+    """Return what a person types to go on with a run."""
+    again = to_give_again(HydraConfig.get().overrides.task)
+    return " ".join(["nerf train", to_type("resume", str(folder)), *map(shlex.quote, searchpath_override()), *again])

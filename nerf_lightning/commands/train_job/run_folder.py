@@ -1,0 +1,93 @@
+"""The folder of a training: taken by one process for all, held while it trains, and marked with how it ended."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig
+
+from nerf_lightning.commands.train_job.build import TrainJob
+from nerf_lightning.compute import ranks
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.atomic import full_disk_named
+from nerf_lightning.files.run_marker import require_run
+from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
+from nerf_lightning.runs.log_file import log_file
+from nerf_lightning.runs.summary import read_note
+from nerf_lightning.training.callbacks.watcher import errors_told_once
+from nerf_lightning.training.launch.preemption import wants_restart
+from nerf_lightning.training.loggers import opened_loggers
+
+
+@dataclass
+class HeldFolder:
+    """The run's folder as every process sees it; only the first one holds it, and writes how the run ended."""
+
+    path: Path
+    former: ResumePoint | None
+    """Where training goes on; None: it begins."""
+    held: RunFolder | None
+    loggers: list[Logger]
+
+    def trained(self, seconds: float) -> None:
+        """Note how long this start has trained."""
+        if self.held is not None:
+            self.held.trained(seconds)
+
+    def finish(self, step: int, psnr: float | None) -> None:
+        """Note that the run is complete."""
+        if self.held is not None:
+            self.held.finish(step, psnr)
+
+
+@contextmanager
+def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
+    """Take the folder of a job, and its log and loggers; note how the run ended, and let the folder go.
+
+    Args:
+        job: what is trained.
+        asked: the config before anything was chosen for the scene.
+    """
+    held: list[RunFolder] = []
+
+    def take() -> tuple[Path, ResumePoint | None]:
+        hydra = HydraConfig.get()
+        held.append(open_run(job.config, job.num_steps, job_folder(), asked, hydra.overrides.task))
+        write_config(held[0].path, job.config, hydra)
+        return held[0].path, held[0].resume_point()
+
+    try:
+        path, former = ranks.from_first(take)
+        with (
+            errors_told_once(),
+            full_disk_named(path),
+            log_file(path) if ranks.is_first() else nullcontext(),
+            _loggers(job, path, former) as loggers,
+        ):
+            yield HeldFolder(path, former, held[0] if held else None, loggers)
+    except SystemExit as stop:
+        for folder in held:
+            folder.trained(job.clock.seconds)
+            folder.stop(restarted=wants_restart(stop.code))
+        raise
+    except (InputError, OSError):
+        for folder in held:
+            require_run(folder.path)  # where it is gone, whatever failed has failed for that
+        raise
+    finally:
+        for folder in held:
+            folder.release()
+
+
+@contextmanager
+def _loggers(job: TrainJob, folder: Path, former: ResumePoint | None) -> Iterator[list[Logger]]:
+    purge: dict[str, int] = {}
+    if (folder / "tensorboard").exists():
+        # Steps that were logged after the checkpoint will be logged again: TensorBoard is told to forget them.
+        purge = {"purge_step": 0 if former is None else former.step + 1}
+    started = str(read_note(folder).get("started"))
+    with opened_loggers(job.loggers if ranks.is_first() else {}, folder, started, **purge) as loggers:
+        yield loggers

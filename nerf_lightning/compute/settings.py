@@ -1,0 +1,104 @@
+"""Device, precision, threads and tile: all that opening and rendering a checkpoint needs of a machine."""
+
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch.plugins.environments import ClusterEnvironment, SLURMEnvironment, TorchElasticEnvironment
+from torch import distributed
+
+from nerf_lightning.compute import ranks, xla_device
+from nerf_lightning.compute.cores import MOST_THREADS
+from nerf_lightning.compute.devices import (
+    Accelerator,
+    Precision,
+    choose_device,
+    choose_precision,
+    prepare_machine,
+    suited,
+    working_device,
+)
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.products import Products
+
+Launcher = Literal["nerf", "torchrun", "slurm"]
+PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
+CPU_TILE_POINTS = 8_192
+GPU_TILE_POINTS = 1 << 20
+MOST_CPU_TILE_POINTS = 1 << 18
+MOST_GPU_TILE_POINTS = 1 << 22
+LEAST_TILE_POINTS = 1 << 10
+
+
+class ComputeSettings:
+    """Where and in which precision to compute. The arguments are those of `TrainerSettings`."""
+
+    def __init__(
+        self,
+        accelerator: Accelerator = "auto",
+        precision: Precision = "auto",
+        tile_points: int | Literal["auto"] | None = "auto",
+        num_threads: int | None = None,
+        devices: int | Literal["auto"] = 1,
+    ):
+        if num_threads is not None and not 1 <= num_threads <= MOST_THREADS:
+            raise InputError(f"trainer.num_threads={num_threads}: give a number from 1 to {MOST_THREADS}, or null.")
+        if isinstance(tile_points, int) and tile_points < 1:
+            raise InputError(f"trainer.tile_points={tile_points}: give a positive number of points, auto, or null.")
+        self.device_type, self.device_reason = working_device(choose_device(accelerator), accelerator)
+        self._chosen = choose_precision(precision, self.device_type)
+        self.precision, self.reason = self._chosen
+        default_tile = CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS
+        # On XLA each size would be compiled first.
+        self.measures_tile = tile_points == "auto" and self.device_type != "xla"
+        self.tile_points = default_tile if tile_points == "auto" else tile_points
+        self.num_threads, self.devices = num_threads, devices
+
+    def prepare_machine(self) -> None:
+        """Set threads and the allocator, once per process."""
+        prepare_machine(self.num_threads)
+        if self.device_type == "xla":
+            self.devices = xla_device.use_cores(self.devices)
+
+    def keep_tile(self, measured: int | None) -> None:
+        """Take the tile that a run has measured, unless the user named one; on a CPU no larger than is ever tried."""
+        if self.measures_tile and measured is not None:
+            # The number comes out of a file: ever smaller tiles take hours, ever larger ones the memory.
+            most = MOST_CPU_TILE_POINTS if self.device_type == "cpu" else MOST_GPU_TILE_POINTS
+            self.tile_points = min(max(measured, LEAST_TILE_POINTS), most)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that models go to."""
+        if self.device_type == "cuda" and distributed.is_initialized():
+            return torch.device("cuda", cluster_environment().local_rank())
+        return torch.device(self.device_type)
+
+    @property
+    def inference_tile_points(self) -> int:
+        """Most points at once when rendering without gradients."""
+        return self.tile_points or (CPU_TILE_POINTS if self.device_type == "cpu" else GPU_TILE_POINTS)
+
+    def prepare(self, model: Model) -> Model:
+        """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
+        self.precision, self.reason = suited(*self._chosen, self.device_type, model)
+        model.multiply_in(PRODUCTS[self.precision])
+        return model.to(self.device)
+
+    def describe(self) -> str:
+        """Say device and precision, with the reason where they were chosen."""
+        threads = f", {torch.get_num_threads()} threads" if self.device_type == "cpu" else ""
+        processes = f"{ranks.world_size()} processes, each " if ranks.world_size() > 1 else ""
+        return f"{processes}{self.device_type}{threads} ({self.device_reason}), {self.precision} ({self.reason})"
+
+    def keep_precision(self, former: Any) -> None:
+        """Go on in the precision that a run began with, where none is asked for: it decides the weights' last bits."""
+        if self.reason != "as asked":
+            self._chosen = self.precision, self.reason = former, "as the run began"
+
+
+def cluster_environment() -> ClusterEnvironment:
+    """Return Lightning's view of who started the processes; requeueing on Slurm is ours."""
+    if distributed.is_torchelastic_launched():
+        return TorchElasticEnvironment()
+    return SLURMEnvironment(auto_requeue=False)

@@ -1,0 +1,85 @@
+"""The step of training, built from a config: model, cameras, loss, correction, optimizer and schedule."""
+
+from dataclasses import replace
+
+from omegaconf import DictConfig
+
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import hold_to_budgets, load_weights
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.corrections.base import Correction
+from nerf_lightning.nerf.losses.base import Loss
+from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.refinements.base import Refinement
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.launch import xla
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
+
+
+def build_step(
+    config: DictConfig,
+    settings: TrainerSettings,
+    scene: Scene,
+    progress: Progress,
+    start: Checkpoint | None = None,
+    model: Model | None = None,
+    loss: Loss | None = None,
+) -> TrainStep:
+    """Build model, cameras, loss, correction, optimizer and schedule into the step of training.
+
+    Args:
+        config: of the run.
+        settings: of the machine.
+        scene: what is learnt.
+        progress: the run's place.
+        start: the checkpoint whose weights it begins with.
+        model: one in the place of the config's.
+        loss: the same.
+
+    Raises:
+        InputError: a value of the wrong kind, cameras that cannot be refined, a model that cannot be cut into tiles, a
+            correction for one photograph.
+    """
+    if not isinstance(config.seed, int):
+        raise InputError(f"seed={config.seed} does not fit: it must be a whole number.")
+    model = build(config.model) if model is None else model
+    refinement: Refinement = build(config.refinement)
+    refinement.fit_to(scene)
+    if model.needs_photographs and refinement.moves():
+        raise InputError(
+            "A model that looks at photographs takes their cameras as they are, so nothing is learnt of them: leave "
+            "refinement out. Refine the cameras of a capture with a model of its own (model=fast)."
+        )
+    scene = replace(scene, refined=refinement.moves())
+    optimizer = build(config.optimizer)
+    if settings.device_type == "xla":
+        xla.require_static_shapes(model)
+        optimizer.keywords.pop("fused", None)  # torch's own fusion is for other devices; XLA fuses by itself
+    hold_to_budgets(model, "The model")
+    model.fit_to(scene)
+    show_photographs(model, scene)
+    correction: Correction = build(config.correction)
+    correction.fit_to(scene)
+    if start is not None:
+        load_weights(model, start)
+    return TrainStep(
+        model=model,
+        rays=RayGenerator.of_views(scene, model, refinement),
+        loss=build(config.loss) if loss is None else loss,
+        correction=correction,
+        optimizer=optimizer,
+        schedule=build(config.scheduler),
+        progress=progress,
+        seed=config.seed,
+        background=scene.background,
+        tile_points=settings.tile_points,
+        clip_norm=settings.clip_norm,
+        sample_budget=config.data.sample_budget,
+        start_weights=None if start is None else start.weights,
+        jitter=config.data.overfit_views is None,
+    )

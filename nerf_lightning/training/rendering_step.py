@@ -1,0 +1,43 @@
+"""A step for a checkpoint whose training is over: it renders and validates, and takes no step."""
+
+from collections.abc import Sequence
+from typing import NoReturn
+
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.compute.settings import ComputeSettings
+from nerf_lightning.config.load_model import load_model
+from nerf_lightning.errors import InputError
+from nerf_lightning.nerf.losses.mse import MeanSquaredError
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.training.step import TrainStep
+
+
+def rendering_step(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> TrainStep:
+    """Return a step that renders and validates, and takes no step.
+
+    The loss, the optimizer and the schedule of a run come from its person's own config alone, never from a file.
+    """
+
+    def no_optimizer(parameters: object) -> NoReturn:
+        raise InputError(
+            f"This system was loaded from a checkpoint ({checkpoint.path}), which holds neither the photographs nor "
+            "how it was trained, so it only renders. To go on training: run = build_run(...) with the settings of the "
+            f"run, then trainer.fit(run.system, run.data, ckpt_path='{checkpoint.path}')."
+        )
+
+    scene, model, settings = checkpoint.scene, load_model(checkpoint, trusted), ComputeSettings(accelerator="cpu")
+    settings.keep_tile(checkpoint.tile_points)
+    return TrainStep(
+        model=model,
+        rays=RayGenerator.of_views(scene, model),
+        loss=MeanSquaredError(),
+        optimizer=no_optimizer,
+        schedule=ExponentialDecay(),
+        progress=Progress(),
+        seed=0,
+        background=scene.background,
+        tile_points=None if model.needs_whole_batch else settings.tile_points,
+        start_weights=checkpoint.weights,
+    )
