@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.nerf.activations import LEAST_SLOPE, color_from, density_from
 from nerf_lightning.nerf.encoders.base import ConeEncoder, Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box, to_unit_cube
@@ -22,11 +23,7 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
 
-LARGEST_EXPONENT = 15.0
 THICK, THIN = 3.0, -1.0
-LEAST_SLOPE = 0.003
-"""Of a colour over its raw value, on the way back from black or full: what it is at a colour of 0.003 or 0.997. With
-alpha, which teaches density what is empty, there is no need, and Lego loses 0.08 dB by it."""
 
 
 class HashField(Field):
@@ -134,7 +131,7 @@ class HashField(Field):
         raw_rgb = self._through(self.color_mlp, self._with_direction(hidden, points))
         density = self._density(hidden, points.positions)
         raw_rgb = raw_rgb.float()
-        rgb = _Sigmoid.apply(raw_rgb, self.least_slope) if self.least_slope else torch.sigmoid(raw_rgb)
+        rgb = color_from(raw_rgb, self.least_slope)
         return FieldOutput(density=density, rgb=rgb)
 
     def hidden_layers(self) -> list[HiddenLayer]:
@@ -214,7 +211,7 @@ class HashField(Field):
         return scaled_covariance(covariance, to_cube)
 
     def _density(self, features: Tensor, positions: Tensor) -> Tensor:
-        density = _TruncatedExponential.apply(features[..., 0].float() + self.bias)
+        density = density_from(features[..., 0].float() + self.bias)
         if self.contracted.is_on():
             return density
         center, half = center_and_half(self.aabb)
@@ -232,42 +229,3 @@ def _layer_by_layer(weights: nn.ParameterList, features: Tensor) -> list[Tensor]
         features = linear(features if not number else functional.relu(features), weight, None, "float32")
         layers.append(features)
     return [*(functional.relu(layer) for layer in layers[:-1]), layers[-1]]
-
-
-class _TruncatedExponential(torch.autograd.Function):
-    """exp(x), whose gradient stops growing at exp(15): one wild sample must not end the run."""
-
-    @staticmethod
-    def forward(ctx: Any, raw: Tensor) -> Tensor:
-        ctx.save_for_backward(raw)
-        return torch.exp(raw.clamp(max=2 * LARGEST_EXPONENT))
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        (raw,) = ctx.saved_tensors
-        return grad * torch.exp(raw.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT))
-
-
-class _Sigmoid(torch.autograd.Function):
-    """1 / (1 + exp(-x)), with a way back from black and from full colours, where it has no slope left.
-
-    Where nearly all pixels are black, all colours are within ten steps (1e-38), and what the few pixels of the content
-    ask for would be multiplied by as little. What leads farther out keeps the true slope: as steep, it would carry the
-    weights away to no end, at a cost of 6 dB on photographs with dark corners.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, raw: Tensor, least_slope: float) -> Tensor:
-        color = torch.sigmoid(raw)
-        ctx.save_for_backward(color)
-        ctx.least_slope = least_slope
-        return color
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        (color,) = ctx.saved_tensors
-        slope = color * (1.0 - color)
-        inward = grad * (color - 0.5) > 0  # a step goes against the gradient
-        return grad * torch.where(inward, slope.clamp(min=ctx.least_slope), slope), None

@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-ROOM = "nerf_lightning.nerf.kernels"
+ROOM = "nerf_lightning"
 LONG_SECONDS = 2.0
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
@@ -111,7 +111,7 @@ def _digest(module: str) -> str:
 
 
 def _sources(module: str) -> set[Path]:
-    """Return the files of a module of kernels, and of all kernel modules that it imports from."""
+    """Return the files of a module of kernels, and of all modules of ours that it imports from."""
     found: set[Path] = set()
     waiting = [module]
     while waiting:

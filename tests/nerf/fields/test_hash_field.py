@@ -4,10 +4,11 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
+from nerf_lightning.nerf.activations import color_from, density_from
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField, _Sigmoid, _TruncatedExponential
+from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.types.points import Points
 
 
@@ -43,7 +44,7 @@ def test_outside_of_the_box_there_is_nothing_unless_space_is_contracted():
 
 def test_the_exponential_and_its_gradient_stay_finite():
     raw = torch.tensor([-200.0, -1.0, 0.0, 14.0, 80.0, 1e6], requires_grad=True)
-    density = _TruncatedExponential.apply(raw)
+    density = density_from(raw)
     density.sum().backward()
     assert bool(density.isfinite().all())
     assert bool(raw.grad.isfinite().all())
@@ -53,7 +54,7 @@ def test_the_exponential_and_its_gradient_stay_finite():
 
 def test_colours_have_the_slope_of_the_logistic_function_and_a_way_back_from_its_ends():
     raw = torch.tensor([-90.0, -3.0, 0.0, 2.0, 60.0], requires_grad=True)
-    color = _Sigmoid.apply(raw, 0.003)
+    color = color_from(raw, 0.003)
     slope = (color * (1 - color)).detach()
     torch.testing.assert_close(color.detach(), torch.sigmoid(raw.detach()))
     brighter, darker = (torch.autograd.grad(sign * color.sum(), raw, retain_graph=True)[0] for sign in (-1, 1))

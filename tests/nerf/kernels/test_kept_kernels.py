@@ -49,7 +49,13 @@ def test_a_change_of_a_number_in_another_file_is_compiled_in(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kernel", "other"), [("mlp.cpu", "vectors.py"), ("march.cpu", "grid.py"), ("hash_grid.cpu", "reference.py")]
+    ("kernel", "other"),
+    [
+        ("mlp.cpu", "vectors.py"),
+        ("march.cpu", "grid.py"),
+        ("hash_grid.cpu", "reference.py"),
+        ("render.cpu", "activations.py"),
+    ],
 )
 def test_those_that_are_known_to_take_something_are_found(kernel, other):
-    assert other in {Path(file).name for file in backends._sources(f"{backends.ROOM}.{kernel}")}
+    assert other in {Path(file).name for file in backends._sources(f"nerf_lightning.nerf.kernels.{kernel}")}

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
+from nerf_lightning.nerf.activations import LARGEST_SLOPE_RAW
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
@@ -36,6 +37,7 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
 from nerf_lightning.nerf.kernels.render.cpu import (
+    LARGEST_RAW,
     along,
     arrays_of,
     interval,
@@ -51,7 +53,7 @@ from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
-LARGEST_RAW, LARGEST_SLOPE = np.float32(30.0), np.float32(15.0)
+LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
 """The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.hash_field`)."""
 SLOTS = 64
 """So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were

@@ -1,0 +1,62 @@
+"""From a network's raw numbers to density and colour; kernels of whole rays compute the same, with these numbers."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LARGEST_RAW = 30.0
+"""Of a raw density: exp is taken of no more."""
+LARGEST_SLOPE_RAW = 15.0
+"""Beyond it the slope of the density grows (or, below its negative, falls) no further."""
+LEAST_SLOPE = 0.003
+"""Of a colour over its raw value, on the way back from black or full: what it is at a colour of 0.003 or 0.997. With
+alpha, which teaches density what is empty, there is no need, and Lego loses 0.08 dB by it."""
+
+
+def density_from(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
+    """Return exp(raw), whose gradient stops growing at exp(15): one wild sample must not end the run."""
+    return _TruncatedExponential.apply(raw)
+
+
+def color_from(raw: Float[Tensor, "*points 3"], least_slope: float) -> Float[Tensor, "*points 3"]:
+    """Return 1 / (1 + exp(-raw)), with a slope of at least `least_slope` on the way back from black or full."""
+    return _Sigmoid.apply(raw, least_slope) if least_slope else torch.sigmoid(raw)
+
+
+class _TruncatedExponential(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
+        return torch.exp(raw.clamp(max=LARGEST_RAW))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (raw,) = ctx.saved_tensors
+        return grad * torch.exp(raw.clamp(-LARGEST_SLOPE_RAW, LARGEST_SLOPE_RAW))
+
+
+class _Sigmoid(torch.autograd.Function):
+    """1 / (1 + exp(-x)), with a way back from black and from full colours, where it has no slope left.
+
+    Where nearly all pixels are black, all colours are within ten steps (1e-38), and what the few pixels of the content
+    ask for would be multiplied by as little. What leads farther out keeps the true slope: as steep, it would carry the
+    weights away to no end, at a cost of 6 dB on photographs with dark corners.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, least_slope: float) -> Tensor:
+        color = torch.sigmoid(raw)
+        ctx.save_for_backward(color)
+        ctx.least_slope = least_slope
+        return color
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (color,) = ctx.saved_tensors
+        slope = color * (1.0 - color)
+        inward = grad * (color - 0.5) > 0  # a step goes against the gradient
+        return grad * torch.where(inward, slope.clamp(min=ctx.least_slope), slope), None
