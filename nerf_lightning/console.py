@@ -1,6 +1,7 @@
 """What a person sees in the terminal: lines on stdout, progress bars on stderr."""
 
 import logging
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeVar
@@ -8,7 +9,6 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn, track
 
-from nerf_lightning.compute import ranks
 from nerf_lightning.escaping import for_terminal
 
 DAY = 86_400
@@ -19,10 +19,16 @@ Item = TypeVar("Item")
 log = logging.getLogger(__name__)
 
 
+def _speaks() -> bool:
+    """Return whether this process speaks for all of its run (`compute.ranks`, without importing torch)."""
+    distributed = sys.modules.get("torch.distributed")
+    return distributed is None or not distributed.is_initialized() or distributed.get_rank() == 0
+
+
 def progress_bar(*columns: ProgressColumn | str, shown: bool = True) -> Progress:
     """Return a bar that vanishes when it is done; it stays silent where stderr is not a terminal."""
     console = Console(stderr=True)
-    shown = shown and console.is_terminal and ranks.is_first()
+    shown = shown and console.is_terminal and _speaks()
     return Progress(*columns, console=console, transient=True, disable=not shown)
 
 
@@ -31,7 +37,7 @@ class ProgressLines:
 
     def __init__(self) -> None:
         console = Console(stderr=True)
-        self.shown = ranks.is_first() and not console.is_terminal
+        self.shown = _speaks() and not console.is_terminal
         self.began = self.told = time.monotonic()
 
     def __call__(self, what: str, fraction: float) -> None:
@@ -138,5 +144,5 @@ class StdoutConsole(Console):
 def stderr_console() -> Console:
     """Return a console on stderr, silent where that is not a terminal, and in all processes of a run but the first."""
     console = Console(stderr=True)
-    console.quiet = not (console.is_terminal and ranks.is_first())
+    console.quiet = not (console.is_terminal and _speaks())
     return console
