@@ -32,7 +32,7 @@ endef
 export XLA_NEEDS
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all test-slow test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
+.PHONY: help setup train test test-all test-slow test-core test-fast test-gpu test-other test-xla xla check format lint types layers docs bench soak doctor-rates fuzz clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -62,6 +62,9 @@ test-slow: setup ## Run the tests that take minutes together: kernels compiled f
 
 test-fast: setup ## Run the tests that take less than a few seconds each
 	@$(PYTEST) -m "not slow and not exhaustive and not minutes"
+
+test-core: setup ## Run the quick tests in a copy of the project without extensions
+	@$(VENV)/bin/python -m pytest -m "" tests/test_without_extensions.py
 
 test-xla: ## Run the tests of TPU training on XLA's CPU device; skipped where torch_xla cannot be installed
 	@$(MAKE) --no-print-directory xla \

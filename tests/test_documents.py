@@ -17,13 +17,14 @@ from nerf_lightning.cli.completion import completion
 from nerf_lightning.cli.help import help_on_anything
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
 from nerf_lightning.config.compose import compose_config
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.folders import conf_folders
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("[!s]*.md")),
+    *sorted((ROOT / "nerf_lightning" / "extensions").glob("*/README.md")),
     ROOT / "docs" / "scaling.md",
     ROOT / "docs" / "sweeps.md",
 ]
@@ -152,9 +153,9 @@ def known_settings():
             for key, inner in value.items():
                 gather(inner, f"{prefix}.{key}" if prefix else key)
 
-    for file in conf_folder().rglob("*.yaml"):
+    for conf, file in ((folder, file) for folder in conf_folders() for file in folder.rglob("*.yaml")):
         text = file.read_text(encoding="utf-8")
-        group = file.relative_to(conf_folder()).parent.as_posix()
+        group = file.relative_to(conf).parent.as_posix()
         shared = {"capture": "scene"}.get(file.stem, "") if group == "." else group
         prefix = "" if "@package _global_" in text else shared.replace("/", ".")
         gather(yaml.safe_load(text) or {}, prefix)

@@ -34,13 +34,20 @@ def test_what_is_published_says_how_to_contribute_and_whom_to_tell_of_holes(tmp_
 @pytest.mark.slow
 def test_a_wheel_installed_elsewhere_gives_a_working_nerf(tmp_path):
     with zipfile.ZipFile(built("wheel", tmp_path / "dist")) as content:
-        packed = {name for name in content.namelist() if name.startswith("nerf_lightning/conf/")}
+        names = set(content.namelist())
+        packed = {name for name in names if name.startswith("nerf_lightning/conf/")}
         content.extractall(tmp_path / "site")
     ours = {f"nerf_lightning/{file.relative_to(REPOSITORY)}" for file in (REPOSITORY / "conf").rglob("*.yaml")}
     assert packed == ours
+    assert {"nerf_lightning/extensions/pruning/conf/prune.yaml", "nerf_lightning/data/bricks/fire_engine.txt"} <= names
+    assert [name for name in names if "tests/" in name or "conftest" in name] == []
     elsewhere = {"cwd": tmp_path, "PYTHONPATH": str(tmp_path / "site")}
     where = python("-c", "import nerf_lightning.files.folders as c; print(c.conf_folder())", **elsewhere)
     assert where.strip() == str(tmp_path / "site" / "nerf_lightning" / "conf")
     assert "num_frequencies: 10" in python("-m", "nerf_lightning", "train", "model=nerf", "--cfg", "job", **elsewhere)
+    assert "ViewTransformer" in python(
+        "-m", "nerf_lightning", "train", "model=view_transformer", "--cfg", "job", **elsewhere
+    )
+    assert "nerf prune ckpt=RUN" in python("-m", "nerf_lightning", "prune", "--help", **elsewhere)
     assert "scene.images=images" in python("-m", "nerf_lightning", "help", "scene=colmap", **elsewhere)
     assert "complete -c nerf" in python("-m", "nerf_lightning", "completion", "fish", **elsewhere)

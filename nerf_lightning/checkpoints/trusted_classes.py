@@ -15,7 +15,10 @@ from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.samplers.base import Sampler
 
 CONTRACTS = (Encoder, Field, Sampler, Level, Model)
-ROOMS = tuple(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models"))
+ROOMS = (
+    *(f"nerf_lightning.nerf.{room}." for room in ("encoders", "fields", "samplers", "models")),
+    "nerf_lightning.extensions.",
+)
 LARGEST_NUMBER = 1 << 53
 
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.budgets import Budgets, allow, allow_as_typed
@@ -21,7 +22,7 @@ from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.cli.working_directory import require_no_settings_here
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
-from nerf_lightning.files.folders import PACKAGE, conf_folder
+from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.manual.suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -79,9 +80,20 @@ def _answer(arguments: list[str]) -> None:
 
 
 def find_commands() -> dict[str, str]:
-    """Return each command with its one-line description: a file in commands/ that has a yaml of its name in conf/."""
-    files = sorted((PACKAGE / "commands").glob("*.py"))
-    return {file.stem: _summary(file) for file in files if (conf_folder() / f"{file.stem}.yaml").is_file()}
+    """Return each command with its one-line description, without importing any."""
+    return {name: _summary(file) for name, file in sorted(_command_files().items())}
+
+
+def command_module(name: str) -> ModuleType:
+    """Import the module whose `run(config)` does a command's work."""
+    file = _command_files()[name].relative_to(PACKAGE.parent)
+    return importlib.import_module(".".join(file.with_suffix("").parts))
+
+
+def _command_files() -> dict[str, Path]:
+    """Return the files in commands/, ours and extensions', each of which has a yaml of its name in conf/."""
+    files = [*PACKAGE.glob("extensions/*/commands/*.py"), *PACKAGE.glob("commands/*.py")]
+    return {file.stem: file for file in files if conf_file(file.stem).is_file()}
 
 
 def _summary(file: Path) -> str:
@@ -124,7 +136,7 @@ def _run(command: str, arguments: list[str]) -> None:
     def task(config: "DictConfig") -> Any:
         # torch and Lightning take seconds, and --help needs neither.
         with quick_imports():
-            module = importlib.import_module(f"nerf_lightning.commands.{command}")
+            module = command_module(command)
         # A job of a sweep may be in another process than the command line was read in.
         allow(Budgets(**config.budgets))
         if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -139,11 +151,13 @@ def _run(command: str, arguments: list[str]) -> None:
     with explained(command):
         from nerf_lightning.cli.arguments import options_first
         from nerf_lightning.cli.one_composition import compose_once
+        from nerf_lightning.config.search_path import search_extensions
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
         allow_as_typed(arguments)
         sys.argv = [f"nerf {command}", *options_first(quoted_paths(prepared(command, sweep_arguments(arguments))))]
         compose_once()
+        search_extensions()
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)
         if is_sweep(arguments):
             from nerf_lightning.runs.sweep import watched
@@ -158,7 +172,7 @@ def _require_sections(config: "DictConfig", command: str) -> None:
 
     from nerf_lightning.config.instantiate import require_sections
 
-    require_sections(config, OmegaConf.load(conf_folder() / f"{command}.yaml"))  # type: ignore[arg-type]
+    require_sections(config, OmegaConf.load(conf_file(command)))  # type: ignore[arg-type]
 
 
 @contextmanager

@@ -1,13 +1,12 @@
 """The arguments of a sweep: its folder, a folder per job named by what differs, what it was started with."""
 
-import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.folders import option_names
 
 if TYPE_CHECKING:
     from nerf_lightning.runs.sweep_record import SweepRecord
@@ -118,5 +117,5 @@ def _swept(arguments: list[str]) -> list[str]:
 
 
 def _current_value(key: str) -> str:
-    is_group = os.path.isdir(conf_folder() / key)
+    is_group = bool(option_names(key))
     return f"${{hydra.runtime.choices.{key}}}" if is_group else f"${{{key}}}"

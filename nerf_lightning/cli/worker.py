@@ -4,13 +4,12 @@ The folder holds the config that the first process composed, and Hydra's; the co
 the number of that process.
 """
 
-import importlib
 import json
 import sys
 from pathlib import Path
 
 from nerf_lightning.budgets import Budgets, allow
-from nerf_lightning.cli.main import explained
+from nerf_lightning.cli.main import command_module, explained
 from nerf_lightning.cli.process import quick_end
 
 
@@ -38,7 +37,7 @@ def _run(command: str, folder: Path, launcher: int) -> None:
     hydra = OmegaConf.merge(OmegaConf.structured(HydraConf), OmegaConf.load(folder / "hydra.yaml"))
     HydraConfig.instance().set_config(OmegaConf.create({"hydra": hydra}))
     configure_log(hydra.job_logging)
-    module = importlib.import_module(f"nerf_lightning.commands.{command}")
+    module = command_module(command)
     with joined(choose_device(config.trainer.accelerator)[0]):
         result = module.run(config)
         if ranks.is_first():

@@ -53,7 +53,7 @@ def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
     if scene is not None:
         raise InputError(
             f"{opened.checkpoint.path} knows the scene {opened.checkpoint.scene.name} alone. Leave scene=... out; "
-            "models that look at photographs (model=view_transformer) render other scenes, too."
+            "models that look at photographs render other scenes, too."
         )
     return opened.checkpoint.scene
 

@@ -12,7 +12,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config.instantiate import require_sections
 from nerf_lightning.config.messages import in_words
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.config.search_path import search_extensions
+from nerf_lightning.files.folders import conf_file, conf_folder
 
 
 def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
@@ -51,7 +52,7 @@ def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
     """Return a command's config with Hydra's own."""
     with in_words(command), _hydra():
         config = compose(command, overrides=list(overrides), return_hydra_config=True)
-        primary = OmegaConf.load(conf_folder() / f"{command}.yaml")
+        primary = OmegaConf.load(conf_file(command))
         assert isinstance(primary, DictConfig)
         require_sections(config, primary)
     return config
@@ -67,6 +68,7 @@ def _hydra() -> Iterator[None]:
     """Let Hydra compose from our conf/, and leave another application of it, which may have called us, as it was."""
     former = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
+    search_extensions()
     try:
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
             yield

@@ -170,7 +170,6 @@ ROWS: tuple[tuple[Meaning, str], ...] = (
         """
         ckpt trust what.** labels outputs mosaic format alpha background crop near hold_camera projection
         host port open_browser photographs max_height
-        keep by weights round_to tables drop_empty finetune_steps
         run measured max_megabytes runs scenes models sort published force curves out
         rounds steps warmup_steps target_psnr kernels render_rays scaling
         images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads

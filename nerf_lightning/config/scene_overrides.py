@@ -12,7 +12,7 @@ from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_
 from nerf_lightning.config.overrides import leaves, quoted
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal, listed
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
 
 PLAIN = (bool, int, float, str)
@@ -36,17 +36,17 @@ def scene_overrides(path: str) -> list[str]:
     """
     checkpoint = read_checkpoint(path.strip("'\""))
     name = checkpoint.choices.get("scene", "")
-    known = {file.stem: file for file in (conf_folder() / "scene").glob("*.yaml")}
+    known = option_names("scene")
     if name not in known:
         raise UnknownScene(
             f"{path} was trained on the scene '{name}', which conf/scene/ lacks. Name the scene: "
-            f"add scene=... ({', '.join(sorted(known))})."
+            f"add scene=... ({', '.join(known)})."
         )
     config = plain_yaml(checkpoint.config, f"The config in {path}")
     recorded = config.get("scene") if isinstance(config, dict) else None
     if not isinstance(recorded, dict):
         raise UnknownScene(f"{path} is damaged: its config has no readable scene part. Name the scene with scene=...")
-    ours = _settings_of(known[name])
+    ours = _settings_of(conf_file(f"scene/{name}"))
     values = _taken(leaves(recorded, "scene"), leaves(ours, "scene"), path)
     values |= {key: _found(values[key], checkpoint.path) for key in PLACES if isinstance(values.get(key), str)}
     if ours.get("download") and not os.path.exists(str(values.get("scene.path"))):
@@ -60,7 +60,7 @@ def _settings_of(file: Path) -> dict[str, Any]:
     taken: dict[str, Any] = {}
     for name in content.pop("defaults", []):
         base = name.removeprefix("/").removesuffix("@_here_")
-        taken |= _settings_of(conf_folder() / f"{base}.yaml")
+        taken |= _settings_of(conf_file(base))
     return taken | content
 
 

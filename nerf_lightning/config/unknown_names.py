@@ -3,7 +3,8 @@
 import re
 
 from nerf_lightning.config.overrides import PLAIN
-from nerf_lightning.manual.catalogue import Command, command_named, option_names
+from nerf_lightning.files.folders import option_names
+from nerf_lightning.manual.catalogue import Command, command_named
 from nerf_lightning.manual.suggestions import did_you_mean, near
 
 KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")

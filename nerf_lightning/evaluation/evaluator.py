@@ -20,7 +20,6 @@ from nerf_lightning.evaluation.kept_views import KeptViews, ScoredView
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
-from nerf_lightning.evaluation.nearest_view import baselines
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -48,8 +47,8 @@ class Scoring:
         lpips_net: the backbone, alex or vgg.
         colors: raw compares renders as they are; half_fit gives each the exposure and white balance that suit the left
             half of its photograph, and compares the right halves (the protocol of NeRF in the Wild, arXiv 2008.02268).
-        nearest_views: also measure what so many photographs give without a model, each view shown as the nearest of
-            them and as their blend; null: no.
+        nearest_views: of a model that renders from photographs: also measure what so many of them give without it, each
+            view shown as the nearest of them and as their blend; null: no.
     """
 
     def __init__(
@@ -92,6 +91,11 @@ class Scoring:
         says whose numbers these are (`protocol.measured_of`), and is stamped beside them.
         """
         views = self._views(scene)
+        if self.nearest_views is not None and model.baselines is None:
+            raise InputError(
+                f"evaluation.nearest_views={self.nearest_views} is for models that render from photographs, which this "
+                "one does not. Leave it out."
+            )
         shown_views = evenly_spaced_subset(views, self.num_pictures)
         show_photographs(model, scene)
         rays_of = RayGenerator.of_views(scene, model)
@@ -122,8 +126,8 @@ class Scoring:
             "environment": environment(),
         }
         _warn_of_unseen(rows)
-        if self.nearest_views is not None and ranks.is_first():
-            result["nearest_views"] = baselines(scene, views, background, self.nearest_views)
+        if self.nearest_views is not None and model.baselines is not None and ranks.is_first():
+            result["nearest_views"] = model.baselines(scene, views, background, self.nearest_views)
         if scene.capture_of is not None:
             names = {scene.view_names[view]: scene.captures[scene.capture_of[view]] for view in views}
             result["captures"] = of_captures(rows, names, scene.trained_captures)

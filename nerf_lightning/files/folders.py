@@ -12,6 +12,22 @@ def conf_folder() -> Path:
     return inside if inside.is_dir() else PACKAGE.parent / "conf"
 
 
+def conf_folders() -> list[Path]:
+    """Return every folder of yaml files: the program's own, then each extension's (`extensions/NAME/conf`)."""
+    return [conf_folder(), *sorted((PACKAGE / "extensions").glob("*/conf"))]
+
+
+def conf_file(name: str) -> Path:
+    """Return the yaml file of a name such as `scene/bricks`, the first on the search path; it may not exist."""
+    files = [folder / f"{name}.yaml" for folder in conf_folders()]
+    return next((file for file in files if file.is_file()), files[0])
+
+
+def option_names(group: str) -> list[str]:
+    """Return the names of the yaml files of a group, those of extensions included."""
+    return sorted({file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")})
+
+
 def default_folder(kind: str) -> Path:
     """Return $NERF_LIGHTNING_CACHE/kind, else nerf_lightning/kind in $XDG_CACHE_HOME or ~/.cache."""
     chosen = os.environ.get("NERF_LIGHTNING_CACHE")

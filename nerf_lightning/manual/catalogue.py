@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 
-from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.manual.commented_yaml import CommentedYaml, Entry, brief, read_commented
 from nerf_lightning.manual.settings import Setting, maker_of, settings_in
 
@@ -173,36 +172,30 @@ class Command:
 @cache
 def command_named(name: str) -> Command | None:
     """Return what a command has; None where there is none of the name."""
-    file = conf_folder() / f"{name}.yaml"
+    file = conf_file(name)
     return Command(name, read_commented(file)) if file.is_file() else None
-
-
-def option_names(group: str) -> list[str]:
-    """Return the names of a group's options."""
-    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
 
 
 @cache
 def option(group: str, name: str, place: str) -> Option:
     """Return an option of a group, as it fills a section."""
-    file = read_commented(conf_folder() / group / f"{name}.yaml")
-    entry, chosen = _resolved(file, conf_folder() / group, "" if file.is_global else place)
+    file = read_commented(conf_file(f"{group}/{name}"))
+    entry, chosen = _resolved(file, group, "" if file.is_global else place)
     return Option(group, name, "" if file.is_global else place, file, entry, chosen)
 
 
-def _resolved(file: CommentedYaml, folder: Path, place: str) -> tuple[Entry, dict[str, str]]:
+def _resolved(file: CommentedYaml, group: str, place: str) -> tuple[Entry, dict[str, str]]:
     """Return a yaml's settings over those of the options that it is based on, and what all of them choose."""
     entry, chosen = Entry(), {}
     for typed, name in file.defaults:
         typed = typed.removeprefix("override ")
-        base = conf_folder() / f"{typed.removeprefix('/')}.yaml" if typed.startswith("/") else folder / f"{typed}.yaml"
-        base = base.with_name(base.name.replace("@_here_", ""))
+        base = conf_file((typed[1:] if typed.startswith("/") else f"{group}/{typed}").removesuffix("@_here_"))
         if name is not None:
-            group, _, below = typed.removeprefix("/").partition("@")
+            name_of_group, _, below = typed.removeprefix("/").partition("@")
             where = ".".join(filter(None, (place, below))) if below else ""
-            chosen[f"{group}@{where}" if where else group] = name
+            chosen[f"{name_of_group}@{where}" if where else name_of_group] = name
         elif base.is_file():
-            theirs, also = _resolved(read_commented(base), folder, place)
+            theirs, also = _resolved(read_commented(base), group, place)
             entry, chosen = theirs.over(entry), chosen | also
     return file.root.over(entry), chosen
 

@@ -84,7 +84,7 @@ class TrainedModel:
     def of_scene(self, scene: Scene) -> "TrainedModel":
         """Return the same network for another scene, which it renders from the photographs of that scene from now on.
 
-        For models that look at photographs (model=view_transformer), which have to be shown some before they render; of
+        For models that look at photographs, which have to be shown some before they render; of
         several captures that were joined, the first that was never trained on is taken.
 
         Raises:

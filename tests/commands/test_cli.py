@@ -4,10 +4,10 @@ import sys
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
+from support.configs import yaml_files
 
 from nerf_lightning.cli import main as cli
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.files.folders import conf_folder
 
 
 def test_help_lists_every_command_with_its_line(nerf):
@@ -47,7 +47,7 @@ def test_the_settings_that_readers_share_are_no_scene_and_no_command(nerf):
 
 def test_no_config_sets_the_mode_that_hydra_composes_twice_to_find():
     """cli/one_composition.py counts on it."""
-    configs = [OmegaConf.load(file) for file in conf_folder().rglob("*.yaml")]
+    configs = [OmegaConf.load(file) for file in yaml_files()]
     assert len(configs) > 50
     assert not [config for config in configs if OmegaConf.select(config, "hydra.mode") or config.get("hydra/mode")]
 

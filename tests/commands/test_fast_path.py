@@ -11,15 +11,9 @@ QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.cr
 STEPS = 70
 
 
-def with_hybrid(arguments):
-    """The same with a hybrid encoder that sees cones."""
-    chosen = ["encoder=hybrid", "encoder.cones=true", "encoder.width=16", "encoder.fine.min_resolution=8"]
-    return [*(each.replace("encoder.", "encoder.fine.") for each in arguments), *chosen]
-
-
-def arguments(capture, folder, *extra, quiet=QUIET):
+def arguments(capture, folder, *extra):
     return (
-        "train", "scene=npz", f"scene.path={capture}", *quiet, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
+        "train", "scene=npz", f"scene.path={capture}", *QUIET, f"trainer.max_steps={STEPS}", "trainer.num_threads=1",
         "final.evaluate=false", "final.video=false", "resume=auto", "callbacks.checkpoints.every_steps=5",
         "callbacks.validation_pictures.every_steps=1000", f"paths.output_dir={folder}", *extra,
     )  # fmt: skip
@@ -49,22 +43,21 @@ def flat(value, path=""):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize("quiet", [QUIET, pytest.param(with_hybrid(QUIET), marks=pytest.mark.exhaustive, id="hybrid")])
-def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads, quiet):
+def test_a_fast_run_that_is_killed_and_stopped_ends_with_the_same_bits(capture, tmp_path, threads):
     """Weights, moments, occupancy grid, rays per step and per pixel: all of it."""
     # Several rays a pixel from step 21 on: between the two places at which it is stopped.
     shared = (f"trainer.num_threads={threads}", "model.subpixels=2", "model.subpixels_from=0.3")
-    code, output = finished(start(*arguments(capture, tmp_path / "whole", *shared, quiet=quiet)))
+    code, output = finished(start(*arguments(capture, tmp_path / "whole", *shared)))
     assert code == 0, output
     folder = tmp_path / "stopped"
     for how, after in ((signal.SIGKILL, 10), (signal.SIGTERM, 25)):
-        process = start(*arguments(capture, folder, *shared, quiet=quiet))
+        process = start(*arguments(capture, folder, *shared))
         while process.poll() is None and saved(folder)["global_step"] < after:
             time.sleep(0.02)
         process.send_signal(how)
         code, output = finished(process)
         assert code in (-how, 128 + how), output
-    code, output = finished(start(*arguments(capture, folder, *shared, quiet=quiet)))
+    code, output = finished(start(*arguments(capture, folder, *shared)))
     assert code == 0, output
     assert "going on from step" in output
     ours, theirs = saved(folder), saved(tmp_path / "whole")
@@ -119,12 +112,10 @@ def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overri
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("model", ["fast_small", "fast_proposal", "fast_proposal encoder=hybrid"])
+@pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
 def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp_path, model):
     """The order of the levels is part of what it keeps."""
-    model, hybrid, _ = model.partition(" encoder=hybrid")
     small = [x for x in FAST_PATH if not x.startswith(("model", "data.sample_budget"))]
-    small = with_hybrid(small) if hybrid else small
     result = nerf(
         "train", "scene=npz", f"scene.path={capture}", *[x for x in QUIET if x not in FAST_PATH], *small,
         f"model={model}", "trainer.max_steps=2", "final.evaluate=false", "final.video=false",

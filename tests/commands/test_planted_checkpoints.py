@@ -272,7 +272,7 @@ def test_of_a_recorded_scene_settings_that_nobody_decided_about_are_not_taken(tm
     """Whether the yaml of this name has them, or not."""
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nunheard_of: null\n")
-    monkeypatch.setattr("nerf_lightning.config.scene_overrides.conf_folder", lambda: tmp_path)
+    monkeypatch.setattr("nerf_lightning.files.folders.conf_folder", lambda: tmp_path)
     scene = {"root": "data", "unheard_of": "/tmp/evil", "not\x1b[2J in_it": 1, "allow_outside": True}
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
     assert scene_of(file) == ["scene=mine", "scene.root='data'"]

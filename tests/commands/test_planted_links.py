@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from support.planted import write_checkpoint
 from support.running import said
 
@@ -35,7 +34,6 @@ def content(folder):
         ("export", "what=cameras"),
         ("export", "what=images", "what.max_views=1"),
         ("eval", "evaluation.max_views=1", "evaluation.num_pictures=1"),
-        ("prune",),
     ],
     ids=" ".join,
 )
@@ -74,17 +72,3 @@ def test_the_named_folder_itself_may_be_a_link(nerf, tmp_path):
     checkpoint = write_checkpoint(tmp_path / "a.ckpt")
     assert nerf("export", f"ckpt={checkpoint}", "what=cameras", f"paths.output_dir={tmp_path}/out").code == 0
     assert (tmp_path / "disk" / "sparse" / "0" / "cameras.txt").is_file()
-
-
-def test_pruning_writes_over_its_own_file_alone(nerf, tmp_path):
-    checkpoint, out = write_checkpoint(tmp_path / "a.ckpt"), tmp_path / "out"
-    given = ("prune", f"ckpt={checkpoint}", f"paths.output_dir={out}")
-    assert nerf(*given).code == 0
-    assert nerf(*given, "by=random").code == 0
-    target = out / "checkpoints" / "last.ckpt"
-    foreign = torch.load(target, weights_only=True) | {"optimizer_states": [{"state": {}, "param_groups": [{}]}]}
-    for theirs in (lambda: target.write_text("precious"), lambda: torch.save(foreign, target)):
-        theirs()
-        before = content(out)
-        said(nerf(*given), f"{target} was not written by nerf prune", "paths.output_dir=DIR")
-        assert content(out) == before

@@ -10,16 +10,16 @@ import sys
 import nerf_lightning.data.bricks.reader as module
 from nerf_lightning.data.bricks import cache
 
-count, plain = 0, cache._make_and_save
+count, plain = 0, cache._save
 
 
-def counted(path, make):
+def counted(path, rendered):
     global count
     count += 1
-    return plain(path, make)
+    return plain(path, rendered)
 
 
-cache._make_and_save = counted
+cache._save = counted
 reader = module.BricksReader(resolution=8, num_train=2, num_val=1, num_test=1, cache_dir=sys.argv[1])
 print("ready", flush=True)
 sys.stdin.read()

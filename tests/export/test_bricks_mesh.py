@@ -10,8 +10,8 @@ POINTS = 100_000
 
 
 def test_points_of_the_exact_surface_are_on_it_and_reach_all_of_it():
+    from nerf_lightning.data.bricks.parts import fire_engine
     from nerf_lightning.data.bricks.solids import Solids
-    from nerf_lightning.data.bricks.vehicle import fire_engine
 
     points = exact_surface(5_000)
     room = Solids.of(fire_engine()).room(points.T, 1.0)

@@ -4,12 +4,12 @@ import inspect
 
 import pytest
 from hydra.utils import get_object
-from support.configs import composed
+from support.configs import composed, groups, yaml_files
 
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.overrides import flatten
-from nerf_lightning.files.folders import conf_folder
-from nerf_lightning.manual.catalogue import command_named, option_names
+from nerf_lightning.files.folders import conf_file, option_names
+from nerf_lightning.manual.catalogue import command_named
 from nerf_lightning.manual.commented_yaml import read_commented
 from nerf_lightning.manual.constructors import constructor
 from nerf_lightning.manual.pages import command_page, page_of, said
@@ -69,7 +69,7 @@ def test_what_an_option_sets_of_other_groups_is_there(command):
             } <= known | WIRING | OF_LIGHTNING, f"{group.typed}={option.name}"
 
 
-@pytest.mark.parametrize("group", [folder.name for folder in conf_folder().iterdir() if folder.is_dir()])
+@pytest.mark.parametrize("group", groups())
 def test_every_option_has_a_line_of_its_own(group):
     asked = [found for name in COMMANDS for each in (command_named(name),) for found in (*each.groups, *each.brought)]
     groups = [each for each in asked if each.name == group] or [None]
@@ -86,7 +86,7 @@ def test_a_command_lists_the_groups_that_it_has_and_no_others(command):
         for line in page.partition("Groups and their options:\n")[2].partition("\n\n")[0].splitlines()
         if line[2:3].strip()
     }
-    chosen = {name.partition("@")[0] for name, _ in read_commented(conf_folder() / f"{command}.yaml").defaults}
+    chosen = {name.partition("@")[0] for name, _ in read_commented(conf_file(command)).defaults}
     assert {name.partition("@")[0] for name in listed} == {name for name in chosen if len(option_names(name)) > 1}
 
 
@@ -111,7 +111,7 @@ def test_every_setting_and_every_option_has_a_page(command):
 
 def targets():
     """Return what yamls of ours build, by its dotted name."""
-    files = [read_commented(file).root for file in conf_folder().rglob("*.yaml")]
+    files = [read_commented(file).root for file in yaml_files()]
     found = set()
     while files:
         entry = files.pop()

@@ -27,7 +27,6 @@ import nerf_lightning
 from nerf_lightning.evaluation import camera_fit
 from nerf_lightning.evaluation.lpips import LPIPS
 from nerf_lightning.evaluation.metrics import RayErrors
-from nerf_lightning.evaluation.nearest_view import NearestViews
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.contraction import Contracted
@@ -182,7 +181,6 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.geometry.cones.pixel_side": {"view": torch.ones(RAYS, dtype=torch.int64)},
     "nerf.geometry.cones.scaled_covariance": {"scale": torch.tensor([0.31, 1.7, 2.3])},
     "nerf.rendering.near_gradients.soften_near_gradients": {"distance": torch.rand(40, 8)},
-    "evaluation.nearest_view.baselines": {"views": [0, 3], "background": "white", "count": 2},
     "evaluation.camera_fit.fitted_camera": {"model": tiny_model().eval(), "background": "white"},
     "evaluation.color_fit.exposure_fitted": {"opacity": torch.ones(48, 48), "background": torch.ones(1, 3)},
     "nerf.rendering.blending.in_other_light": {"change": torch.square, "foreground": torch.rand(40, 3)},
@@ -287,7 +285,6 @@ def instances(tmp_path_factory) -> list[Any]:
     grid.allocate(8, 1)
     crop = CropBox.from_user((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8), known()["to_user"])
     others = [grid, crop, Clip(3.1, crop), Contracted(), RayErrors(), LPIPS(), known()["around"]]
-    others.append(NearestViews(known()["scene"], "white", 2))
     encoders = [instantiate(composed("train", f"encoder={option}").encoder) for option in options("encoder")]
     passed = [
         Keyframe(place, look_at=(0.1, 0.2, 0.1)) for place in ((2.0, 0.3, 0.4), (0.2, 2.1, 0.5), (-1.9, 0.1, 0.6))

@@ -10,11 +10,23 @@ import numpy as np
 import torch
 
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
-from nerf_lightning.data.bricks.parts import ALONG_Z, BLACK, GREY, RED, SILVER, WHITE, YELLOW, Part, ball, block, rod
+from nerf_lightning.data.bricks.parts import (
+    ALONG_Z,
+    BLACK,
+    GREY,
+    RED,
+    SILVER,
+    WHITE,
+    YELLOW,
+    Part,
+    ball,
+    block,
+    fire_engine,
+    rod,
+)
 from nerf_lightning.data.bricks.reader import FIELD_OF_VIEW
 from nerf_lightning.data.bricks.shapes import BOX
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
-from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.data.pixels.store import layout
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras

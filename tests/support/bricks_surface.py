@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from nerf_lightning.data.bricks.parts import fire_engine
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
-from nerf_lightning.data.bricks.vehicle import fire_engine
 
 # Lines that come from so far above the horizon, as the photographs do (sine of the elevation).
 LOWEST = 0.05

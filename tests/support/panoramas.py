@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from nerf_lightning.data.bricks.parts import fire_engine
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
-from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.nerf.geometry.poses import look_at
 
 

@@ -15,7 +15,8 @@ from hydra.core.default_element import InputDefault, ResultDefault
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig
 
-CONF = f"file://{Path(__file__).parents[2] / 'conf'}"
+ROOT = Path(__file__).parents[2]
+CONF = {f"file://{folder}" for folder in (ROOT / "conf", *ROOT.glob("nerf_lightning/extensions/*/conf"))}
 
 merged = ConfigLoaderImpl._compose_config_from_defaults_list
 loaded = ConfigRepository.load_config
@@ -96,5 +97,5 @@ def map_if_needed(overrides: Overrides, defaults: list[InputDefault], self_added
 
 
 def _stays(source: ConfigSource) -> bool:
-    """Whether what it offers is the same in all tests: Hydra's own, and our conf/."""
-    return source.scheme() != "file" or f"{source.scheme()}://{source.path}" == CONF
+    """Whether what it offers is the same in all tests: Hydra's own, our conf/ and extensions'."""
+    return source.scheme() != "file" or f"{source.scheme()}://{source.path}" in CONF

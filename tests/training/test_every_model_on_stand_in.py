@@ -17,7 +17,6 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.models.view_transformer.model import ViewTransformer
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 WARM, STEPS = 2, 7  # the optimizer's state comes to be while a run gets warm, and numbers that are kept on the device
@@ -75,7 +74,7 @@ def named_waits(model):
     """Return how often functions may wait in the steps after the first."""
     parts = {type(part) for part in model.modules()}
     of_grids = CELLS if parts & {PackedLevel, MaskedLevel} else {}
-    return of_grids | (TALLY if PackedLevel in parts else {}) | (SOURCES if ViewTransformer in parts else {})
+    return of_grids | (TALLY if PackedLevel in parts else {}) | (SOURCES if model.needs_photographs else {})
 
 
 def step_and_render(there, run, waits):

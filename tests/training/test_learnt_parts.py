@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 from support.learnt_cameras import LearntShifts
-from support.looking import looking_model
 from support.scenes import ball_scene, tiny_model
 from support.steps import make_step
 
@@ -114,10 +113,12 @@ def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_
 
 
 def test_a_part_of_a_model_may_learn_at_its_own_rate():
-    step = make_step(None, looking_model(image_rate=0.5))
+    step = make_step(None, tiny_model())
+    field = step.model.last.field
+    field.learning_rate = 0.5
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
-    others, image = step.new_optimizer().param_groups
-    own = {id(each) for each in step.model.image_network.parameters()}
-    assert (image["lr"], others["lr"]) == (0.5, 1e-3)
-    assert {id(each) for each in image["params"]} == own
+    others, quick = step.new_optimizer().param_groups
+    own = {id(each) for each in field.parameters()}
+    assert (quick["lr"], others["lr"]) == (0.5, 1e-3)
+    assert {id(each) for each in quick["params"]} == own
     assert len(others["params"]) + len(own) == len(list(step.model.parameters()))

@@ -9,23 +9,13 @@ from support.static_models import fast_model
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
-from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.encoders.hybrid import HybridEncoder
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 
-
-def hybrid_model():
-    grid = HashGridEncoder(num_levels=2, features_per_level=2, log2_table_size=10)
-    return fast_model(PackedLevel, HybridEncoder(FrequencyEncoder(3), grid, width=16, cones=True))
-
-
 MODELS = {
     "nerf": lambda: tiny_model(density_bias=0.5),
     "fast": lambda: fast_model(PackedLevel),
-    "hybrid": hybrid_model,
 }
 
 

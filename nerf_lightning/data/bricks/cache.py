@@ -38,15 +38,10 @@ def cache_file(folder: Path, settings: dict[str, int]) -> Path:
 
 
 def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
-    """Return what `path` holds, or make it and keep it there.
+    """Return what `path` holds, a sound file of so many pixels, or make it and keep it there.
 
     Of several processes that ask at once, one makes and the others wait. A damaged file is made again. A folder that
     cannot be written costs a warning and the time to make it every run, never the run.
-
-    Args:
-        path: the file.
-        pixels: how many pixels a sound file has.
-        make: renders the scene.
     """
     try:
         make_own_folder(path.parent)
@@ -56,7 +51,7 @@ def cached(path: Path, pixels: int, make: Callable[[], Rendered]) -> Rendered:
         logger.warning("Cannot keep the bricks scene in %s (%s); it is rendered anew.", path.parent, error)
         return make()
     try:
-        return _load(path, pixels) or _make_and_save(path, make)
+        return _load(path, pixels) or _save(path, make())
     finally:
         lock.release()
 
@@ -65,16 +60,12 @@ def _load(path: Path, pixels: int) -> Rendered | None:
     """Return a sound file's content, or None."""
     if not path.exists():
         return None
-    sound: dict[str, tuple[tuple[int, ...], str]] = {
-        "rgba": ((pixels, 4), "uint8"),
-        "depth": ((pixels,), "float32"),
-        "normals": ((pixels, 3), "float32"),
-    }
+    sound = {"rgba": ((pixels, 4), "uint8"), "depth": ((pixels,), "float32"), "normals": ((pixels, 3), "float32")}
     try:
         with open_own(path, None) as file, zipfile.ZipFile(file) as archive:
             headers = archive_headers(archive, list(sound))
-            for name, (shape, dtype) in sound.items():
-                if headers[name].shape != shape or headers[name].dtype != dtype:
+            for name, expected in sound.items():
+                if (headers[name].shape, headers[name].dtype) != expected:
                     raise ValueError(f"{name} is {headers[name].shape} of {headers[name].dtype}")
             return Rendered(**{name: read_member(archive, name) for name in sound})
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zlib.error, zipfile.BadZipFile, InputError) as error:
@@ -82,19 +73,17 @@ def _load(path: Path, pixels: int) -> Rendered | None:
         return None
 
 
-def _make_and_save(path: Path, make: Callable[[], Rendered]) -> Rendered:
-    rendered = make()
+def _save(path: Path, rendered: Rendered) -> Rendered:
+    # A reader must never see half a file: write beside it, then swap names.
+    part = path.with_suffix(".part")
     try:
-        # A reader must never see half a file: write beside it, then swap names.
-        part = path.with_suffix(".part")
-        try:
-            # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
-            part.unlink(missing_ok=True)
-            with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as stream:
-                np.savez(stream, **vars(rendered))
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        # Under the lock, what lies there was left by a process that was killed, or is somebody's link to elsewhere.
+        part.unlink(missing_ok=True)
+        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as stream:
+            np.savez(stream, **vars(rendered))
+        os.replace(part, path)
     except OSError as error:
         logger.warning("Cannot keep the bricks scene in %s (%s).", path.parent, error)
+    finally:
+        part.unlink(missing_ok=True)
     return rendered

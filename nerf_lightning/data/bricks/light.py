@@ -1,32 +1,41 @@
-"""What of the light reaches a point: shadows of the key light, and the openness of the surroundings.
+"""From light to colour: shadows of the key light, the openness of the surroundings, and what a surface makes of them.
 
-Both are exact whatever the culling: points are sorted into cells, and a cell asks only the parts that can matter.
+Shadows and openness are exact whatever the culling: points are sorted into cells, and a cell asks only the parts that
+can matter.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from nerf_lightning.data.bricks.parts import Triple
+from nerf_lightning.data.bricks.parts import Part, Triple
 from nerf_lightning.data.bricks.solids import Solids
 
 
 @dataclass(frozen=True)
 class Light:
-    """What shines on a model. Colours are linear."""
+    """What shines on a model: a key light, a fill light that casts no shadow, and the surroundings.
+
+    `key` is the unit vector towards the key light; an upward surface receives `sky_light`, a downward one
+    `ground_light`. Colours are linear.
+    """
 
     key: Float[ndarray, "3"]
-    """Towards the middle of the key light, in world axes; unit length."""
     key_color: Triple
     fill_color: Triple
-    """Of the fill light, which casts no shadow."""
     sky_light: Triple
-    """What an upward surface receives from the surroundings."""
     ground_light: Triple
-    """What a downward surface receives."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is rendered, in world units."""
+
+    parts: Sequence[Part]
+    light: Light
 
 
 DAY = Light(
@@ -45,22 +54,26 @@ PROBES = (0.025, 0.05, 0.1, 0.18)
 LIFT = 1e-3
 """Shadow rays start this far above the surface."""
 SHADOW_CELL, PROBE_CELL = 0.12, 0.24
+FILL = np.array([-0.60, 0.66, 0.45]) / np.linalg.norm([-0.60, 0.66, 0.45])
+"""Towards the fill light, which casts no shadow."""
+ZENITH, HORIZON, GROUND = (0.34, 0.52, 0.92), (1.00, 1.00, 1.00), (0.26, 0.22, 0.20)
+"""Linear colours of what surrounds the model, as surfaces mirror it."""
 
 
-def key_axes(light: Light) -> Float[ndarray, "3 3"]:
+def _key_axes(light: Light) -> Float[ndarray, "3 3"]:
     """Return rows across, across and towards the key light."""
     across = np.cross([0.0, 0.0, 1.0], light.key)
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(light.key, across), light.key])
 
 
-def key_directions(light: Light) -> Float[ndarray, "3 directions"]:
+def _key_directions(axes: Float[ndarray, "3 3"]) -> Float[ndarray, "3 directions"]:
     """Return unit directions spread evenly over the light's disc (a spiral of equal areas)."""
     index = np.arange(SIDES**2)
     radius = SPREAD * np.sqrt((index + 0.5) / SIDES**2)
     angle = index * np.pi * (3 - np.sqrt(5))
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(SIDES**2)])
-    return key_axes(light).T @ (local / np.linalg.norm(local, axis=0))
+    return axes.T @ (local / np.linalg.norm(local, axis=0))
 
 
 def key_visible(
@@ -71,11 +84,11 @@ def key_visible(
     light: Light = DAY,
 ) -> Float[ndarray, "points"]:
     """Return 1 where the key light's direction number `rays` is free, 0 where it is blocked or behind."""
-    directions = key_directions(light).astype(points.dtype)[:, rays]
+    axes = _key_axes(light)
+    directions = _key_directions(axes).astype(points.dtype)[:, rays]
     starts = points + points.dtype.type(LIFT) * normals
     visible = np.zeros_like(points[0])
     facing = np.flatnonzero(np.sum(directions * normals, axis=0) > 0)
-    axes = key_axes(light)
     spans = solids.corners() @ axes.T
     low, high = spans.min(axis=1), spans.max(axis=1)
     seen = axes.astype(points.dtype) @ starts[:, facing]
@@ -126,3 +139,80 @@ def cells(places: Float[ndarray, "axes points"], width: float) -> Iterator[Int[n
     flat = flat.astype(np.min_scalar_type(int(np.prod(shape))))
     order = np.argsort(flat, kind="stable")
     yield from np.split(order, np.flatnonzero(flat[order][1:] != flat[order][:-1]) + 1)
+
+
+def palette(parts: Sequence[Part], dtype: type[np.floating]) -> Float[ndarray, "6 parts"]:
+    """Return the parts' materials: linear red, green and blue, then specular, sharpness and mirror."""
+    made = [part.material for part in parts]
+    shine = np.array([(m.specular, m.sharpness, m.mirror) for m in made]).T
+    return np.concatenate([decode_srgb(np.array([m.color for m in made]).T), shine]).astype(dtype)
+
+
+def shade(
+    materials: Float[ndarray, "6 parts"],
+    light: Light,
+    part: Int[ndarray, "hits"],
+    normals: Float[ndarray, "3 hits"],
+    directions: Float[ndarray, "3 hits"],
+    lit: Float[ndarray, "hits"],
+    openness: Float[ndarray, "hits"],
+) -> Float[ndarray, "3 hits"]:
+    """Return the sRGB-encoded colour of each hit.
+
+    Lambert plus a Blinn-Phong highlight of the key light (the half vector's cosine to the power of 2^sharpness),
+    plus the mirrored surroundings with Schlick's Fresnel term: both change with the view.
+
+    Args:
+        materials: what `palette` returns.
+        light: what shines on the model.
+        part: which part was hit.
+        normals: outward, unit length.
+        directions: of the rays that came, unit length.
+        lit: share of the key light that arrives.
+        openness: share of the surroundings that is not hidden by nearby parts.
+    """
+    dtype, (red, green, blue, specular, sharpness, mirror) = normals.dtype, materials[:, part]
+    key = _column(light.key, dtype)
+    lambert = np.maximum(np.sum(normals * key, axis=0), 0) * lit
+    fill = np.maximum(np.sum(normals * _column(FILL, dtype), axis=0), 0) * (0.4 + 0.6 * openness)
+    ambient = _mix(light.ground_light, light.sky_light, 0.5 + 0.5 * normals[2]) * openness
+    received = ambient + _column(light.key_color, dtype) * lambert + _column(light.fill_color, dtype) * fill
+    cosine = np.clip(-np.sum(normals * directions, axis=0), 0, 1)
+    fresnel = mirror + (1 - mirror) * (1 - cosine) ** 5 * dtype.type(0.5)
+    mirrored = _surroundings(directions + 2 * cosine * normals) * (0.25 + 0.75 * openness)
+    half = key - directions
+    half /= np.sqrt(np.sum(half**2, axis=0))
+    highlight = np.maximum(np.sum(half * normals, axis=0), 0)
+    for power in range(int(materials[4].max())):
+        highlight = np.where(power < sharpness, highlight * highlight, highlight)
+    shine = specular * lit * highlight
+    linear = (1 - fresnel) * np.stack([red, green, blue]) * received + fresnel * mirrored
+    return encode_srgb(linear + shine)
+
+
+def _surroundings(directions: Float[ndarray, "3 rays"]) -> Float[ndarray, "3 rays"]:
+    """Return the linear colour of the sky, of the ground, and of the soft step between them."""
+    height = directions[2]
+    sky = _mix(HORIZON, ZENITH, np.clip(height, 0, 1) ** 0.5)
+    rise = np.clip((height + 0.12) / 0.16, 0, 1)
+    rise = rise * rise * (3 - 2 * rise)
+    return _column(GROUND, directions.dtype) * (1 - rise) + sky * rise
+
+
+def encode_srgb(linear: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
+    """Return the sRGB code of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
+    light = np.clip(linear, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(code: Float[ndarray, "..."]) -> Float[ndarray, "..."]:
+    """Return the linear light of an sRGB code in [0, 1]."""
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def _mix(low: Triple, high: Triple, share: Float[ndarray, "rays"]) -> Float[ndarray, "3 rays"]:
+    return _column(low, share.dtype) * (1 - share) + _column(high, share.dtype) * share
+
+
+def _column(values: Sequence[float] | Float[ndarray, "3"], dtype: np.dtype) -> Float[ndarray, "3 1"]:
+    return np.array(values, dtype)[:, None]

@@ -1,6 +1,10 @@
-"""The parts of a model: a solid, where it stands, and its material. Lengths are in studs until `scaled`."""
+"""The parts of a model: a solid, where it stands, and its material; and those of the fire engine.
+
+Lengths are in studs until `scaled`.
+"""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -8,15 +12,13 @@ from numpy import ndarray
 
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE, Solid
 
-STUD_RADIUS = 0.3
-STUD_HEIGHT = 0.22
-
 Triple = tuple[float, float, float]
 
 ALONG_X = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Frame whose z axis is the world's x; the columns are the frame's axes."""
 ALONG_Y = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 ALONG_Z = np.eye(3)
+AXES = {"x": ALONG_X, "y": ALONG_Y, "z": ALONG_Z}
 
 
 @dataclass(frozen=True)
@@ -25,23 +27,20 @@ class Material:
 
     color: Triple
     specular: float = 0.25
-    """Strength of the highlight of the key light."""
+    """Strength of the highlight of the key light, whose exponent is two to the power of `sharpness`."""
     sharpness: int = 5
-    """The highlight's exponent is two to this power."""
     mirror: float = 0.03
     """Share of the surroundings that is mirrored at normal incidence; the rest is diffuse."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One convex solid in the world."""
+    """One convex solid in the world: its own numbers (see `shapes`), its middle, and its rotation to the world."""
 
     solid: Solid
     size: tuple[float, ...]
-    """The solid's own numbers, see `shapes`."""
     center: Triple
     frame: Float[ndarray, "3 3"]
-    """Rotation from the solid's frame to the world."""
     material: Material
 
     def scaled(self, scale: float, shift: Triple) -> "Part":
@@ -77,19 +76,10 @@ def ball(center: Triple, radius: float, material: Material) -> Part:
     return Part(BALL, (radius,), center, ALONG_Z, material)
 
 
-def studs(xs: list[float], ys: list[float], z: float, material: Material) -> list[Part]:
-    """Return a grid of studs that stand on the height `z`."""
-    return [rod((x, y, z + 0.5 * STUD_HEIGHT), STUD_RADIUS, STUD_HEIGHT, ALONG_Z, material) for x in xs for y in ys]
-
-
 def _between(low: Triple, high: Triple) -> tuple[Triple, Triple]:
-    a, b = np.array(low), np.array(high)
-    half, middle = 0.5 * (b - a), 0.5 * (a + b)
-    return (float(half[0]), float(half[1]), float(half[2])), (
-        float(middle[0]),
-        float(middle[1]),
-        float(middle[2]),
-    )
+    half = tuple(0.5 * (b - a) for a, b in zip(low, high, strict=True))
+    middle = tuple(0.5 * (a + b) for a, b in zip(low, high, strict=True))
+    return half, middle  # type: ignore[return-value]
 
 
 RED = Material((0.86, 0.10, 0.08))
@@ -104,3 +94,32 @@ SILVER = Material((0.78, 0.80, 0.82), specular=0.4, mirror=0.08)
 LAMP = Material((1.0, 0.93, 0.70), specular=0.6, sharpness=6, mirror=0.08)
 GLASS = Material((0.10, 0.20, 0.32), specular=1.0, sharpness=7, mirror=0.22)
 CHROME = Material((0.86, 0.88, 0.92), specular=1.5, sharpness=6, mirror=0.75)
+
+SCALE = 0.185
+"""World units per stud: the model is about as large as the scenes of the Blender set."""
+MIDDLE = (0.0, 0.0, -4.0)
+"""Brings the middle of the model to the origin, in studs."""
+RISE = np.radians(6.0)
+"""How far the ladder is raised."""
+LADDER = np.array([[np.cos(RISE), 0, -np.sin(RISE)], [0, 1, 0], [np.sin(RISE), 0, np.cos(RISE)]])
+"""Axes along the ladder, across it, and up from it."""
+
+
+def fire_engine() -> list[Part]:
+    """Return all parts in world units, each within [-1.2, 1.2]^3."""
+    lines = Path(__file__).with_name("fire_engine.txt").read_text(encoding="utf-8").splitlines()
+    return [_part(*line.split()).scaled(SCALE, MIDDLE) for line in lines if not line.startswith("#")]
+
+
+def _part(kind: str, color: str, *words: str) -> Part:
+    material: Material = globals()[color.upper()]
+    a, b, c, *more = (float(word) for word in words if word not in AXES)
+    if kind == "block":
+        return block((a, b, c), (more[0], more[1], more[2]), material)
+    if kind == "slope":
+        return slope((a, b, c), (more[0], more[1], more[2]), (more[3], more[4]), (more[5], more[6]), material)
+    if kind == "rod":
+        return rod((a, b, c), more[0], more[1], AXES[words[-1]], material)
+    if kind == "ball":
+        return ball((a, b, c), more[0], material)
+    return Part(BOX, tuple(more), (a, b, c), LADDER, material)

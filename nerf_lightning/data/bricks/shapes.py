@@ -1,7 +1,8 @@
 """Closed forms of convex solids centred at the origin of their own frame: ray intervals, distances and normals.
 
 A ray is inside a convex solid between two distances, so every solid here is an intersection of intervals. All
-functions broadcast: axis 0 of `origin`, `direction` and `point` is x, y, z; axis 0 of `size` is the solid's numbers.
+functions broadcast: axis 0 of `origin`, `direction` (of unit length) and `point` is x, y, z; axis 0 of `size` is the
+solid's numbers.
 
 | solid    | size                                                                        |
 |----------|-----------------------------------------------------------------------------|
@@ -44,34 +45,26 @@ def _nonzero(values: Numbers) -> Numbers:
     return np.where(np.abs(values) < TINY, values.dtype.type(TINY), values)
 
 
-def slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interval:
+def _slab_interval(origin: Numbers, direction: Numbers, half: Numbers) -> Interval:
     """Return between which distances a line is within `half` of 0 along one axis (Kay and Kajiya, SIGGRAPH 1986).
 
-    Distances are in lengths of `direction`. Where the line runs along the slab, they are huge: both of one sign outside
-    of it, of two signs inside.
+    Where the line runs along the slab, they are huge: both of one sign outside of it, of two signs inside.
     """
     inverse = 1 / _nonzero(direction)
     middle, reach = -origin * inverse, half * np.abs(inverse)
     return middle - reach, middle + reach
 
 
-def box_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
-    """Return entry and exit of a box.
-
-    >>> start, along = np.array([[-4.0], [0], [0]]), np.array([[1.0], [0], [0]])
-    >>> [t.tolist() for t in box_interval(start, along, np.array([[1.0], [2], [3]]))]
-    [[3.0], [5.0]]
-    """
-    entry, exit = slab_interval(origin[0], direction[0], size[0])
+def _box_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    entry, exit = _slab_interval(origin[0], direction[0], size[0])
     for axis in (1, 2):
-        low, high = slab_interval(origin[axis], direction[axis], size[axis])
+        low, high = _slab_interval(origin[axis], direction[axis], size[axis])
         entry, exit = np.maximum(entry, low), np.minimum(exit, high)
     return entry, exit
 
 
-def wedge_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
-    """Return entry and exit of a box cut by a plane."""
-    entry, exit = box_interval(origin, direction, size)
+def _wedge_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    entry, exit = _box_interval(origin, direction, size)
     along, cut_x, cut_z = size[5], size[3], size[4]
     slope = _nonzero(cut_x * direction[0] + cut_z * direction[2])
     plane = (along - cut_x * origin[0] - cut_z * origin[2]) / slope
@@ -79,28 +72,18 @@ def wedge_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval
     return np.where(inwards, np.maximum(entry, plane), entry), np.where(inwards, exit, np.minimum(exit, plane))
 
 
-def _disc_interval(origin: Vectors, direction: Vectors, radius: Numbers) -> Interval:
-    """Return where a line is within the infinite cylinder around z.
-
-    The discriminant is written as (a r^2 - (o x d)^2): b^2 - a c loses its digits for a small cylinder far away.
-    """
+def _cylinder_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
+    # The discriminant is written as (a r^2 - (o x d)^2): b^2 - a c loses its digits for a small cylinder far away.
     square = np.maximum(direction[0] ** 2 + direction[1] ** 2, TINY)
     closest = -(origin[0] * direction[0] + origin[1] * direction[1]) / square
     moment = origin[0] * direction[1] - origin[1] * direction[0]
-    under = square * radius**2 - moment**2
+    under = square * size[0] ** 2 - moment**2
     half = np.sqrt(np.maximum(under, 0)) / square
-    return np.where(under > 0, closest - half, np.inf), closest + half
+    low, high = _slab_interval(origin[2], direction[2], size[1])
+    return np.maximum(np.where(under > 0, closest - half, np.inf), low), np.minimum(closest + half, high)
 
 
-def cylinder_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
-    """Return entry and exit of a capped cylinder."""
-    entry, exit = _disc_interval(origin, direction, size[0])
-    low, high = slab_interval(origin[2], direction[2], size[1])
-    return np.maximum(entry, low), np.minimum(exit, high)
-
-
-def ball_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
-    """Return entry and exit of a ball; the direction has unit length."""
+def _ball_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
     closest = -(origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2])
     miss = sum((origin[i] + closest * direction[i]) ** 2 for i in range(3))
     under = size[0] ** 2 - miss
@@ -108,48 +91,41 @@ def ball_interval(origin: Vectors, direction: Vectors, size: Sizes) -> Interval:
     return np.where(under > 0, closest - half, np.inf), closest + half
 
 
-def box_distance(point: Vectors, size: Sizes) -> Numbers:
-    """Return the signed distance of a box."""
+def _box_distance(point: Vectors, size: Sizes) -> Numbers:
     x, y, z = (np.abs(point[i]) - size[i] for i in range(3))
     outside = np.sqrt(np.maximum(x, 0) ** 2 + np.maximum(y, 0) ** 2 + np.maximum(z, 0) ** 2)
     return outside + np.minimum(np.maximum(np.maximum(x, y), z), 0)
 
 
-def wedge_distance(point: Vectors, size: Sizes) -> Numbers:
-    """Return a lower bound of the distance of a cut box, exact at its surface."""
-    return np.maximum(box_distance(point, size), size[3] * point[0] + size[4] * point[2] - size[5])
+def _wedge_distance(point: Vectors, size: Sizes) -> Numbers:
+    return np.maximum(_box_distance(point, size), size[3] * point[0] + size[4] * point[2] - size[5])
 
 
-def cylinder_distance(point: Vectors, size: Sizes) -> Numbers:
-    """Return the signed distance of a capped cylinder."""
+def _cylinder_distance(point: Vectors, size: Sizes) -> Numbers:
     around = np.sqrt(point[0] ** 2 + point[1] ** 2) - size[0]
     along = np.abs(point[2]) - size[1]
     outside = np.sqrt(np.maximum(around, 0) ** 2 + np.maximum(along, 0) ** 2)
     return outside + np.minimum(np.maximum(around, along), 0)
 
 
-def ball_distance(point: Vectors, size: Sizes) -> Numbers:
-    """Return the signed distance of a ball."""
+def _ball_distance(point: Vectors, size: Sizes) -> Numbers:
     return np.sqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2) - size[0]
 
 
-def box_normal(point: Vectors, size: Sizes) -> Vectors:
-    """Return the normal of the nearest face."""
+def _box_normal(point: Vectors, size: Sizes) -> Vectors:
     face = np.argmax(np.abs(point) - size[:3], axis=0)
     picked = np.arange(3).reshape(3, *[1] * face.ndim) == face
     return np.where(picked, np.copysign(1, point), 0).astype(point.dtype)
 
 
-def wedge_normal(point: Vectors, size: Sizes) -> Vectors:
-    """Return the normal of the nearest face, the cut being one."""
+def _wedge_normal(point: Vectors, size: Sizes) -> Vectors:
     to_faces = np.max(np.abs(point) - size[:3], axis=0)
     to_cut = size[3] * point[0] + size[4] * point[2] - size[5]
     cut = np.stack([size[3], np.zeros_like(size[3]), size[4]])
-    return np.where(to_cut > to_faces, cut, box_normal(point, size))
+    return np.where(to_cut > to_faces, cut, _box_normal(point, size))
 
 
-def cylinder_normal(point: Vectors, size: Sizes) -> Vectors:
-    """Return the normal of the side or of a cap, whichever is nearer."""
+def _cylinder_normal(point: Vectors, size: Sizes) -> Vectors:
     around = np.sqrt(point[0] ** 2 + point[1] ** 2)
     zero = np.zeros_like(around)
     side = np.stack([point[0], point[1], zero]) / np.maximum(around, TINY)
@@ -157,12 +133,11 @@ def cylinder_normal(point: Vectors, size: Sizes) -> Vectors:
     return np.where(around - size[0] > np.abs(point[2]) - size[1], side, cap)
 
 
-def ball_normal(point: Vectors, size: Sizes) -> Vectors:
-    """Return the direction from the middle."""
+def _ball_normal(point: Vectors, size: Sizes) -> Vectors:
     return point / np.sqrt(np.sum(point**2, axis=0))
 
 
-BOX = Solid(box_interval, box_distance, box_normal, lambda size: size[:3])
-WEDGE = Solid(wedge_interval, wedge_distance, wedge_normal, lambda size: size[:3])
-CYLINDER = Solid(cylinder_interval, cylinder_distance, cylinder_normal, lambda size: size[[0, 0, 1]])
-BALL = Solid(ball_interval, ball_distance, ball_normal, lambda size: size[[0, 0, 0]])
+BOX = Solid(_box_interval, _box_distance, _box_normal, lambda size: size[:3])
+WEDGE = Solid(_wedge_interval, _wedge_distance, _wedge_normal, lambda size: size[:3])
+CYLINDER = Solid(_cylinder_interval, _cylinder_distance, _cylinder_normal, lambda size: size[[0, 0, 1]])
+BALL = Solid(_ball_interval, _ball_distance, _ball_normal, lambda size: size[[0, 0, 0]])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from nerf_lightning.data.bricks.parts import Part
-from nerf_lightning.data.bricks.shapes import Solid
+from nerf_lightning.data.bricks.shapes import Interval, Solid, Vectors
 
 NOTHING = -1
 """Part number of a ray that hits nothing."""
@@ -21,15 +21,13 @@ NOTHING = -1
 
 @dataclass(frozen=True)
 class Group:
-    """Parts of one kind of solid in one frame."""
+    """Parts of one kind of solid in one frame: centres in its axes, and each part's number in the model."""
 
     solid: Solid
     frame: Float[ndarray, "3 3"]
     center: Float[ndarray, "3 parts"]
-    """In axes of the frame."""
     size: Float[ndarray, "numbers parts"]
     number: Int[ndarray, "parts"]
-    """Each part's place in the model."""
 
     def only(self, keep: Bool[ndarray, "parts"]) -> "Group":
         """Return the parts that are marked."""
@@ -39,9 +37,7 @@ class Group:
         """Return points as each part sees them."""
         return (self.frame.T @ points)[:, None] - self.center[:, :, None]
 
-    def interval(
-        self, origins: Float[ndarray, "3 #rays"], directions: Float[ndarray, "3 rays"]
-    ) -> tuple[Float[ndarray, "parts rays"], Float[ndarray, "parts rays"]]:
+    def interval(self, origins: Vectors, directions: Vectors) -> Interval:
         """Return where rays enter and leave each part."""
         along = (self.frame.T @ directions)[:, None]
         return self.solid.interval(self.local(origins), along, self.size[:, :, None])
@@ -49,11 +45,10 @@ class Group:
 
 @dataclass(frozen=True)
 class Solids:
-    """A model, or the candidates among its parts."""
+    """A model, or the candidates among its parts, of which there are `total` in the whole model."""
 
     groups: tuple[Group, ...]
     total: int
-    """Number of parts of the whole model."""
 
     @classmethod
     def of(cls, parts: Sequence[Part], dtype: type[np.floating] = np.float64) -> "Solids":
@@ -61,7 +56,15 @@ class Solids:
         kinds: dict[tuple[int, bytes], list[int]] = {}
         for number, part in enumerate(parts):
             kinds.setdefault((id(part.solid), part.frame.tobytes()), []).append(number)
-        return cls(tuple(_group(parts, numbers, dtype) for numbers in kinds.values()), len(parts))
+        groups = []
+        for numbers in kinds.values():
+            chosen = [parts[number] for number in numbers]
+            frame = chosen[0].frame
+            center = frame.T @ np.array([part.center for part in chosen]).T
+            size = np.array([part.size for part in chosen]).T
+            frame, center, size = frame.astype(dtype), center.astype(dtype), size.astype(dtype)
+            groups.append(Group(chosen[0].solid, frame, center, size, np.array(numbers)))
+        return cls(tuple(groups), len(parts))
 
     def only(self, keep: Bool[ndarray, "total"]) -> "Solids":
         """Return the parts that are marked."""
@@ -118,22 +121,9 @@ class Solids:
     def normals(self, points: Float[ndarray, "3 points"], number: Int[ndarray, "points"]) -> Float[ndarray, "3 points"]:
         """Return the outward unit normal of the part `number` at points of its surface."""
         normals = np.zeros_like(points)
-        owner, place = np.zeros((2, self.total), np.int64)
-        for index, group in enumerate(self.groups):
-            owner[group.number] = index
-            place[group.number] = np.arange(group.number.size)
-        owners = owner[number]
-        for index, group in enumerate(self.groups):
-            mine = np.flatnonzero(owners == index)
-            which = place[number[mine]]
+        for group in self.groups:
+            mine = np.flatnonzero(np.isin(number, group.number))
+            which = np.searchsorted(group.number, number[mine])
             local = group.frame.T @ points[:, mine] - group.center[:, which]
             normals[:, mine] = group.frame @ group.solid.normal(local, group.size[:, which])
         return normals
-
-
-def _group(parts: Sequence[Part], numbers: list[int], dtype: type[np.floating]) -> Group:
-    chosen = [parts[number] for number in numbers]
-    frame = chosen[0].frame
-    center = frame.T @ np.array([part.center for part in chosen]).T
-    size = np.array([part.size for part in chosen]).T
-    return Group(chosen[0].solid, frame.astype(dtype), center.astype(dtype), size.astype(dtype), np.array(numbers))

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from nerf_lightning.data.bricks.light import DAY, SIDES, Light, key_visible, openness
+from nerf_lightning.data.bricks.light import DAY, SIDES, Light, key_visible, openness, palette, shade
 from nerf_lightning.data.bricks.parts import Part
-from nerf_lightning.data.bricks.shading import Hits, Palette, shade
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 
 TILE_RAYS = 64
@@ -18,11 +17,10 @@ TILE_RAYS = 64
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One square view, in float64."""
+    """One square view, in float64; the focal length in pixels."""
 
     c2w: Float[ndarray, "3 4"]
     focal: float
-    """In pixels."""
     resolution: int
 
     def directions(self, x: Float[ndarray, "rays"], y: Float[ndarray, "rays"]) -> Float[ndarray, "3 rays"]:
@@ -41,12 +39,10 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Found:
-    """The rays that hit something."""
+    """The rays that hit something; pixels of the picture and rays of a pixel are numbered row by row."""
 
     pixel: Int[ndarray, "hits"]
-    """Number of the pixel in its picture, row by row."""
     ray: Int[ndarray, "hits"]
-    """Number of the ray in its pixel, row by row."""
     part: Int[ndarray, "hits"]
     depth: Float[ndarray, "hits"]
     points: Float[ndarray, "3 hits"]
@@ -58,10 +54,8 @@ class Tracer:
 
     def __init__(self, parts: Sequence[Part], light: Light = DAY) -> None:
         self.light = light
-        self.solids = Solids.of(parts, np.float64)
-        self.fast = Solids.of(parts, np.float32)
-        self.palette = Palette.of(parts, np.float32)
-        self.corners = self.solids.corners()
+        self.solids, self.fast = Solids.of(parts, np.float64), Solids.of(parts, np.float32)
+        self.palette, self.corners = palette(parts, np.float32), self.solids.corners()
 
     def pictures(self, views: Sequence[Pinhole]) -> UInt8[ndarray, "views pixels 4"]:
         """Return straight RGBA: alpha is the share of a pixel's 4 x 4 rays that hit, colour the mean of those hits.
@@ -72,7 +66,11 @@ class Tracer:
         pixels = views[0].resolution ** 2
         each = [self.find(view, SIDES, self.fast) for view in views]
         pixel = np.concatenate([found.pixel + i * pixels for i, found in enumerate(each)])
-        colors = self._colors(_joined(each), pixel)
+        found = _joined(each)
+        normals = self.fast.normals(found.points, found.part)
+        lit = key_visible(self.fast, found.points, normals, found.ray, self.light)
+        open_ = self._openness(found, normals, pixel)
+        colors = shade(self.palette, self.light, found.part, normals, found.directions, lit, open_)
         count = np.bincount(pixel, minlength=len(views) * pixels)
         sums = [np.bincount(pixel, channel, minlength=count.size) for channel in colors]
         rgb = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
@@ -101,18 +99,7 @@ class Tracer:
                     found.append(_trace_tile(view, left, top, tile, sides, solids.only(inside)))
         return _joined(found)
 
-    def _colors(self, found: Found, pixel: Int[ndarray, "hits"]) -> Float[ndarray, "3 hits"]:
-        normals = self.fast.normals(found.points, found.part)
-        hits = Hits(
-            part=found.part,
-            normals=normals,
-            directions=found.directions,
-            key=key_visible(self.fast, found.points, normals, found.ray, self.light),
-            openness=self._pixel_openness(found, normals, pixel),
-        )
-        return shade(self.palette, hits, self.light)
-
-    def _pixel_openness(
+    def _openness(
         self, found: Found, normals: Float[ndarray, "3 hits"], pixel: Int[ndarray, "hits"]
     ) -> Float[ndarray, "hits"]:
         """Return each pixel's mean openness, for it varies slowly: asked on the diagonal of the 4 x 4 rays.
@@ -127,7 +114,6 @@ class Tracer:
 
 
 def _joined(each: Sequence[Found]) -> Found:
-    """Return all hits in one; axis -1 counts them."""
     return Found(*(np.concatenate([getattr(f, name) for f in each], axis=-1) for name in vars(each[0])))
 
 
@@ -143,11 +129,6 @@ def _trace_tile(view: Pinhole, left: int, top: int, tile: int, sides: int, candi
     origin, directions = view.c2w[:, 3:].astype(dtype), view.directions(x, y).astype(dtype)
     depth, part = candidates.first_hit(origin, directions)
     hit = np.flatnonzero(part != NOTHING)
-    return Found(
-        pixel=y[hit].astype(np.int64) * view.resolution + x[hit].astype(np.int64),
-        ray=hit % sides**2,
-        part=part[hit],
-        depth=depth[hit],
-        points=origin + depth[hit] * directions[:, hit],
-        directions=directions[:, hit],
-    )
+    pixel = y[hit].astype(np.int64) * view.resolution + x[hit].astype(np.int64)
+    points = origin + depth[hit] * directions[:, hit]
+    return Found(pixel, hit % sides**2, part[hit], depth[hit], points, directions[:, hit])

@@ -1,6 +1,7 @@
 """The contract of a model: what training, bench, exporters and the viewer ask of it, and no more."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 from jaxtyping import Float
@@ -14,7 +15,9 @@ from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Background, Scene
+
+Baselines = Callable[[Scene, list[int], Background, int], dict[str, Any]]
 
 
 class Model(nn.Module, ABC):
@@ -26,6 +29,8 @@ class Model(nn.Module, ABC):
     """True where the result for one ray depends on the others; such a model is never cut into tiles."""
     needs_photographs: bool = False
     """True where it renders a scene from photographs: `look_at` is called before the first rays."""
+    baselines: Baselines | None = None
+    """Mean PSNR (dB) of views that are shown by so many photographs, without the model, for each way to do so."""
 
     replays: bool = False
     """True where a training step's kernels are the same in each step, so that a recording of them may be replayed: what

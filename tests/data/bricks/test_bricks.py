@@ -1,5 +1,6 @@
 """The embedded scene: its solids against closed forms, its pictures against its geometry, its cache."""
 
+import hashlib
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -9,15 +10,12 @@ import pytest
 import torch
 
 from nerf_lightning.data.bricks import reader as reader_module
-from nerf_lightning.data.bricks.family import model
-from nerf_lightning.data.bricks.light import cells, key_visible, openness
-from nerf_lightning.data.bricks.parts import ALONG_X, ALONG_Z, Material, ball, block, rod, slope
-from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cameras, model_box
-from nerf_lightning.data.bricks.shading import Hits, decode_srgb, encode_srgb, shade
+from nerf_lightning.data.bricks.light import DAY, cells, decode_srgb, encode_srgb, key_visible, openness, shade
+from nerf_lightning.data.bricks.parts import ALONG_X, ALONG_Z, Material, ball, block, fire_engine, rod, slope
+from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cameras
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 from nerf_lightning.data.bricks.tracer import SIDES, Pinhole, Tracer
-from nerf_lightning.data.bricks.vehicle import fire_engine
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.nerf.geometry.cameras import all_pixels, project, rays_through_pixels
@@ -231,9 +229,18 @@ def test_scene_is_named_split_and_boxed(scene: Scene) -> None:
     assert scene.view_names == ("train_000", "train_001", "train_002", "val_000", "test_000", "test_001")
     assert scene.protocol["filter"] == "4x4 supersampling"
     assert scene.pixels.view(5).shape == (16, 16, 4)
-    box = model_box(model(0))
-    assert (np.abs(box) < 1.25).all()
-    assert (box[1] - box[0] > 1).all()
+    assert (scene.aabb.abs() < 1.25).all()
+    assert (scene.aabb[1] - scene.aabb[0] > 1).all()
+
+
+def test_the_fire_engine_keeps_its_parts_and_its_file(tmp_path: Path) -> None:
+    """The file's name stands for the pixels."""
+    numbers = [[*part.size, *part.center, *part.frame.flat, *part.material.color] for part in fire_engine()]
+    assert len(numbers) == 238
+    digest = hashlib.sha256((np.concatenate(numbers).round(6) + 0.0).tobytes()).hexdigest()
+    assert digest[:16] == "b09e1dec1e67790a"
+    BricksReader(resolution=16, num_train=2, num_val=0, num_test=0, cache_dir=str(tmp_path)).read()
+    assert [file.name for file in tmp_path.glob("*.npz")] == ["401381e4b296a378.npz"]
 
 
 def test_colours_survive_the_code() -> None:
@@ -247,7 +254,7 @@ def test_highlights_move_with_the_view(tracer: Tracer) -> None:
     directions /= np.linalg.norm(directions, axis=0)
     ones = np.ones(3, np.float32)
     up = np.array([[0, 0, 0], [0, 0, 0], [1, 1, 1]], np.float32)
-    colors = shade(tracer.palette, Hits(np.zeros(3, int), up, directions, ones, ones))
+    colors = shade(tracer.palette, DAY, np.zeros(3, int), up, directions, ones, ones)
     assert np.ptp(colors, axis=1).max() > 0.02
 
 
@@ -321,22 +328,18 @@ def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"resolution": 0}, "scene.resolution=0: give a width in pixels, 1 or more"),
-        ({"num_train": 0}, "scene.num_train=0 views: give 1 or more"),
-        ({"num_test": -1}, "scene.num_test=-1 views: give 0 or more"),
+        ({"resolution": 0}, "scene.resolution=0: give 1 or more"),
+        ({"num_train": 0}, "scene.num_train=0: give 1 or more"),
+        ({"num_test": -1}, "scene.num_test=-1: give 0 or more"),
         ({"near": 6.0, "far": 2.0}, "scene.near=6.0 and scene.far=2.0: near must be 0 or more and less than far"),
         (
             {"background": "pink"},
-            "scene.background=pink: choose one of white, black, random, white_or_random, black_or_random, none",
+            "scene.background is 'pink'; choose one of white, black, random, white_or_random, black_or_random, none",
         ),
     ],
 )
 def test_wrong_arguments_are_explained(arguments: dict[str, object], message: str) -> None:
     reader = BricksReader()
-    arguments = dict(arguments)
-    for split in ("train", "test"):
-        if f"num_{split}" in arguments:
-            reader.counts[split] = arguments.pop(f"num_{split}")
     vars(reader).update(arguments)
     with pytest.raises(InputError, match=message):
         reader.read()

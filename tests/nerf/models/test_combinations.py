@@ -9,7 +9,6 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.gaussian_fourier import GaussianFourierEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.encoders.hybrid import HybridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
@@ -37,9 +36,8 @@ POSITIONS = {
     "frequency": lambda: FrequencyEncoder(4),
     "gaussian_fourier": lambda: GaussianFourierEncoder(16, scale=0.5),
     "hash_grid": a_grid,
-    "hybrid": lambda: HybridEncoder(FrequencyEncoder(3), a_grid(), cones=True),
 }
-UNIT_CUBE = {"hash_grid", "hybrid"}
+UNIT_CUBE = {"hash_grid"}
 DIRECTIONS = {"frequency": lambda: FrequencyEncoder(2), "spherical_harmonics": lambda: SphericalHarmonicsEncoder(3)}
 FIELDS = {
     "nerf_mlp": lambda p, d: NerfMLP(p, d, depth=2, width=32, skip=None, density_activation="softplus"),
@@ -61,7 +59,7 @@ MODELS = {
 }
 PAIRS = [
     ("frequency", "frequency"),
-    *((each, "spherical_harmonics") for each in ("gaussian_fourier", "hash_grid", "hybrid")),
+    *((each, "spherical_harmonics") for each in ("gaussian_fourier", "hash_grid")),
 ]
 CASES = [
     (model, field, *pair)

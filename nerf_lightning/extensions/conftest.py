@@ -1,0 +1,3 @@
+"""The fixtures of commands, for tests of extensions."""
+
+from support.command_fixtures import *  # noqa: F403

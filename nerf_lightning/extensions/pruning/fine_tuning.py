@@ -1,0 +1,75 @@
+"""The training that follows a pruning: that of the run again, at the narrower widths, from the weights that stayed."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from nerf_lightning.budgets import Budgets, allow
+from nerf_lightning.checkpoints.reading import Checkpoint
+from nerf_lightning.commands.train import run as train
+from nerf_lightning.config.auto_settings import AUTO
+from nerf_lightning.config.compose import compose_config, composed_job
+from nerf_lightning.config.messages import in_words
+from nerf_lightning.config.overrides import open_sections, quoted
+from nerf_lightning.errors import InputError
+from nerf_lightning.files.folders import option_names
+from nerf_lightning.runs.output_folder import beside_checkpoint
+from nerf_lightning.runs.saved_overrides import former_overrides
+
+
+def fine_tuning(checkpoint: Checkpoint, widths: Mapping[str, int], steps: int) -> list[str] | None:
+    """Return the overrides of `nerf train` that fine-tune a narrower model; None where it takes no steps.
+
+    They are those of the run that the checkpoint lies in, as far as a file may say them, and the widths.
+
+    Args:
+        checkpoint: the one that was pruned.
+        widths: of the narrower fields, by the names of the modules.
+        steps: how many.
+
+    Raises:
+        InputError: no number of steps, or the run's folder does not say how it was trained.
+    """
+    if steps < 0:
+        raise InputError(f"finetune_steps={steps}: give a whole number, 0 for none.")
+    if not steps:
+        return None
+    folder = beside_checkpoint(checkpoint.path, ".hydra").parent if checkpoint.path.is_file() else checkpoint.path
+    if not (folder / ".hydra" / "overrides.yaml").is_file():
+        raise InputError(
+            f"finetune_steps={steps}: {folder} has no .hydra/overrides.yaml, which says how {checkpoint.path.name} was "
+            f"trained. Leave it out, and fine-tune with nerf train, the run's settings, {_told(widths)} and "
+            "init_from=CHECKPOINT."
+        )
+    # What a run does at its start alone, a look at the pictures' centres first, is for weights that know nothing.
+    length = [f"trainer.max_steps={steps}", "trainer.max_epochs=null", "budget.seconds=null", "data.crop_steps=0"]
+    former = open_sections([*former_overrides(folder, length), *length])
+    config, choices = compose_config("train", former)
+    settled = checkpoint.choices.get("model")
+    if choices.get("model") == AUTO and settled in option_names("model"):
+        former.append(f"model={settled}")  # what the scene had chosen
+        config, _ = compose_config("train", former)
+    model = OmegaConf.to_container(config.model, resolve=False)
+    return [*former, *dict.fromkeys(f"{_setting(model, name)}={width}" for name, width in widths.items())]
+
+
+def fine_tune(overrides: list[str], checkpoint: Path, folder: Path) -> float | None:
+    """Train as `fine_tuning` says from a checkpoint into a run folder of its own; return the PSNR (dB)."""
+    places = [f"init_from={quoted(str(checkpoint))}", f"paths.output_dir={quoted(str(folder))}"]
+    with in_words("train"), composed_job("train", [*overrides, *places]) as config:
+        allow(Budgets(**config.budgets))
+        return train(config)
+
+
+def _setting(model: Any, field: str) -> str:
+    """Return the setting of a field's width: of the section that it is composed from, where it is from one."""
+    node = model
+    for name in field.split("."):
+        node = node.get(name) if isinstance(node, dict) else None
+    return f"{node[2:-1]}.width" if isinstance(node, str) else f"model.{field}.width"
+
+
+def _told(widths: Mapping[str, int]) -> str:
+    return ", ".join(f"model.{name}.width={width}" for name, width in widths.items()) or "the same widths"

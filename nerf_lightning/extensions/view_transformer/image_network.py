@@ -1,0 +1,119 @@
+"""Features of photographs: a small convolutional network with skips between its scales."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nerf_lightning.nerf.part import Part
+from nerf_lightning.nerf.products import own_precision
+
+ImageNorm = Literal["none", "instance", "neurn"]
+PATCH = 3
+"""Side in pixels of the squares whose deviation is taken."""
+LEAST_DEVIATION = 1e-6
+"""Deviations below it, which only rounding makes of colours in [0, 1], count as none."""
+
+
+def normalized(
+    pictures: Float[Tensor, "views 3 height width"], kind: ImageNorm
+) -> Float[Tensor, "views 3 height width"]:
+    """Return pictures as the image network sees them.
+
+    Args:
+        pictures: colours in [0, 1].
+        kind: `none` shifts them to [-1, 1]; `instance` gives each channel of each picture mean 0 and deviation 1;
+            `neurn` is `local_deviation`.
+    """
+    if kind == "neurn":
+        return local_deviation(pictures)
+    if kind == "instance":
+        return functional.instance_norm(pictures)
+    return 2.0 * pictures - 1.0
+
+
+def local_deviation(
+    pictures: Float[Tensor, "*views channels height width"], patch: int = PATCH
+) -> Float[Tensor, "*views channels height width"]:
+    """Return the standard deviation around each pixel over the picture's largest, channel by channel, in [0, 1].
+
+    NeuRN (arXiv 2505.06894), after neurons that answer to contrast. It is unchanged by gain and offset of a channel,
+    and 0 where all is of one colour. Beyond the border the outermost pixels are repeated.
+    """
+    flat = pictures.reshape(-1, *pictures.shape[-3:])
+    around = functional.pad(flat, (patch // 2,) * 4, mode="replicate").unfold(-2, patch, 1).unfold(-2, patch, 1)
+    # Not as a difference of means of squares, which has no digits where little differs.
+    apart = around - around.mean(dim=(-2, -1), keepdim=True)
+    deviation = apart.square().mean(dim=(-2, -1)).sqrt()
+    deviation = torch.where(deviation > LEAST_DEVIATION, deviation, 0.0)
+    largest = deviation.amax(dim=(-2, -1), keepdim=True)
+    return (deviation / largest.clamp(min=LEAST_DEVIATION)).view_as(pictures)
+
+
+class ImageNetwork(Part):
+    """Residual blocks at 1/2, 1/4, ... of the picture's size and one scale beyond that of the features, and back.
+
+    The papers' is the first half of a ResNet34 with instance norm (arXiv 2102.13090). Here each scale has as many
+    blocks as the others, and halves the size by a 4 x 4 convolution that is centred between pixels, so that the
+    feature of row i stands at (i + 1/2) `scale` pixels.
+
+    Args:
+        features: channels that come out.
+        scale: pixels of the picture per feature, along each side: 2, 4 or 8.
+        width: channels at half the size; twice as many at each smaller one.
+        blocks: residual blocks at each size.
+        norm: what is done to the pictures first.
+    """
+
+    def __init__(self, features: int, scale: int, width: int, blocks: int, norm: ImageNorm):
+        super().__init__()
+        self.scale, self.norm = scale, norm
+        widths = [width << level for level in range(scale.bit_length())]
+        self.down = nn.ModuleList(
+            nn.Sequential(_halve(before, after), *[_Residual(after) for _ in range(blocks)])
+            for before, after in zip([3, *widths[:-1]], widths, strict=True)
+        )
+        self.join = nn.Sequential(_convolve(widths[-1] + widths[-2], widths[-2]), nn.ReLU(inplace=True))
+        self.out = nn.Conv2d(widths[-2], features, 1)
+
+    @own_precision
+    def forward(self, pictures: Float[Tensor, "views 3 height width"]) -> Float[Tensor, "views features rows columns"]:
+        """Return the features of pictures of one size, rows and columns a `scale`th of it, rounded up."""
+        height, width = pictures.shape[-2:]
+        unit = 2 * self.scale
+        # Of a single feature at the smallest scale no deviation could be taken.
+        bottom, right = -height % unit, max(2 * unit, width + -width % unit) - width
+        found = functional.pad(normalized(pictures, self.norm), (0, right, 0, bottom), mode="replicate")
+        levels: list[Tensor] = []
+        for level in self.down:
+            found = level(found)
+            levels.append(found)
+        wide = functional.interpolate(levels[-1], scale_factor=2, mode="nearest")
+        features = self.out(self.join(torch.cat([wide, levels[-2]], dim=1)))
+        return features[:, :, : -(-height // self.scale), : -(-width // self.scale)]
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.first, self.second = _convolve(width, width), _convolve(width, width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return functional.relu(features + self.second(functional.relu(self.first(features), inplace=True)))
+
+
+def _convolve(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+        nn.InstanceNorm2d(outputs, affine=True),
+    )
+
+
+def _halve(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, bias=False),
+        nn.InstanceNorm2d(outputs, affine=True),
+        nn.ReLU(inplace=True),
+    )

@@ -1,0 +1,130 @@
+"""What the sources of rays show at their points."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nerf_lightning.extensions.view_transformer.attention import NARROWER
+from nerf_lightning.nerf.products import Linear, own_precision
+from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+
+@dataclass(frozen=True)
+class Views(TensorStruct):
+    """What the sources show at the points of rays."""
+
+    states: Float[Tensor, "rays samples sources width"]
+    """Colour and features together."""
+    colors: Float[Tensor, "rays samples sources 3"]
+    """In [0, 1]."""
+    turned: Float[Tensor, "rays samples sources 4"]
+    """How the ray looks on the point against how the source does (`projection.Projected`)."""
+    visible: Bool[Tensor, "rays samples sources"]
+
+
+class Largest(nn.Module):
+    """In each channel the largest of what the views show, as published (arXiv 2207.13298); 0 where none sees it.
+
+    Args:
+        width: of the states.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+
+    def forward(self, views: Views) -> Float[Tensor, "rays samples width"]:
+        """Return the states."""
+        largest = views.states.float().masked_fill(~views.visible[..., None], -torch.inf).amax(dim=-2)
+        return torch.where(views.visible.any(dim=-1)[..., None], largest, 0.0)
+
+
+class Spread(Largest):
+    """And a linear layer on the mean and the deviation of the views' colours, and on the variance of their states.
+
+    As IBRNet begins (arXiv 2102.13090): where views differ, they do not see the same thing.
+
+    Args:
+        width: of the states.
+    """
+
+    def __init__(self, width: int):
+        super().__init__(width)
+        self.of_colors, self.of_states = nn.Linear(6, width), nn.Linear(width, width)
+
+    @own_precision
+    def forward(self, views: Views) -> Float[Tensor, "rays samples width"]:
+        """Return the states."""
+        share = views.visible / views.visible.sum(dim=-1, keepdim=True).clamp(min=1)
+        mean, variance = moments(views.colors, share)
+        spread = (variance + 1e-6).sqrt()
+        _, of_states = moments(views.states.float(), share)
+        return super().forward(views) + self.of_colors(torch.cat([mean, spread], dim=-1)) + self.of_states(of_states)
+
+
+def moments(
+    values: Float[Tensor, "*points sources channels"], share: Float[Tensor, "*points sources"]
+) -> tuple[Float[Tensor, "*points channels"], Float[Tensor, "*points channels"]]:
+    """Return the mean of values over the sources, and their variance; 0 where the shares are."""
+    share = share[..., None]
+    mean = (share * values).sum(dim=-2)
+    return mean, (share * (values - mean[..., None, :]).square()).sum(dim=-2)
+
+
+class PooledColor(nn.Module):
+    """A linear layer on the mean of the normalised states, as published (arXiv 2207.13298).
+
+    Args:
+        width: of the states.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm, self.color = nn.LayerNorm(width), nn.Linear(width, 3)
+
+    @own_precision
+    def forward(
+        self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
+        """Return colours, and the weights of samples as they were given: those of the last attention."""
+        return self.color(self.norm(states.float()).mean(dim=1)), weights
+
+
+class BlendedColor(nn.Module):
+    """sum_s a_s sum_v b_sv c_sv, the sources' own colours, and what the pooled state adds to them.
+
+    a is a softmax along the ray, over the points that any source sees, b one over the sources of a point, as IBRNet
+    blends (arXiv 2102.13090). It begins as the mean of all colours that a ray's points have in the sources, and has to
+    learn where they agree, but not what colours are.
+
+    Args:
+        width: of the states.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        narrow = max(1, width // NARROWER)
+        self.norm, self.color, self.where = nn.LayerNorm(width), nn.Linear(width, 3), nn.Linear(width, 1)
+        self.of_view, self.of_state = Linear(width, narrow), Linear(width, narrow, bias=False)
+        self.of_turn = nn.Linear(4, narrow, bias=False)
+        self.which = nn.Linear(narrow, 1)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Begin with nothing added to the sources' colours."""
+        nn.init.zeros_(self.color.weight)
+        nn.init.zeros_(self.color.bias)
+
+    @own_precision
+    def forward(
+        self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
+        """Return colours, and the weights of samples in them."""
+        states = self.norm(states.float())
+        of_views = self.of_view(views.states) + self.of_turn(views.turned) + self.of_state(states)[..., None, :]
+        which = self.which(functional.relu(of_views.float()))[..., 0].masked_fill(~views.visible, -1e9).softmax(dim=-1)
+        seen = (which[..., None] * views.colors).sum(dim=-2)
+        of_points = self.where(states)[..., 0].masked_fill(~views.visible.any(dim=-1), -1e9).softmax(dim=-1)
+        return (of_points[..., None] * seen).sum(dim=1) + self.color(states.mean(dim=1)), of_points
