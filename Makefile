@@ -45,7 +45,7 @@ $(VENV)/.ready: pyproject.toml constraints/torch.txt
 	@$(PYTHON) -m venv $(VENV) || { echo "make: python3-venv is missing (Debian, Ubuntu: apt install python3-venv)"; exit 2; }
 	$(PIP) install -q $(PINNED) torch
 	$(PIP) install -q $(PINNED) -e '.[dev]'
-	@$(VENV)/bin/python -m nerf_lightning.nerf.kernels.compile
+	@$(VENV)/bin/python -m nerf_lightning.config.exporters
 	@touch $@
 
 train: setup ## Train the embedded scene, measure it and film it; ARGS="key=value ..." for Hydra overrides

@@ -1,8 +1,8 @@
 """The rooms of the package, and the arrows between them.
 
-A room is a folder directly below nerf_lightning/, or a file beside those folders; an `__init__.py` that defines nothing is
-none. An arrow leads from a room to another that one of its files imports, wherever in the file. `python tests/test_rooms.py`
-prints both. That no arrow leads up is checked by import-linter (`make layers`).
+A room is a folder directly below nerf_lightning/, or a file beside those folders; an `__init__.py` that defines nothing
+is none. An arrow leads from a room to another that one of its files imports, wherever in the file.
+`python tests/test_rooms.py` prints both. That no arrow leads up is checked by import-linter (`make layers`).
 """
 
 import ast

@@ -80,11 +80,18 @@ def _view(arguments: list[str]) -> list[str]:
 
 
 def _export(arguments: list[str]) -> list[str]:
-    """Name the run's own scene as for `eval` where photographs are shown; where it is unknown, go without them."""
-    if "what=page" not in arguments:
+    """Name the run's own scene as for `eval` where the exporter needs photographs; where it is unknown, do without."""
+    named = [value for key, _, value in (each.partition("=") for each in arguments) if key == "what"]
+    if not named:
         return arguments
-    without = ["what.photographs=0", "what.max_views=0"]
-    return _eval_or_without(arguments, without, "The page will be without photographs")
+    with quick_imports():
+        from nerf_lightning.config.exporters import exporter_class
+
+        exporter = exporter_class(named[-1])
+    # Nothing is known here of an exporter of a person's own: it may need them.
+    if exporter is not None and not getattr(exporter, "needs_photographs", False):
+        return arguments
+    return _eval_or_without(arguments, ["photographs=false"], f"what={named[-1]} goes without photographs")
 
 
 def _eval_or_without(arguments: list[str], without: list[str], said: str) -> list[str]:

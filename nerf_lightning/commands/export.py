@@ -41,15 +41,13 @@ def export(config: DictConfig) -> None:
 def export_one(config: DictConfig) -> list[Path]:
     """Export one checkpoint, and return where the files are."""
     what: Export = build(config.what)
-    path = build(config.path) if what.shows_photographs else None
+    path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
     if what.needs_density and opened.model.needs_photographs:
         opened.model.density(torch.zeros(1, 3, device=opened.settings.device))  # or says by name that there is none
-    if path is not None:
-        asked = config.what.photographs or config.what.max_views or config.what.fit_steps
-        photographs = read_photographs(config, opened) if asked else None
-        what.beside = beside_page(opened.checkpoint, photographs, path)
+    photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
+    what.beside = beside(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
     with torch.no_grad(), filled_folder(config.paths.output_dir, default) as folder:
         record = opened.checkpoint.scene
@@ -73,19 +71,18 @@ def export_runs(config: DictConfig) -> list[Path]:
         return what.export(runs, folder, page_maker(export_one))
 
 
-def beside_page(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath) -> Beside:
-    """Return what a page shows besides the scene: photographs, the numbers of the run, and a camera path.
+def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> Beside:
+    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene.
 
     Raises:
         InputError: the path cannot be laid around the scene.
     """
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
-    model = checkpoint.choices.get("model", "")
     known = [
-        ("model", model),
+        ("model", checkpoint.choices.get("model", "")),
         ("step", f"{checkpoint.step:,}"),
         *facts(read_json_object(run / "metrics.json"), read_note(run)),
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
-    keyframes = page_path(path, checkpoint.scene, run)
+    keyframes = () if path is None else page_path(path, checkpoint.scene, run)
     return Beside(photographs, corrected, tuple(known), keyframes)

@@ -23,7 +23,7 @@ def page_maker(export_one: Callable[..., list[Path]]) -> Callable[[Path, Quality
         try:
             scene = scene_overrides(str(run))
         except UnknownScene:  # its page is without photographs
-            scene = ["what.photographs=0", "what.max_views=0"]
+            scene = ["photographs=false"]
         given = [f"ckpt={quoted(str(run))}", "what=page", f"what.quality={quality}", *passed_on]
         try:
             with composed_job("export", [*scene, *given]) as config:

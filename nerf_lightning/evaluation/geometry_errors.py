@@ -26,7 +26,7 @@ def depth_error(
     Returns:
         The error, or None if no pixel can be scored. A hole in the surface counts with depth far.
     """
-    scored = _opaque(alpha) & truth_depth.isfinite()
+    scored = (alpha >= 1.0) & truth_depth.isfinite()
     if not scored.any():
         return None
     return float((surface_depth(depth, opacity, far) - truth_depth)[scored].abs().mean())
@@ -42,7 +42,7 @@ def normal_error(
     A pixel counts if it and its four neighbours are wholly covered by the scene (`alpha` 1): the differences
     that make its normal then touch no background. The border, which lacks a neighbour, does not count.
     """
-    scored = _well_inside(_opaque(alpha)) & (truth_normals.norm(dim=-1) > 0)
+    scored = _well_inside(alpha >= 1.0) & (truth_normals.norm(dim=-1) > 0)
     if not scored.any():
         return None
     ours, true = normals[scored], truth_normals[scored]
@@ -57,8 +57,3 @@ def _well_inside(covered: Bool[Tensor, "height width"]) -> Bool[Tensor, "height 
     beside = covered[1:-1, :-2] & covered[1:-1, 2:]
     inside[1:-1, 1:-1] = covered[1:-1, 1:-1] & above_and_below & beside
     return inside
-
-
-def _opaque(alpha: Float[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
-    """Tell the pixels that are wholly covered by the scene, where geometry can be scored."""
-    return alpha >= 1.0

@@ -28,6 +28,8 @@ _TAPS: dict[Net, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15,
 """The rectified layers whose features are compared."""
 _SMALLEST: dict[Net, int] = {"alex": 31, "vgg": 16}
 """Pixels below which pooling leaves nothing of a side."""
+_ALEX = ((64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1))
+"""Channels, kernel, stride and padding; the second and the third come after pooling."""
 _VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 _TINY = 1e-8
 """Keeps the length of a feature of zeros from dividing by zero; the reference's value."""
@@ -86,22 +88,19 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
     """
     if weights is None:
         return None
+    start, cure = f"evaluation.lpips_weights={weights}:", f"To have LPIPS, {LPIPS_HINT}"
     if not Path(weights).is_file():
-        raise InputError(f"evaluation.lpips_weights={weights}: there is no such file. To have LPIPS, {LPIPS_HINT}")
+        raise InputError(f"{start} there is no such file. {cure}")
     try:
         state = load_tensors(Path(weights))
     except InputError:
         raise
     except Exception as error:  # a file of another kind can fail in any way
-        raise InputError(
-            f"evaluation.lpips_weights={weights}: this is not a file of weights. To have LPIPS, {LPIPS_HINT}"
-        ) from error
+        raise InputError(f"{start} this is not a file of weights. {cure}") from error
     model = LPIPS(net)
     wrong = _mismatch(state, model.state_dict())
     if wrong is not None:
-        raise InputError(
-            f"evaluation.lpips_weights={weights}: not the backbone {net!r}: {wrong}. To have LPIPS, {LPIPS_HINT}"
-        )
+        raise InputError(f"{start} not the backbone {net!r}: {wrong}. {cure}")
     model.load_state_dict({name: state[name] for name in model.state_dict()})
     return model.eval()
 
@@ -132,20 +131,14 @@ def _channel_weights(net: Net) -> list[Float[Tensor, "channels 1 1"]]:
 
 
 def _alexnet() -> list[nn.Module]:
-    return [
-        nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(64, 192, kernel_size=5, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(192, 384, kernel_size=3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(384, 256, kernel_size=3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(256, 256, kernel_size=3, padding=1),
-        nn.ReLU(),
-    ]
+    layers: list[nn.Module] = []
+    width = 3
+    for wider, kernel, stride, padding in _ALEX:
+        if 0 < len(layers) < 6:
+            layers.append(nn.MaxPool2d(kernel_size=3, stride=2))
+        layers += [nn.Conv2d(width, wider, kernel, stride, padding), nn.ReLU()]
+        width = wider
+    return layers
 
 
 def _vgg16() -> list[nn.Module]:

@@ -74,20 +74,12 @@ def _similarity(render: Float[Tensor, "height width 3"], truth: Float[Tensor, "h
 
 
 def mean_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
-    """Return each metric's mean over images; None where an image has none, since a mean over others misleads.
-
-    Raises:
-        ValueError: no images.
-    """
+    """Return each metric's mean over images; None where an image has none, since a mean over others misleads."""
     return {name: None if known is None else sum(known) / len(known) for name, known in _columns(per_image).items()}
 
 
 def median_over_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
-    """Return each metric's median over images; None where an image has none.
-
-    Raises:
-        ValueError: no images.
-    """
+    """Return each metric's median over images; None where an image has none."""
     return {name: None if known is None else statistics.median(known) for name, known in _columns(per_image).items()}
 
 
@@ -96,9 +88,6 @@ def worst_of_images(per_image: Sequence[dict[str, float | None]]) -> dict[str, i
 
     >>> worst_of_images([{"psnr": 30.0, "lpips": 0.1}, {"psnr": 20.0, "lpips": 0.3}])
     {'psnr': 1, 'lpips': 1}
-
-    Raises:
-        ValueError: no images.
     """
     return {
         name: None if known is None else known.index(min(known) if name in HIGHER_IS_BETTER else max(known))

@@ -24,12 +24,7 @@ SENSOR_WIDTH = 36.0
 
 
 def nerfstudio_path(cameras: Cameras, fps: int) -> dict[str, Any]:
-    """Return what `ns-render camera-path` reads.
-
-    Args:
-        cameras: in the user's frame.
-        fps: photographs per second.
-    """
+    """Return what `ns-render camera-path` reads, of cameras in the user's frame; `fps` are photographs per second."""
     panorama = cameras.lens_model == "equirectangular"
     frames = [
         {
@@ -86,7 +81,7 @@ def blender_script(cameras: Cameras, names: Sequence[str], fps: int) -> str:
 
     Args:
         cameras: in the user's frame.
-        names: of the photographs; they may come from anybody.
+        names: of the photographs, which may come from anybody.
         fps: photographs per second.
 
     Raises:
@@ -118,9 +113,7 @@ def blender_script(cameras: Cameras, names: Sequence[str], fps: int) -> str:
 def beyond_pinholes(cameras: Cameras, shifts: bool) -> list[str]:
     """Return what of the cameras an animated pinhole does not show, where it would be seen: by half a pixel.
 
-    Args:
-        cameras: of the photographs.
-        shifts: whether the principal point may lie off the middle.
+    `shifts` says whether the principal point may lie off the middle.
     """
     (width, height), (fx, fy) = (cameras.width, cameras.height), cameras.focal.unbind(dim=-1)
     off = cameras.center - 0.5 * torch.stack([width, height], dim=-1)

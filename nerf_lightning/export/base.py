@@ -28,21 +28,25 @@ class Beside:
 class Export(ABC):
     """Write what a model has learnt as files for other programs."""
 
-    shows_photographs: bool = False
-    """Whether the photographs are read again for it."""
+    needs_photographs: bool = False
+    """Whether the photographs of the run are read again, and stand in `beside`; None there: they cannot be."""
+    plays_path: bool = False
+    """Whether the camera path of the config stands in `beside`, as keyframes."""
     needs_density: bool = True
     """Whether it says where matter is, and not only what is seen."""
+    kernels: tuple[str, ...] = ()
+    """Full names of modules of compiled kernels that it uses, each with a `trial`: compiled at installation."""
     beside: Beside = Beside()
-    """What the command has found beside the checkpoint, for those that show photographs."""
+    """What the command has found beside the checkpoint."""
 
     @abstractmethod
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
-        """Write files into `folder` and return where they are.
+        """Write files into `folder`, which is there, and return where they are.
 
         Args:
             model: in evaluation mode.
             record: the scene that it was trained on.
-            folder: is there, and can be written.
+            folder: where to.
             tile_points: most points that go through a field at once.
 
         Raises:
@@ -67,6 +71,16 @@ class RunsExport(ABC):
         """
 
 
+def require_setting(name: str, value: object, good: bool, rule: str) -> None:
+    """Refuse a setting of an exporter that is not good.
+
+    Raises:
+        InputError: it names the setting, and says the rule.
+    """
+    if not good:
+        raise InputError(f"what.{name}={value}: {rule}")
+
+
 def refuse_ndc(record: SceneRecord, what: str) -> None:
     """Refuse a scene whose field lives in normalised device coordinates.
 
@@ -81,29 +95,17 @@ def refuse_ndc(record: SceneRecord, what: str) -> None:
         )
 
 
-def require_no_folders(paths: Iterable[Path]) -> None:
-    """Refuse places for files at which folders lie, before the work and not after it.
+def require_free(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> None:
+    """Refuse places for files where folders lie, and for folders where files lie: before the work, not after it.
 
     Raises:
-        InputError: one does.
+        InputError: with the first of them.
     """
-    for path in paths:
-        if path.is_dir():
-            raise InputError(
-                f"{path} is a folder, and a file of that name is to be written. Remove it, or give another place with "
-                "paths.output_dir=DIR."
-            )
-
-
-def require_no_files(paths: Iterable[Path]) -> None:
-    """Refuse places for folders at which files lie.
-
-    Raises:
-        InputError: one does.
-    """
-    for path in paths:
-        if path.exists() and not path.is_dir():
-            raise InputError(
-                f"{path} is a file, and a folder of that name is to be filled. Remove it, or give another place with "
-                "paths.output_dir=DIR."
-            )
+    taken = [(path, "a folder, and a file of that name is to be written") for path in files if path.is_dir()]
+    taken += [
+        (path, "a file, and a folder of that name is to be filled")
+        for path in folders
+        if path.exists() and not path.is_dir()
+    ]
+    for path, reason in taken[:1]:
+        raise InputError(f"{path} is {reason}. Remove it, or give another place with paths.output_dir=DIR.")

@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import torch
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_colmap
 from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
-from nerf_lightning.export.base import Export, require_no_files, require_no_folders
+from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
@@ -30,6 +29,8 @@ CAMERA_MODELS: dict[LensModel, str] = {
 }
 WITHOUT_COEFFICIENTS = ("pinhole", "equirectangular")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+COLMAP_TAKES = {"pinhole": [], "radial_tangential": [0, 1, 4, 5], "fisheye": [0, 1, 2, 3]}
+"""Which of the coefficients each of COLMAP's models has, in its order."""
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +52,7 @@ class CamerasExport(Export):
     needs_density = False
 
     def __init__(self, images: str | None = None, format: CamerasFormat = "transforms", fps: int = 24):
-        if fps < 1:
-            raise InputError(f"what.fps={fps}: give 1 or more photographs per second.")
+        require_setting("fps", fps, fps >= 1, "give 1 or more photographs per second.")
         self.images, self.format, self.fps = images, format, fps
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
@@ -61,8 +61,7 @@ class CamerasExport(Export):
         if self.format != "transforms":
             return [self._animation(cameras, record.view_names, folder / ANIMATIONS[self.format])]
         transforms = folder / "transforms.json"
-        require_no_folders([transforms])
-        require_no_files([folder / "sparse", folder / "sparse" / "0"])
+        require_free(files=[transforms], folders=[folder / "sparse", folder / "sparse" / "0"])
         write_json(transforms, self._transforms(record, cameras))
         reason = beyond_colmap(cameras)
         if reason:
@@ -70,12 +69,11 @@ class CamerasExport(Export):
             return [transforms]
         sparse = make_folder(folder, "sparse", "0")
         for name, text in colmap_files(cameras, record.view_names).items():
-            with whole_file(sparse / name) as part:
-                part.write_text(text, encoding="utf-8")
+            _write_text(sparse / name, text)
         return [transforms, sparse]
 
     def _animation(self, cameras: Cameras, names: Sequence[str], path: Path) -> Path:
-        require_no_folders([path])
+        require_free(files=[path])
         blender = self.format == "blender"
         text = blender_script(cameras, names, self.fps) if blender else None
         lost = beyond_pinholes(cameras, shifts=blender)
@@ -84,8 +82,7 @@ class CamerasExport(Export):
         if text is None:
             write_json(path, nerfstudio_path(cameras, self.fps))
         else:
-            with whole_file(path) as part:
-                part.write_text(text, encoding="ascii")
+            _write_text(path, text)
         return path
 
     def _transforms(self, record: SceneRecord, cameras: Cameras) -> dict[str, Any]:
@@ -97,6 +94,11 @@ class CamerasExport(Export):
             for split, views in record.splits.items():
                 content[f"{split}_filenames"] = [names[view] for view in views]
         return content
+
+
+def _write_text(path: Path, text: str) -> None:
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def in_user_frame(record: SceneRecord) -> Cameras:
@@ -112,26 +114,14 @@ def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
     if cameras.lens_model == "equirectangular":
         fx, fy = math.pi * fx, math.pi * fy  # nerfstudio counts pixels per half turn
     plain = cameras.lens_model in WITHOUT_COEFFICIENTS
-    bent = {} if plain else dict(zip(COEFFICIENTS, cameras.lens[view].tolist(), strict=True))
     return {
         "file_path": name,
         "w": int(cameras.width[view]),
         "h": int(cameras.height[view]),
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        **bent,
+        **{"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy},
+        **({} if plain else dict(zip(COEFFICIENTS, cameras.lens[view].tolist(), strict=True))),
         "transform_matrix": [*cameras.c2w[view].tolist(), [0.0, 0.0, 0.0, 1.0]],
     }
-
-
-# Of the coefficients k1, k2, k3, k4, p1, p2: those that each of COLMAP's models takes, in its order.
-MODELS = {
-    "pinhole": ("PINHOLE", ()),
-    "radial_tangential": ("OPENCV", (0, 1, 4, 5)),
-    "fisheye": ("OPENCV_FISHEYE", (0, 1, 2, 3)),
-}
 
 
 def beyond_colmap(cameras: Cameras) -> str | None:
@@ -149,10 +139,8 @@ def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of features (none)"]
     for view, name in enumerate(names):
         camera = numbers.setdefault(_camera(cameras, view), len(numbers) + 1)
-        images += [
-            f"{view + 1} {_pose(cameras, view)} {camera} {for_colmap(name)}",
-            "",
-        ]  # two lines each, whatever it is called
+        # Two lines each, whatever it is called.
+        images += [f"{view + 1} {_pose(cameras, view)} {camera} {for_colmap(name)}", ""]
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *(f"{number} {text}" for text, number in numbers.items())]
     return {
         "cameras.txt": "\n".join(lines) + "\n",
@@ -162,9 +150,10 @@ def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
 
 
 def _camera(cameras: Cameras, view: int) -> str:
-    model, lens = MODELS[cameras.lens_model]
-    numbers = [*cameras.focal[view].tolist(), *cameras.center[view].tolist(), *cameras.lens[view, list(lens)].tolist()]
-    return f"{model} {int(cameras.width[view])} {int(cameras.height[view])} {' '.join(map(repr, numbers))}"
+    lens = cameras.lens[view, COLMAP_TAKES[cameras.lens_model]]
+    numbers = [*cameras.focal[view].tolist(), *cameras.center[view].tolist(), *lens.tolist()]
+    size = f"{int(cameras.width[view])} {int(cameras.height[view])}"
+    return f"{CAMERA_MODELS[cameras.lens_model]} {size} {' '.join(map(repr, numbers))}"
 
 
 def _pose(cameras: Cameras, view: int) -> str:

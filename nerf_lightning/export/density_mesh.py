@@ -1,14 +1,20 @@
-"""The surface where the density crosses a level, as a mesh: closed, the insides of things included."""
+"""The surface where the density crosses a level, as a mesh: closed, the insides of things included.
+
+Marching cubes (Lewiner et al. 2003, by scikit-image) go block by block; what floats is removed.
+"""
 
 import logging
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.density_grid import Lattice, Report, sample_density
-from nerf_lightning.export.marching_cubes import marching_cubes
+from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.surface import surface_level
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -18,30 +24,33 @@ BYTES_PER_POINT = 8
 # So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
 RATIO = 10.0
 
+BLOCK = 64
+"""Cells along a block's side."""
+
 log = logging.getLogger(__name__)
 
 
 def mesh_of_density(
     model: Model, record: SceneRecord, lattice: Lattice, threshold: float | None, tile_points: int, report: Report
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
-    """Return vertices (scene frame) and faces of the surface where the density is `threshold`.
+    """Return vertices (scene frame) and faces of the surface where the density is `threshold` per scene unit.
 
-    Args:
-        model: in evaluation mode.
-        record: of the scene.
-        lattice: where the density is asked.
-        threshold: per scene unit; None: where rendering sees the surface (`surface_level`).
-        tile_points: most points that go through the field at once.
-        report: told how much of `density` and `surface` is done.
+    Without a threshold, that is where rendering sees it (`surface_level`).
 
     Raises:
         InputError: there is no such surface.
     """
     density = sample_density(model, lattice, tile_points, report)
     if record.space == "bounded":
-        _close(density)
+        # Nothing lies outside of its box: the surface is closed there.
+        for axis in range(3):
+            sides = np.moveaxis(density, axis, 0)
+            sides[0] = sides[-1] = 0.0
     level = _level(model, record, density, threshold, tile_points)
-    _to_log_ratio(density, level)
+    # Densities grow by factors, and so the logarithm of their ratio to the level is straight.
+    density /= level
+    np.clip(density, 1.0 / RATIO, RATIO, out=density)
+    np.log(density, out=density)
     vertices, faces = marching_cubes(density, 0.0, report)
     log.info("the surface is where the density is %.4g", level)
     return lattice.to_scene(vertices), faces
@@ -66,15 +75,63 @@ def _level(
     )
 
 
-def _to_log_ratio(density: Float[ndarray, "x y z"], level: float) -> None:
-    """Replace densities by log(density / level), bounded: they grow by factors, and so their logarithm is straight."""
-    density /= level
-    np.clip(density, 1.0 / RATIO, RATIO, out=density)
-    np.log(density, out=density)
+def marching_cubes(
+    density: Float[ndarray, "x y z"], level: float, report: Report, block: int = BLOCK
+) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+    """Return the surface density = level: vertices in units of cells, and faces, anticlockwise as seen from outside.
+
+    Blocks share the points between them and so the vertices there, bit for bit, which are then made one.
+    """
+    measure = require_library("skimage.measure")
+    corners = list(product(*(range(0, size - 1, block) for size in density.shape)))
+    vertices, faces, shared = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.int32)], [np.zeros(0, bool)]
+    count = 0
+    for number, corner in enumerate(corners):
+        part = density[tuple(slice(start, start + block + 1) for start in corner)]
+        if part.min() < level < part.max():
+            found, triangles, _, _ = measure.marching_cubes(part, level)
+            vertices.append(np.array(corner, np.float32) + found)
+            # scikit-image's run clockwise where what is dense lies inside.
+            faces.append(triangles[:, ::-1] + np.int32(count))
+            shared.append(((found == 0) | (found == np.array(part.shape) - 1)).any(axis=1))
+            count += len(found)
+        report("surface", (number + 1) / len(corners))
+    return _joined(*(_emptied(parts) for parts in (vertices, faces, shared)))
 
 
-def _close(density: Float[ndarray, "x y z"]) -> None:
-    """Empty the outermost points: nothing lies outside of a bounded scene's box, and the surface is closed there."""
-    for axis in range(3):
-        faces = np.moveaxis(density, axis, 0)
-        faces[0] = faces[-1] = 0.0
+def _joined(
+    vertices: Float[ndarray, "all 3"], faces: Int[ndarray, "faces 3"], shared: ndarray
+) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
+    """Make one of the vertices that several blocks have, and drop the triangles that have no area then."""
+    of_one, of_many = np.flatnonzero(~shared), np.flatnonzero(shared)
+    once, place = np.unique(vertices[of_many], axis=0, return_inverse=True)
+    number = np.empty(len(vertices), np.int32)
+    number[of_one] = np.arange(len(of_one))
+    number[of_many] = len(of_one) + place.reshape(-1)
+    faces = number[faces]
+    a, b, c = faces.T
+    return np.concatenate([vertices[of_one], once]), faces[(a != b) & (b != c) & (a != c)]
+
+
+def _emptied(parts: list[ndarray]) -> ndarray:
+    # The parts would otherwise lie in memory beside the whole.
+    whole = np.concatenate(parts)
+    parts.clear()
+    return whole
+
+
+def without_floaters(
+    vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], least_share: float
+) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_faces 3"], int]:
+    """Return the connected parts that have at least this share of the largest one's faces, and how many have not."""
+    size, edges = len(vertices), np.concatenate([faces[:, :2], faces[:, 1:]])
+    links = coo_array((np.ones(len(edges), bool), edges.T), shape=(size, size))
+    _, part_of_vertex = connected_components(links, directed=False)
+    part = part_of_vertex[faces[:, 0]]
+    num_faces = np.bincount(part)
+    large = num_faces >= least_share * num_faces.max()
+    faces = faces[large[part]]
+    used = np.unique(faces)
+    place = np.full(size, -1, np.int32)
+    place[used] = np.arange(len(used))
+    return vertices[used], place[faces], int(((num_faces > 0) & ~large).sum())

@@ -1,7 +1,6 @@
 """The surface that the views see, as a mesh: their rendered depth, fused to one truncated signed distance."""
 
 from dataclasses import dataclass, replace
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -13,10 +12,10 @@ from torch.nn.functional import normalize
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Lattice, Report
-from nerf_lightning.export.marching_cubes import marching_cubes
+from nerf_lightning.export.density_mesh import marching_cubes
+from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.kernels.backends import twin, why_not
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import weighted_renderings
@@ -52,18 +51,13 @@ def mesh_of_depth(
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
     """Return vertices (scene frame) and faces of the surface that training views see, open where none looks.
 
-    Args:
-        model: in evaluation mode.
-        record: of the scene.
-        lattice: where the distance is kept.
-        truncation: how far before and behind a surface its distance is kept, in cells.
-        tile_points: most points that go through the field at once.
-        report: told how much of `depth` and `surface` is done.
+    `truncation` says how far before and behind a surface its distance is kept, in cells.
 
     Raises:
-        InputError: no view sees a surface in the box.
+        InputError: no view sees a surface in the box, or none sees one well.
     """
-    fuse, lower, reach = _kernels(), lattice.lower.numpy(), truncation * lattice.spacing
+    fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or take what.surface=density.")
+    lower, reach = lattice.lower.numpy(), truncation * lattice.spacing
     distance, weight = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
     rays_of = depth_rays(record, max(lattice.shape))
     cameras = rays_of.cameras
@@ -87,16 +81,6 @@ def mesh_of_depth(
             "at a grazing angle only, or by coarse pixels. Give a smaller what.resolution, or what.surface=density."
         )
     return lattice.to_scene(vertices), faces
-
-
-def _kernels() -> ModuleType:
-    found = twin("fusion.cpu")
-    if found is None:
-        raise InputError(
-            f"what.surface=tsdf needs numba, which cannot be used here: {why_not('fusion.cpu')}. Reinstall numba, or "
-            "take what.surface=density."
-        )
-    return found
 
 
 def _known(
@@ -135,9 +119,7 @@ def depth_view(
 def depth_rays(record: SceneRecord, cells: int) -> RayGenerator:
     """Return the rays of pinholes that look as training views do: depth is rendered, so no lens is needed.
 
-    Args:
-        record: of the scene.
-        cells: along the longest side of the grid; as many pixels has the longer side of a picture.
+    The longer side of a picture has as many pixels as the longest side of the grid has cells.
     """
     views = [view for view in record.splits["train"] if record.far[view] > record.near[view]]
     chosen = evenly_spaced_subset(views, VIEWS)

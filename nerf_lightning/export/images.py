@@ -15,7 +15,7 @@ from nerf_lightning.console import StageProgress, say
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_file_name
-from nerf_lightning.export.base import Export, require_no_files, require_no_folders
+from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
@@ -32,6 +32,7 @@ Split = Literal["train", "val", "test", "all"]
 # Pixels that stop less light have no depth.
 OPAQUE = 0.5
 LARGEST = 65_535
+KINDS = ("depth", "opacity", "normals")
 MILLIMETRE = 1e-3
 
 
@@ -50,18 +51,17 @@ class ImagesExport(Export):
     needs_density = False
 
     def __init__(self, split: Split = "test", max_views: int | None = None, depth: DepthKind = "distance"):
-        if max_views is not None and max_views < 1:
-            raise InputError(f"what.max_views={max_views}: give at least one view, or null for all.")
+        some = max_views is None or max_views >= 1
+        require_setting("max_views", max_views, some, "give at least one view, or null for all.")
         self.split, self.max_views, self.depth = split, max_views, depth
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
-        require_no_files(folder / name for name in ("depth", "opacity", "normals"))
-        require_no_folders([folder / "images.json"])
+        require_free(files=[folder / "images.json"], folders=[folder / name for name in KINDS])
         views = self._views(record)
         require_room(record.cameras, views, record.view_names)
         names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
-        depths, opacities, directions = (make_folder(folder, name) for name in ("depth", "opacity", "normals"))
+        depths, opacities, directions = (make_folder(folder, name) for name in KINDS)
         farthest = 0.0
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):

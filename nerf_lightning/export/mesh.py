@@ -13,16 +13,22 @@ from torch import Tensor
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
 from nerf_lightning.export import density_mesh, fused_mesh
-from nerf_lightning.export.atlas import find_texels, make_atlas
-from nerf_lightning.export.base import Export, refuse_ndc, require_no_folders
+from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
-from nerf_lightning.export.density_mesh import mesh_of_density
+from nerf_lightning.export.density_mesh import mesh_of_density, without_floaters
 from nerf_lightning.export.fused_mesh import mesh_of_depth
-from nerf_lightning.export.marching_cubes import without_floaters
-from nerf_lightning.export.mesh_files import MeshFormat, require_library, save_mesh, save_textured_mesh
+from nerf_lightning.export.mesh_files import GltfFrame, MeshFormat, require_library, save_mesh, save_textured_mesh
 from nerf_lightning.export.surface import SeenFrom, surface_colors
-from nerf_lightning.export.texture import LARGEST_SIZE, LEAST_SIZE, TextureMaker, require_texture_room
+from nerf_lightning.export.texture import (
+    LARGEST_SIZE,
+    LEAST_SIZE,
+    TextureMaker,
+    find_texels,
+    make_atlas,
+    require_texture_room,
+)
 from nerf_lightning.export.visibility import seen_faces
+from nerf_lightning.export.voxel_kernels.layout import ROOM
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -66,6 +72,8 @@ class MeshExport(Export):
             does not know; OBJ then has an MTL and a PNG beside it.
     """
 
+    kernels = (f"{ROOM}.tsdf_fusion", f"{ROOM}.texels")
+
     def __init__(
         self,
         resolution: int = 256,
@@ -80,10 +88,14 @@ class MeshExport(Export):
         texture_size: int = 2048,
         format: MeshFormat | None = None,
     ):
-        if threshold is not None and not threshold > 0:
-            raise InputError(f"what.threshold={threshold}: give a density above 0, or null to take it from the data.")
-        if not 1 <= truncation <= 64:
-            raise InputError(f"what.truncation={truncation}: give a number of cells from 1 to 64.")
+        positive = threshold is None or threshold > 0
+        require_setting("threshold", threshold, positive, "give a density above 0, or null to take it from the data.")
+        require_setting("truncation", truncation, 1 <= truncation <= 64, "give a number of cells from 1 to 64.")
+        shares = "give a share from 0 (all is kept) to 1 (the largest part)."
+        require_setting("min_share", min_share, 0 <= min_share <= 1, shares)
+        require_setting("faces", faces, faces is None or faces >= 4, "a closed mesh has 4 or more; null keeps all.")
+        sizes = f"give a number of texels from {LEAST_SIZE} to {LARGEST_SIZE}."
+        require_setting("texture_size", texture_size, LEAST_SIZE <= texture_size <= LARGEST_SIZE, sizes)
         if surface == "tsdf" and threshold is not None:
             raise InputError(
                 f"what.threshold={threshold} belongs to what.surface=density: with what.surface=tsdf the surface is "
@@ -93,14 +105,6 @@ class MeshExport(Export):
             raise InputError(
                 "what.seen_only=false asks for a closed mesh, and what.surface=tsdf knows only what the views see. "
                 "Take what.surface=density for it."
-            )
-        if not 0 <= min_share <= 1:
-            raise InputError(f"what.min_share={min_share}: give a share from 0 (all is kept) to 1 (the largest part).")
-        if faces is not None and faces < 4:
-            raise InputError(f"what.faces={faces}: a closed mesh has 4 or more; null keeps all.")
-        if not LEAST_SIZE <= texture_size <= LARGEST_SIZE:
-            raise InputError(
-                f"what.texture_size={texture_size}: give a number of texels from {LEAST_SIZE} to {LARGEST_SIZE}."
             )
         if texture and format == "ply":
             raise InputError(
@@ -118,7 +122,7 @@ class MeshExport(Export):
         """Write the mesh."""
         refuse_ndc(record, "mesh")
         beside = ("mtl", "png") if self.texture and self.format == "obj" else ()
-        require_no_folders(folder / f"mesh.{ending}" for ending in (self.format, *beside))
+        require_free(folder / f"mesh.{ending}" for ending in (self.format, *beside))
         require_library("trimesh")  # before the work, not after it
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT[self.surface])
         if self.texture:
@@ -128,46 +132,34 @@ class MeshExport(Export):
             vertices, faces = self._surface(model, record, lattice, tile_points, report)
             vertices, faces = self._cleaned(vertices, faces)
             log.info("%d vertices, %d faces", len(vertices), len(faces))
-            write = self._textured if self.texture else self._colored
-            return write(model, record, folder, vertices, faces, lattice.spacing, tile_points, report)
+            points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
+            reach = REACH * lattice.spacing
+            if not self.texture:
+                colors = surface_colors(model, record, points, normals, reach, self.colors, tile_points, report)
+                return self._save(record, folder, points, faces, normals, colors=colors.numpy())
+            atlas = make_atlas(vertices, faces, self.texture_size)
+            report("charts", 1.0)
+            maker = TextureMaker(model, record, points, normals, reach, tile_points)
+            picture = maker(find_texels(atlas, self.texture_size), self.texture_size, report)
+        source = torch.from_numpy(atlas.source)
+        return self._save(record, folder, points[source], atlas.faces, normals[source], uv=atlas.uv, picture=picture)
 
-    def _colored(
+    def _save(
         self,
-        model: Model,
         record: SceneRecord,
         folder: Path,
-        vertices: Float[ndarray, "vertices 3"],
+        points: Float[Tensor, "vertices 3"],
         faces: Int[ndarray, "faces 3"],
-        spacing: float,
-        tile_points: int,
-        report: Report,
+        normals: Float[Tensor, "vertices 3"],
+        **look: ndarray,
     ) -> list[Path]:
-        points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
-        colors = surface_colors(model, record, points, normals, REACH * spacing, self.colors, tile_points, report)
-        path, (placed, turned, up) = folder / f"mesh.{self.format}", _for_the_user(points, normals, record)
-        save_mesh(path, placed, faces, turned, colors.numpy(), up, record.metres_per_unit or 1.0)
-        return [path]
-
-    def _textured(
-        self,
-        model: Model,
-        record: SceneRecord,
-        folder: Path,
-        vertices: Float[ndarray, "vertices 3"],
-        faces: Int[ndarray, "faces 3"],
-        spacing: float,
-        tile_points: int,
-        report: Report,
-    ) -> list[Path]:
-        points, normals = torch.from_numpy(vertices), torch.from_numpy(vertex_normals(vertices, faces))
-        atlas = make_atlas(vertices, faces, self.texture_size)
-        report("charts", 1.0)
-        maker = TextureMaker(model, record, points, normals, REACH * spacing, tile_points)
-        picture = maker(find_texels(atlas, self.texture_size), self.texture_size, report)
-        placed, turned, up = _for_the_user(points, normals, record)
-        mesh = (placed[atlas.source], atlas.faces, turned[atlas.source])
-        path = folder / f"mesh.{self.format}"
-        return save_textured_mesh(path, *mesh, atlas.uv, picture, up, record.metres_per_unit or 1.0)
+        """Write a mesh of the scene's frame in the user's."""
+        to_user = record.to_user.double()
+        up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
+        placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
+        frame = GltfFrame(up.numpy(), record.metres_per_unit or 1.0)
+        save = save_textured_mesh if self.texture else save_mesh
+        return save(folder / f"mesh.{self.format}", placed.numpy(), faces, turned.numpy(), frame=frame, **look)
 
     def _surface(
         self, model: Model, record: SceneRecord, lattice: Lattice, tile_points: int, report: Report
@@ -206,13 +198,3 @@ def vertex_normals(
     for axis, part in enumerate(twice_area.T):
         normals[:, axis] = sum(np.bincount(corner, part, len(vertices)) for corner in faces.T)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
-
-
-def _for_the_user(
-    points: Float[Tensor, "vertices 3"], normals: Float[Tensor, "vertices 3"], record: SceneRecord
-) -> tuple[Float[ndarray, "vertices 3"], Float[ndarray, "vertices 3"], Float[ndarray, "3"]]:
-    """Return vertices, normals and the direction up in the user's frame."""
-    to_user = record.to_user.double()
-    up = directions_to_user(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), to_user)[0]
-    placed, turned = points_to_user(points.double(), to_user), directions_to_user(normals.double(), to_user)
-    return placed.numpy(), turned.numpy(), up.numpy()

@@ -1,6 +1,6 @@
 """Mesh files: PLY, OBJ and GLB, with a normal and a colour for each vertex or with a texture, by optional libraries."""
 
-from functools import partial
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -14,10 +14,35 @@ from PIL import Image
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.nerf.geometry.frames import upright_rotation
+from nerf_lightning.nerf.rendering.linear_light import to_linear
 
 MeshFormat = Literal["ply", "obj", "glb"]
 MADE_BY = {"mesh": "a mesh", "texture": "a mesh with a texture", "las": "points as LAS"}
 """What each extra of this package is needed for."""
+
+
+@dataclass(frozen=True)
+class GltfFrame:
+    """How vertices become glTF's, where y is up and a unit is a metre: the root node turns and scales their frame.
+
+    PLY and OBJ say nothing of up and of units, and keep the frame.
+    """
+
+    up: Float[ndarray, "3"]
+    """The unit vector that points up, in the frame of the vertices."""
+    metres: float
+    """How long a unit of that frame is; where nobody knows, 1."""
+
+    def __call__(self, tree: dict[str, Any]) -> None:
+        """Place the root node, and let no viewer add light of its own: it is in the colours already."""
+        (root,) = tree["scenes"][tree["scene"]]["nodes"]
+        placed = np.diag([self.metres, self.metres, self.metres, 1.0]) @ y_up(self.up)
+        tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
+        for primitive in (each for mesh in tree["meshes"] for each in mesh["primitives"]):
+            primitive["material"] = 0
 
 
 def save_mesh(
@@ -25,24 +50,10 @@ def save_mesh(
     vertices: Float[ndarray, "vertices 3"],
     faces: Int[ndarray, "faces 3"],
     normals: Float[ndarray, "vertices 3"],
+    frame: GltfFrame,
     colors: UInt8[ndarray, "vertices 3"],
-    up: Float[ndarray, "3"],
-    metres: float,
-) -> None:
-    """Write a mesh, whole or not at all; the ending says in which format.
-
-    PLY and OBJ say nothing of up and of units, and keep the frame. In glTF, y is up and a unit is a metre: there the
-    vertices keep the frame too, and the root node turns and scales it.
-
-    Args:
-        path: of the file.
-        vertices: where the corners are.
-        faces: three corners each.
-        normals: of the corners.
-        colors: of the corners, sRGB.
-        up: the unit vector that points up, in the frame of the vertices.
-        metres: how long a unit of that frame is; where nobody knows, 1.
-    """
+) -> list[Path]:
+    """Write a mesh with an sRGB colour per vertex, whole or not at all; the ending says in which format."""
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
     shown = _linear(colors) if form == "glb" else colors
@@ -50,11 +61,12 @@ def save_mesh(
     settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},
-        "glb": {"include_normals": True, "tree_postprocessor": partial(_as_gltf, up, metres)},
+        "glb": {"include_normals": True, "tree_postprocessor": frame},
     }
     content = mesh.export(file_type=form, **settings[form])
     with whole_file(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
+    return [path]
 
 
 def save_textured_mesh(
@@ -62,10 +74,9 @@ def save_textured_mesh(
     vertices: Float[ndarray, "vertices 3"],
     faces: Int[ndarray, "faces 3"],
     normals: Float[ndarray, "vertices 3"],
+    frame: GltfFrame,
     uv: Float[ndarray, "vertices 2"],
     picture: UInt8[ndarray, "height width 3"],
-    up: Float[ndarray, "3"],
-    metres: float,
 ) -> list[Path]:
     """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
 
@@ -76,10 +87,9 @@ def save_textured_mesh(
         vertices: where the corners are.
         faces: three corners each.
         normals: of the corners.
+        frame: of the vertices.
         uv: where each corner lies in the picture, from 0 to 1, to the right and up.
         picture: sRGB.
-        up: the unit vector that points up, in the frame of the vertices.
-        metres: how long a unit of that frame is; where nobody knows, 1.
     """
     trimesh = require_library("trimesh")
     image, visual = Image.fromarray(picture), trimesh.visual
@@ -93,14 +103,11 @@ def save_textured_mesh(
     textured = visual.TextureVisuals(uv=uv, material=material)
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=textured, process=False)
     if form == "glb":
-        contents = {
-            path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=partial(_as_gltf, up, metres))
-        }
+        contents = {path: mesh.export(file_type=form, include_normals=True, tree_postprocessor=frame)}
     else:
         exchange = require_library("trimesh.exchange.obj")
-        mtl = path.with_suffix(".mtl")
-        settings = {"include_normals": True, "return_texture": True, "mtl_name": mtl.name, "header": None}
-        text, beside = exchange.export_obj(mesh, **settings)
+        settings = {"include_normals": True, "return_texture": True, "header": None}
+        text, beside = exchange.export_obj(mesh, mtl_name=path.with_suffix(".mtl").name, **settings)
         contents = {path.with_name(name): content for name, content in beside.items()} | {path: text.encode()}
     for each, content in contents.items():
         with whole_file(each) as part:
@@ -110,9 +117,7 @@ def save_textured_mesh(
 
 def _linear(colors: UInt8[ndarray, "vertices 3"]) -> UInt8[ndarray, "vertices 3"]:
     """Return sRGB codes as bytes of linear light, which glTF takes vertex colours for."""
-    share = colors / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.rint(255.0 * linear).astype(np.uint8)
+    return np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
 
 
 def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
@@ -124,23 +129,6 @@ def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
     turned = np.eye(4)
     turned[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright_rotation(torch.from_numpy(up)).numpy()
     return turned
-
-
-def _as_gltf(up: Float[ndarray, "3"], metres: float, tree: dict[str, Any]) -> None:
-    (root,) = tree["scenes"][tree["scene"]]["nodes"]
-    placed = np.diag([metres, metres, metres, 1.0]) @ y_up(up)
-    tree["nodes"][root]["matrix"] = placed.T.flatten().tolist()  # column by column
-    _unlit(tree)
-
-
-def _unlit(tree: dict[str, Any]) -> None:
-    # The light is in the colours already: no viewer should add its own.
-    tree["extensionsUsed"] = ["KHR_materials_unlit"]
-    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    tree.setdefault("materials", [{"pbrMetallicRoughness": rough}])[0]["extensions"] = {"KHR_materials_unlit": {}}
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
 
 
 def require_library(name: str, extra: str = "mesh") -> Any:

@@ -9,8 +9,9 @@ from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
-from nerf_lightning.export.base import Export
+from nerf_lightning.export.base import Export, require_setting
 from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
+from nerf_lightning.export.voxel_kernels.layout import ROOM
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord, Space
 
@@ -53,7 +54,9 @@ class PageExport(Export):
             baked, which they do, too, where those cannot be read, or where the model has a correction for each camera.
     """
 
-    shows_photographs = True
+    needs_photographs = True
+    plays_path = True
+    kernels = tuple(f"{ROOM}.{module}" for module in ("bounded", "contracted", "gradients"))
 
     def __init__(
         self,
@@ -63,13 +66,13 @@ class PageExport(Export):
         max_views: int = 8,
         fit_steps: int = 60,
     ):
-        if resolution is not None and resolution < 8:
-            raise InputError(f"what.resolution={resolution}: give 8 voxels or more, or null for what.quality's.")
+        enough = resolution is None or resolution >= 8
+        require_setting("resolution", resolution, enough, "give 8 voxels or more, or null for what.quality's.")
         for name, value in (("photographs", photographs), ("max_views", max_views), ("fit_steps", fit_steps)):
-            if value < 0:
-                raise InputError(f"what.{name}={value}: give 0 or more.")
+            require_setting(name, value, value >= 0, "give 0 or more.")
         self.quality, self.photographs, self.max_views = quality, photographs, max_views
         self.resolution, self.fit_steps = resolution, fit_steps
+        self.needs_photographs = bool(photographs or max_views or fit_steps)
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the page, and say what it costs."""

@@ -17,10 +17,9 @@ from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.baking.baked_field import BakedField
+from nerf_lightning.export.baking.baked_field import BakedField, described, packed, unpacked
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
-from nerf_lightning.export.baking.payload import described, packed, unpacked
 from nerf_lightning.export.base import Beside
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
@@ -70,15 +69,7 @@ class Page:
 def page_of(
     marcher: Marcher, record: SceneRecord, beside: Beside, max_photographs: int, facts: list[tuple[str, str]]
 ) -> Page:
-    """Return the page of a baked field.
-
-    Args:
-        marcher: of the field.
-        record: its cameras and names.
-        beside: photographs, and what is known of the run.
-        max_photographs: most places to jump to; one at least.
-        facts: what is known of the page.
-    """
+    """Return the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
     field = packed(marcher.baked)
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
     middle, radius = _middle(marcher.baked, record)
@@ -98,33 +89,26 @@ def page_of(
         "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
     }
     grid = " x ".join(str(8 * count) for count in marcher.baked.shape)
-    known = [
-        ("scene", record.name),
-        *beside.facts,
-        *facts,
-        ("grid", f"{grid}, {about['bricks']:,} bricks of 8 x 8 x 8"),
-    ]
+    grid_fact = ("grid", f"{grid}, {about['blocks']:,} blocks of 8 x 8 x 8")
+    known = [("scene", record.name), *beside.facts, *facts, grid_fact]
     places = [_view(record, beside, view if max_photographs else None) for view in views]
-    return Page(
-        record.name,
-        known,
-        places,
-        _still(marcher, record, views[0]),
-        BEHIND[at_evaluation(record.background)],
-        about,
-        field,
-    )
+    still, behind = _still(marcher, record, views[0]), BEHIND[at_evaluation(record.background)]
+    return Page(record.name, known, places, still, behind, about, field)
 
 
 def write_page(page: Page, target: Path) -> None:
     """Write one file of HTML."""
-    style, shader = _text("page.css"), _text("march.glsl")
-    script = "\n".join(map(_text, SCRIPTS))
+    style, shader, *scripts = (
+        (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", "march.glsl", *SCRIPTS)
+    )
+    script = "\n".join(scripts)
+    # Nothing in a text may end the element that it stands in.
+    about = json.dumps(page.about).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     text = rendered(
         FOLDER / "page.html",
         page=page,
         policy=own_policy(script, style),
-        about=Markup(_in_script(json.dumps(page.about))),
+        about=Markup(about),
         script=Markup(script),
         style=Markup(style),
         shader=Markup(shader),
@@ -158,15 +142,6 @@ def is_page(path: Path, mark: bytes = MARK) -> bool:
             return mark in file.read(200)
     except InputError:
         return False
-
-
-def _text(name: str) -> str:
-    return (FOLDER / name).read_text(encoding="utf-8")
-
-
-def _in_script(text: str) -> str:
-    # Nothing in a text may end the element that it stands in.
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _middle(baked: BakedField, record: SceneRecord) -> tuple[list[float], float]:

@@ -1,6 +1,7 @@
 """A coloured point cloud with normals, from the rendered depth of the training views, as binary PLY or LAS."""
 
 import logging
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -13,8 +14,7 @@ from torch import Tensor
 from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.console import StageProgress
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.base import Export, require_no_folders
-from nerf_lightning.export.las_file import save_las
+from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
 from nerf_lightning.files.atomic import whole_file
@@ -63,27 +63,21 @@ class PointsExport(Export):
         tolerance: float = 0.01,
         format: PointFormat = "ply",
     ):
-        for name, value, least in (
-            ("num_points", num_points, 1),
-            ("max_views", max_views, 1),
-            ("longest", longest, 2),
-            ("agreement", agreement, 0),
-        ):
-            if value < least:
-                raise InputError(f"what.{name}={value}: give {least} or more.")
-        if agreement > NEIGHBOURS:
-            raise InputError(f"what.agreement={agreement}: {NEIGHBOURS} other views are asked, so give at most that.")
-        if not 0 <= min_opacity < 1:
-            raise InputError(f"what.min_opacity={min_opacity}: give a share of the light, from 0 to below 1.")
-        if not tolerance > 0:
-            raise InputError(f"what.tolerance={tolerance}: give a share of the distance, above 0.")
+        counts = {"num_points": num_points, "max_views": max_views, "longest": longest, "agreement": agreement}
+        for (name, value), least in zip(counts.items(), (1, 1, 2, 0), strict=True):
+            require_setting(name, value, value >= least, f"give {least} or more.")
+        asked = f"{NEIGHBOURS} other views are asked, so give at most that."
+        require_setting("agreement", agreement, agreement <= NEIGHBOURS, asked)
+        shares = "give a share of the light, from 0 to below 1."
+        require_setting("min_opacity", min_opacity, 0 <= min_opacity < 1, shares)
+        require_setting("tolerance", tolerance, tolerance > 0, "give a share of the distance, above 0.")
         self.num_points, self.max_views, self.longest = num_points, max_views, longest
         self.min_opacity, self.agreement, self.tolerance = min_opacity, agreement, tolerance
         self.format = format
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""
-        require_no_folders([folder / f"points.{self.format}"])
+        require_free(files=[folder / f"points.{self.format}"])
         if self.format == "las":
             require_library("laspy", "las")  # before the work, not after it
         views = evenly_spaced_subset(record.splits["train"], self.max_views)
@@ -138,11 +132,9 @@ class PointsExport(Export):
             pixels = num_pixels(longest)
             return BYTES_PER_PIXEL * pixels + BYTES_PER_POINT * min(pixels, self.num_points)
 
-        largest = int(torch.maximum(cameras.width, cameras.height).max())
-        count = len(cameras.width)
         require_memory(
-            f"what.longest={self.longest} makes {num_pixels(self.longest):,} points of {count} views",
-            min(self.longest, largest),
+            f"what.longest={self.longest} makes {num_pixels(self.longest):,} points of {len(cameras.width)} views",
+            min(self.longest, int(torch.maximum(cameras.width, cameras.height).max())),
             needed,
             lambda longest: f"what.longest={longest} (or a smaller what.max_views)",
         )
@@ -179,9 +171,52 @@ def save_points(
     rows = np.empty(len(points), LAYOUT)
     for name, column in zip((*NUMBERS, *COLORS), (*points.T, *normals.T, *colors.T), strict=True):
         rows[name] = column
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property float {name}" for name in NUMBERS] + [f"property uchar {name}" for name in COLORS]
-    header += ["end_header"]
+    header = [
+        *("ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"),
+        *(f"property float {name}" for name in NUMBERS),
+        *(f"property uchar {name}" for name in COLORS),
+        "end_header",
+    ]
+    with whole_file(path) as part:
+        part.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
+
+
+# LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
+MOST_STEPS = 1e9
+# What a cloud of one place at zero gets.
+FINEST = 1e-30
+# Colours have 16 bits there, full scale: 255 becomes 65535.
+COLOR_SCALE = 257
+
+
+def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarray, "points 3"]) -> None:
+    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colours, no normals), whole or not at all.
+
+    Raises:
+        InputError: laspy is not installed.
+    """
+    laspy = require_library("laspy", "las")
+    header = laspy.LasHeader(version="1.2", point_format=2)
+    header.generating_software = "nerf-lightning"
+    header.scales, header.offsets = scale_and_offset(points)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    las.red, las.green, las.blue = COLOR_SCALE * colors.T.astype(np.uint16)
     with whole_file(path) as part, part.open("wb") as file:
-        file.write(("\n".join(header) + "\n").encode())
-        file.write(rows.tobytes())
+        las.write(file, do_compress=False)
+
+
+def scale_and_offset(points: Float[ndarray, "points 3"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+    """Return the step of the whole numbers, one for all axes, and the place that they count from.
+
+    The step is the finest power of ten of which the extent takes at most 1e9, but no finer than what double precision
+    tells apart at this distance from zero. The offset is a whole number of steps at or below the least coordinates.
+
+    >>> scale, offset = scale_and_offset(np.array([[-3.0, 0.0, 1.0], [5.0, 2.0, 1.5]]))
+    >>> scale.tolist(), offset.tolist()
+    ([1e-08, 1e-08, 1e-08], [-3.0, 0.0, 1.0])
+    """
+    lowest = points.min(axis=0)
+    extent, finest = float((points.max(axis=0) - lowest).max()), float(np.spacing(np.abs(points).max()))
+    step = 10.0 ** math.ceil(math.log10(max(extent / MOST_STEPS, finest, FINEST)))
+    return np.full(3, step), step * np.floor(lowest / step)

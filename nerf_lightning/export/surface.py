@@ -1,6 +1,5 @@
 """Which density counts as the surface, and which colour its points have, looked at from the photographs' cameras."""
 
-from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -36,14 +35,17 @@ def surface_level(model: Model, record: SceneRecord, tile_points: int) -> float 
     Rays of the training views are rendered; where each opaque one has half of its light behind it the field is asked
     for its density. Their first fifth puts the mesh where the pictures see the surface, and leaves few holes.
     """
-    rays = _some_rays(record)
+    device = next(model.parameters()).device
+    rays, points = _some_rays(record).to(device), []
     if not rays.near.numel():
         return None
-    seen = torch.cat(list(_surface_points(model, rays, record, tile_points)))
+    for part, renderings in weighted_renderings(model, rays, record.background, fold(0, "surface"), tile_points):
+        at = part.origins + median_distances(renderings[-1], part)[:, None] * part.directions
+        points.append(at[renderings[-1].opacity > OPAQUE].cpu())
+    seen = torch.cat(points)
     seen = seen[((seen >= record.aabb[0]) & (seen <= record.aabb[1])).all(dim=-1)]
     if not len(seen):
         return None
-    device = next(model.parameters()).device
     density = torch.cat([model.density(part.to(device)).cpu() for part in seen.split(tile_points)])
     density = density[density > 0]  # on the very edge of an empty cell there may be none
     return float(density.quantile(QUANTILE)) if len(density) else None
@@ -61,15 +63,6 @@ def _some_rays(record: SceneRecord) -> RayBundle:
     return rays[(rays.far > rays.near).nonzero()[:, 0]]
 
 
-def _surface_points(
-    model: Model, rays: RayBundle, record: SceneRecord, tile_points: int
-) -> Iterator[Float[Tensor, "points 3"]]:
-    rays, key = rays.to(next(model.parameters()).device), fold(0, "surface")
-    for part, renderings in weighted_renderings(model, rays, record.background, key, tile_points):
-        at = part.origins + median_distances(renderings[-1], part)[:, None] * part.directions
-        yield at[renderings[-1].opacity > OPAQUE].cpu()
-
-
 SeenFrom = Literal["cameras", "normal"]
 # Of a short ray.
 SAMPLES = 8
@@ -84,21 +77,11 @@ def surface_colors(
     seen_from: SeenFrom,
     tile_points: int,
     report: Report,
-    stage: str = "colours",
 ) -> UInt8[Tensor, "points 3"]:
-    """Return the colour of each point.
+    """Return the colour of each point on the surface, in the scene's frame, as the last level has it.
 
-    Args:
-        model: its last level is asked.
-        record: of the scene.
-        points: on the surface, scene frame.
-        normals: unit, outward.
-        reach: half the length of a ray, scene units.
-        seen_from: `normal` looks straight at the surface; `cameras` from the training cameras that face it most
-            squarely, and so along directions that were learnt.
-        tile_points: most points that go through the field at once.
-        report: told how much is done.
-        stage: under this name.
+    A ray of twice `reach` (scene units) passes each. `normal` looks straight at the surface, against its unit outward
+    normal; `cameras` from the training cameras that face it most squarely, and so along directions that were learnt.
     """
     device = next(model.parameters()).device
     eyes = record.cameras.c2w[list(record.splits["train"]), :, 3]
@@ -106,11 +89,10 @@ def surface_colors(
     for part in tiles(len(points), max(1, tile_points // SAMPLES)):
         at, normal = points[part], normals[part]
         looks = -normal[None] if seen_from == "normal" else looks_from_facing(at, normal, eyes)
-        rgb = [
-            short_rays(model, at.to(device), look.to(device), reach, reach, SAMPLES, closed=True).rgb for look in looks
-        ]
+        ways, here = looks.to(device), at.to(device)
+        rgb = [short_rays(model, here, look, reach, reach, SAMPLES, closed=True).rgb for look in ways]
         colors[part] = to_bytes(torch.stack(rgb).mean(dim=0))
-        report(stage, part.stop / max(1, len(points)))
+        report("colours", part.stop / max(1, len(points)))
     return colors
 
 
@@ -132,7 +114,7 @@ def short_rays(
         before: how far before the points rays begin, scene units.
         behind: how far behind them they end.
         samples: of each ray.
-        closed: whether all light ends on them, that which is left at their ends; else it goes on.
+        closed: whether the light that is left ends there, or goes on.
     """
     edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
     intervals, origins = RaySamples(edges), at - before * look
@@ -153,7 +135,7 @@ def looks_from_nearest(
 ) -> Float[Tensor, "looks points 3"]:
     """Return unit directions to each point from the cameras that stand nearest to it."""
     parts = []
-    for part in _handy(points, eyes):
+    for part in tiles(len(points), max(1, PAIRS // len(eyes))):
         away = points[part, None] - eyes
         parts.append(_chosen(away, -away.norm(dim=-1)))
     return functional.normalize(torch.cat(parts, dim=1), dim=-1)
@@ -164,14 +146,10 @@ def looks_from_facing(
 ) -> Float[Tensor, "looks points 3"]:
     """Return unit directions to each point from the cameras that its unit normal points at most squarely."""
     parts = []
-    for part in _handy(points, eyes):
+    for part in tiles(len(points), max(1, PAIRS // len(eyes))):
         away = functional.normalize(points[part, None] - eyes, dim=-1)
         parts.append(_chosen(away, -(away * normals[part, None]).sum(dim=-1)))
     return torch.cat(parts, dim=1)
-
-
-def _handy(points: Tensor, eyes: Tensor) -> list[slice]:
-    return list(tiles(len(points), max(1, PAIRS // len(eyes))))
 
 
 def _chosen(away: Float[Tensor, "points cameras 3"], score: Float[Tensor, "points cameras"]) -> Tensor:

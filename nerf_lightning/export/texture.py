@@ -1,19 +1,22 @@
-"""A texture for a mesh: each texel has the colour that the views which see it best have of it."""
+"""A texture for a mesh: charts that lie flat in one square picture, and the colours that views have of each texel."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
-from nerf_lightning.export.atlas import Texels
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.surface import short_rays
+from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates, project
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model
@@ -24,6 +27,8 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
+# Texels between charts, so that none shines into another where a viewer mixes neighbours.
+PADDING = 4
 # Training views that are asked which places they see, and how many of them give a texel its colour.
 VIEWS, LOOKS = 100, 3
 # Views that see a surface less squarely (cosine) are not asked.
@@ -38,6 +43,51 @@ BYTES_PER_TEXEL = 100
 BEFORE, SAMPLES = 4.0, 20
 # Texels that are looked at together; a report follows each lot.
 TOGETHER = 1 << 16
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """A mesh whose vertices each have one place in a picture; where charts end, a vertex of the mesh has several."""
+
+    source: Int[ndarray, "corners"]
+    """Which vertex of the mesh each is."""
+    faces: Int[ndarray, "faces 3"]
+    uv: Float[ndarray, "corners 2"]
+    """From 0 to 1: to the right and, as mesh files have it, up."""
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The texels of a picture that show something."""
+
+    row: Int[ndarray, "texels"]
+    column: Int[ndarray, "texels"]
+    corners: Int[ndarray, "texels 3"]
+    """The vertices of the mesh around each."""
+    shares: Float[ndarray, "texels 3"]
+    """And how near it is to each; they add up to 1."""
+
+
+def make_atlas(vertices: Float[ndarray, "vertices 3"], faces: Int[ndarray, "faces 3"], size: int) -> Atlas:
+    """Cut a mesh into charts and pack them into a picture of `size` texels a side."""
+    xatlas = require_library("xatlas", "texture")
+    atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
+    atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
+    packing.resolution, packing.padding, packing.bilinear = size, PADDING, True
+    atlas.generate(xatlas.ChartOptions(), packing)
+    source, cut, uv = atlas[0]
+    return Atlas(source.astype(np.int64), cut.astype(np.int64), uv)
+
+
+def find_texels(atlas: Atlas, size: int) -> Texels:
+    """Return the texels whose centres the charts cover."""
+    cure = "Reinstall numba, or leave what.texture=true out for a colour per vertex."
+    texels = kernels("texels", "what.texture=true", cure)
+    down = np.stack([atlas.uv[:, 0], 1.0 - atlas.uv[:, 1]], axis=1) * size
+    face, shares = texels.covered_texels(down[atlas.faces], size)
+    row, column = np.nonzero(face >= 0)
+    corners = atlas.source[atlas.faces[face[row, column]]]
+    return Texels(row, column, corners, shares[row, column])
 
 
 def require_texture_room(size: int) -> None:
@@ -58,15 +108,8 @@ class TextureMaker:
     """Look at the places of a mesh from the training cameras that see them best.
 
     How well a camera sees a vertex is told by a whole ray; the colour of a texel then by a short one, through the
-    surface: what lies farther before it need not be asked about again.
-
-    Args:
-        model: in evaluation mode.
-        record: of the scene.
-        points: the mesh's vertices, scene frame.
-        normals: unit, outward.
-        reach: how far the mesh may be from the surface that the views see, scene units.
-        tile_points: most points that go through the field at once.
+    surface: what lies farther before it need not be asked about again. Vertices and their unit outward normals are in
+    the scene's frame; `reach` is how far the mesh may be from the surface that the views see, scene units.
     """
 
     def __init__(
@@ -103,8 +146,7 @@ class TextureMaker:
         picture, empty = np.zeros((size, size, 3), np.uint8), np.ones((size, size), bool)
         picture[texels.row[known], texels.column[known]] = to_bytes(colors[seen]).numpy()
         empty[texels.row[known], texels.column[known]] = False
-        morphology = require_library("scipy.ndimage")
-        row, column = morphology.distance_transform_edt(empty, return_distances=False, return_indices=True)
+        row, column = distance_transform_edt(empty, return_distances=False, return_indices=True)
         filled: UInt8[ndarray, "size size 3"] = picture[row, column]
         return filled
 
@@ -160,9 +202,7 @@ class TextureMaker:
         near = torch.minimum(record.near[view], end).clamp(min=0.0)
         # A little beyond the place, since a ray that ends at once would be sampled at the surface alone.
         rays = RayBundle(origins, directions, near, distance + self.reach, directions).to(self.device)
-        found = []
-        for tile, levels in weighted_renderings(
-            self.model, rays, record.background, fold(0, "surface"), self.tile_points
-        ):
+        key, found = fold(0, "surface"), []
+        for tile, levels in weighted_renderings(self.model, rays, record.background, key, self.tile_points):
             found.append(transmittance_at(levels[-1], tile, tile.far - 2.0 * self.reach).cpu())
         return torch.cat(found).float()

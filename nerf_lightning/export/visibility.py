@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -81,26 +81,21 @@ def num_agreeing(
     views: Sequence[int],
     tolerance: float,
 ) -> Int[Tensor, "points"]:
-    """Return how many of the views see each point as their surface.
+    """Return how many of the views see each point, in the working frame, as their surface.
 
     Args:
         points: in the working frame.
         cameras: of all views.
-        depths: by view, the distance along each pixel's ray to the surface (scene units); inf where nothing opaque is
-            seen.
+        depths: by view, along each pixel's ray to the surface (scene units); inf where nothing opaque is seen.
         views: those that are asked.
         tolerance: how far the point may lie from the surface, as a share of its distance.
     """
     count = torch.zeros(len(points), dtype=torch.int64)
     for view in views:
-        count += _sees(points, cameras, view, depths[view], tolerance).long()
+        distance = camera_coordinates(cameras, view, points).norm(dim=-1)
+        inside, x, y = seen_at(cameras, view, points)
+        count += inside & ((depths[view][y, x] - distance).abs() <= tolerance * distance)
     return count
-
-
-def _sees(points: Tensor, cameras: Cameras, view: int, depth: Tensor, tolerance: float) -> Bool[Tensor, "points"]:
-    distance = camera_coordinates(cameras, view, points).norm(dim=-1)
-    inside, x, y = seen_at(cameras, view, points)
-    return inside & ((depth[y, x] - distance).abs() <= tolerance * distance)
 
 
 # Training views that are rendered, and their longer side in pixels.
@@ -120,7 +115,6 @@ def seen_faces(
     faces: Int[ndarray, "faces 3"],
     tile_points: int,
     report: Report,
-    stage: str = "views",
 ) -> Int[ndarray, "seen 3"]:
     """Return the faces that a training view sees, or whose neighbours it does.
 
@@ -134,7 +128,7 @@ def seen_faces(
         picture = see(model, record, cameras, view, tile_points)
         depth = torch.where(picture.opacity > OPAQUE, picture.depth, torch.inf)
         seen |= num_agreeing(points, cameras, {view: depth}, [view], TOLERANCE) > 0
-        report(stage, (number + 1) / len(views))
+        report("views", (number + 1) / len(views))
     known = seen.numpy()
     kept = known[faces].any(axis=1)
     for _ in range(RINGS):

@@ -9,7 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.console import StageProgress
-from nerf_lightning.export.base import Export, refuse_ndc, require_no_folders
+from nerf_lightning.export.base import Export, refuse_ndc, require_free
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
 from nerf_lightning.export.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
@@ -42,7 +42,7 @@ class VolumeExport(Export):
         """Write the grids."""
         refuse_ndc(record, "volume")
         arrays, about = folder / "volume.npz", folder / "volume.json"
-        require_no_folders([arrays, about])
+        require_free(files=[arrays, about])
         lattice = require_resolution(record, self.resolution, BYTES_PER_POINT)
         with StageProgress(COSTS) as report:
             density = sample_density(model, lattice, tile_points, report)
@@ -93,9 +93,6 @@ def _colors(
 def _seen(
     model: Model, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
-    device, colors = next(model.parameters()).device, torch.zeros(len(points), 3)
-    looks = looks_from_nearest(points, eyes)
-    for look in looks:
-        output = model.at(Points(points.to(device), look.to(device)))
-        colors += output.rgb.cpu() / len(looks)
-    return to_bytes(colors)
+    device, looks = next(model.parameters()).device, looks_from_nearest(points, eyes)
+    colors = [model.at(Points(points.to(device), look.to(device))).rgb.cpu() / len(looks) for look in looks]
+    return to_bytes(sum(colors, torch.zeros(len(points), 3)))

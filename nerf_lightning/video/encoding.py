@@ -1,6 +1,7 @@
-"""Videos by the ffmpeg that imageio-ffmpeg carries: H.264 in mp4; with alpha VP9 in webm, and ProRes 4444 in mov.
+"""Films as one file: by ffmpeg H.264 in mp4, with alpha VP9 in webm and ProRes 4444 in mov; and animated WebP.
 
-ffmpeg is run here, not by imageio's writer, which rescales odd sizes and says nothing when ffmpeg fails.
+ffmpeg (imageio-ffmpeg carries one) is run here, not by imageio's writer, which rescales odd sizes and says nothing when
+it fails.
 """
 
 import shutil
@@ -8,12 +9,14 @@ import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
 
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
@@ -69,20 +72,61 @@ def write_video(
     codec = CODECS.get(path.suffix.lower())
     if codec is None:
         raise InputError(f"{path}: videos are written as mp4; choose a name that ends in .mp4 (or .webm, or .mov)")
+    first, frames = _counted(path, frames, total)
+    height, width, channels = pad_to_even(first).shape
+    with whole_file(path) as part, _encoder(part, codec, (width, height), channels == 4, fps) as pipe:
+        for frame in frames:
+            pipe.write(pad_to_even(frame).contiguous().numpy().tobytes())
+
+
+LARGEST_SIDE = 16383
+"""Of a WebP, in pixels."""
+QUALITY = 80
+
+
+def write_animation(
+    path: Path, frames: Iterable[UInt8[Tensor, "height width channels"]], fps: int, total: int | None = None
+) -> None:
+    """Write frames as an animated WebP, which pages and messages play by themselves, in a loop without end.
+
+    The arguments are those of `write_video`; each frame is shown for a whole number of milliseconds, equal neighbours
+    as one.
+
+    Raises:
+        InputError: frames larger than the format's largest.
+        ValueError: no frames, another number than `total`, or frames of different sizes.
+    """
+    first, frames = _counted(path, frames, total)
+    height, width, _ = first.shape
+    if max(height, width) > LARGEST_SIDE:
+        raise InputError(
+            f"{path}: a frame of {width} x {height} pixels is larger than a WebP can be, {LARGEST_SIDE} on a side. "
+            "Lower path.width, or write format=video."
+        )
+    pictures = (Image.fromarray(frame.numpy()) for frame in frames)
+    shown = {"duration": round(1000 / fps), "loop": 0, "quality": QUALITY}
+    with whole_file(path) as part:
+        next(pictures).save(part, "WEBP", save_all=True, append_images=pictures, **shown)
+
+
+def _counted(path: Path, frames: Iterable[Tensor], total: int | None) -> tuple[Tensor, Iterator[Tensor]]:
+    """Return the first frame, and all of them, which end in a ValueError where they are not as promised."""
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
-        raise ValueError(f"{path}: a video needs at least one frame")
-    height, width, channels = pad_to_even(first).shape
-    with whole_file(path) as part, _encoder(part, codec, (width, height), channels == 4, fps) as pipe:
+        raise ValueError(f"{path}: a film needs at least one frame")
+
+    def checked() -> Iterator[Tensor]:
         count = 0
-        for frame in _chain(first, frames):
+        for frame in chain([first], frames):
             if frame.shape != first.shape:
                 raise ValueError(f"{path}: frame {count} is {tuple(frame.shape)}, the first {tuple(first.shape)}")
-            pipe.write(pad_to_even(frame).contiguous().numpy().tobytes())
+            yield frame
             count += 1
         if total is not None and count != total:
             raise ValueError(f"{path}: {count} frames came, {total} were promised")
+
+    return first, checked()
 
 
 def pad_to_even(picture: UInt8[Tensor, "height width channels"]) -> UInt8[Tensor, "even_height even_width channels"]:
@@ -91,11 +135,6 @@ def pad_to_even(picture: UInt8[Tensor, "height width channels"]) -> UInt8[Tensor
     rows = torch.arange(height + height % 2).clamp(max=height - 1)
     columns = torch.arange(width + width % 2).clamp(max=width - 1)
     return picture[rows][:, columns]
-
-
-def _chain(first: Tensor, rest: Iterator[Tensor]) -> Iterator[Tensor]:
-    yield first
-    yield from rest
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.nerf.models.render_image import Picture
+from nerf_lightning.nerf.rendering.linear_light import to_linear
 
 NOTHING = 1e10
 """The depth of a pixel that stops less than half of the light, as Blender writes it."""
@@ -38,28 +39,19 @@ def exr_channels(
         picture: the view; where alpha is wanted, rendered over black.
         depth: of what stops the light, for channel Z; None: without it.
         colors: whether to hold R, G and B.
-        alpha: whether to hold A too; then colours are associated, that is multiplied with it, as EXR has them.
+        alpha: whether to hold A too; then colours are multiplied with it, as EXR has them.
     """
     channels: dict[str, Tensor] = {}
     if colors:
         opacity = picture.opacity[..., None]
-        rgb = linear_light(picture.rgb / opacity.clamp(min=1e-4)) * opacity if alpha else linear_light(picture.rgb)
+        straight = picture.rgb / opacity.clamp(min=1e-4) if alpha else picture.rgb
+        rgb = to_linear(straight.clamp(0, 1)) * (opacity if alpha else 1.0)
         channels |= zip("RGB", rgb.unbind(dim=-1), strict=True)
         if alpha:
             channels["A"] = picture.opacity.clamp(0, 1)
     if depth is not None:
         channels["Z"] = torch.where(picture.opacity > 0.5, depth, NOTHING)
     return channels
-
-
-def linear_light(rgb: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
-    """Return sRGB-encoded colours as linear light (IEC 61966-2-1), both from 0 to 1.
-
-    >>> linear_light(torch.tensor([0.0, 0.5, 1.0]))
-    tensor([0.0000, 0.2140, 1.0000])
-    """
-    rgb = rgb.clamp(0, 1)
-    return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
 
 
 def save_exr(path: Path, channels: Channels) -> None:

@@ -80,17 +80,10 @@ def film_steps(
     settings: FilmSettings,
     shows_encoding: bool = True,
 ) -> FilmSteps:
-    """Film a frame at a time, for who has something else to do between two; what is not said here is as in `film`.
+    """Film a frame at a time, for who has something else to do between two; the arguments are those of `film`.
 
-    Yields how many frames of how many are there: at first, and after each. Then `films_of` makes the films.
-
-    Args:
-        subjects: models of one capture.
-        path: where the cameras are.
-        tile_points: most points that go through a field at once.
-        folder: where to.
-        settings: what is filmed.
-        shows_encoding: show in the terminal how far the making of the films is.
+    Yields how many frames of how many are there: at first, and after each. Then `films_of` makes the films;
+    `shows_encoding`: show in the terminal how far that is.
 
     Raises:
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
@@ -202,12 +195,7 @@ def bytes_per_pixel(settings: FilmSettings, num_models: int) -> int:
 
 
 def require_room(cameras: Cameras, settings: FilmSettings, num_models: int = 1) -> None:
-    """Refuse frames that take more memory than can be had.
-
-    Args:
-        cameras: of the path, all of one size.
-        settings: what is filmed.
-        num_models: so many are filmed side by side.
+    """Refuse frames (of cameras of one size) that take more memory than can be had.
 
     Raises:
         InputError: in all processes; it says which size would fit.

@@ -20,8 +20,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_folder, make_ours
-from nerf_lightning.video.animation import write_animation
-from nerf_lightning.video.encoding import write_video
+from nerf_lightning.video.encoding import write_animation, write_video
 from nerf_lightning.video.exr import Channels, save_exr
 from nerf_lightning.video.settings import ENDINGS, Form
 from nerf_lightning.visualization.pictures import save_png

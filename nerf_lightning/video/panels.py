@@ -1,6 +1,6 @@
 """The panels of a film: what is shown of a rendered view, and how panels make one picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float, UInt8
@@ -63,24 +63,18 @@ def film_pictures(
     """
     several = len(panels) > 1
     size = letter_size(next(iter(panels[0].values())).shape[0])
+
+    def row(captioned: Iterable[tuple[UInt8[Tensor, "_ _ 3"], str]]) -> UInt8[Tensor, "_ _ 3"]:
+        return side_by_side([with_caption(picture, text, size) for picture, text in captioned], gap=size)
+
     if mosaic:
-        rows = [
-            side_by_side(
-                [with_caption(each[name], f"{label} | {name}" if several else name, size) for name in each], gap=size
-            )
-            for each, label in zip(panels, labels, strict=True)
-        ]
+        named = zip(panels, [f"{label} | " if several else "" for label in labels], strict=True)
+        rows = [row((each[name], prefix + name) for name in each) for each, prefix in named]
         return {"mosaic": _framed(_stacked(rows, size), size)}
     if not several:
         return {FILMS[name]: picture for name, picture in panels[0].items()}
     return {
-        FILMS[name]: _framed(
-            side_by_side(
-                [with_caption(each[name], label, size) for each, label in zip(panels, labels, strict=True)], gap=size
-            ),
-            size,
-        )
-        for name in panels[0]
+        FILMS[name]: _framed(row(zip((each[name] for each in panels), labels, strict=True)), size) for name in panels[0]
     }
 
 

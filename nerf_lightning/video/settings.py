@@ -72,31 +72,25 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
     if config["alpha"]:
         _check_alpha(config, outputs)
     require_one_of(get_args(Projection), projection=config["projection"])
-    return FilmSettings(
-        outputs=outputs,
-        mosaic=config["mosaic"],
-        form=config["format"],
-        alpha=config["alpha"],
-        near=_near(config["near"]),
-        crop=_crop(config["crop"]),
-        hold_camera=config["hold_camera"],
-        projection=config["projection"],
-    )
+    plain = {name: config[name] for name in (*SWITCHES, "projection")}
+    return FilmSettings(outputs, form=config["format"], near=_near(config["near"]), crop=_crop(config["crop"]), **plain)
 
 
 def _check_alpha(config: Mapping[str, Any], outputs: tuple[str, ...]) -> None:
-    refusals = {
-        "format=video makes mp4, which has no alpha. Give format=webm (for browsers), format=prores (for editing), "
-        "format=animation, format=frames or format=exr": config["format"] == "video",
-        f"background={config['background']} would lie behind the scene. Leave one of the two out": (
-            config["background"] is not None
-        ),
-        "mosaic=true sets pictures on white paper. Leave one of the two out": config["mosaic"],
-        "the colours get it, and outputs has no rgb": "rgb" not in outputs,
-    }
-    for reason, refused in refusals.items():
-        if refused:
-            raise InputError(f"alpha=true: {reason}.")
+    if config["format"] == "video":
+        reason = (
+            "format=video makes mp4, which has no alpha. Give format=webm (for browsers), format=prores (for editing), "
+            "format=animation, format=frames or format=exr"
+        )
+    elif config["background"] is not None:
+        reason = f"background={config['background']} would lie behind the scene. Leave one of the two out"
+    elif config["mosaic"]:
+        reason = "mosaic=true sets pictures on white paper. Leave one of the two out"
+    elif "rgb" not in outputs:
+        reason = "the colours get it, and outputs has no rgb"
+    else:
+        return
+    raise InputError(f"alpha=true: {reason}.")
 
 
 def as_list(value: Any) -> list[Any]:

@@ -64,14 +64,10 @@ class Shot:
 
     def picture(self, frame: int) -> Picture:
         """Render one frame."""
+        looked_up = None if self.seen_from is None else RayGenerator(self.seen_from, self.near, self.far)
+        subject = self.subject
         return render_picture(
-            self.subject.model,
-            self.rays,
-            frame,
-            self.subject.background,
-            self.tile_points,
-            self.clip,
-            None if self.seen_from is None else RayGenerator(self.seen_from, self.near, self.far),
+            subject.model, self.rays, frame, subject.background, self.tile_points, self.clip, looked_up
         )
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:

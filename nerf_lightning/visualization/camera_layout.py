@@ -78,8 +78,7 @@ def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
     axes.set_ylabel("elevation (degrees)", fontsize=9)
     axes.set_xticks(range(-180, 181, 45))
     axes.set_yticks(range(-90, 91, 30))
-    axes.tick_params(labelsize=8, color="0.7")
-    axes.spines[:].set_color("0.8")
+    _style(axes)
 
 
 def _draw_cameras(
@@ -90,15 +89,8 @@ def _draw_cameras(
     centers = scene.cameras.c2w[:, :, 3]
     middle = middle_of(scene)
     size = float((centers - middle).norm(dim=-1).max().clamp(min=1e-6))
-    axes.scatter(
-        content[:, shown[0]].numpy(),
-        content[:, shown[1]].numpy(),
-        s=2.0,
-        color=CONTENT,
-        alpha=0.45,
-        linewidths=0,
-        zorder=1,
-    )
+    x, y = content[:, shown].numpy().T
+    axes.scatter(x, y, s=2.0, color=CONTENT, alpha=0.45, linewidths=0, zorder=1)
     if scene.space == "bounded":
         low, high = scene.aabb[:, shown].numpy()
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
@@ -107,8 +99,8 @@ def _draw_cameras(
         lines = np.concatenate([_frustum(scene, view, 0.13 * size)[:, :, shown] for view in views])
         axes.add_collection(LineCollection(list(lines), colors=COLOURS[split], linewidths=0.8, alpha=0.8, zorder=2))
         label = f"{split} ({len(views)})"
-        x, y = centers[views][:, shown].unbind(dim=-1)
-        axes.scatter(x.numpy(), y.numpy(), s=9, color=COLOURS[split], label=label, zorder=3)
+        x, y = centers[views][:, shown].numpy().T
+        axes.scatter(x, y, s=9, color=COLOURS[split], label=label, zorder=3)
     everything = torch.cat([centers[:, shown], middle[None, shown]]).numpy()
     if scene.space == "bounded":
         everything = np.concatenate([everything, scene.aabb[:, shown].numpy()])
@@ -126,8 +118,7 @@ def _draw_cameras(
     axes.set_ylabel(names[shown[1]], fontsize=9)
     axes.set_title(title, fontsize=11)
     axes.grid(True, color="0.93", linewidth=0.8, zorder=0)
-    axes.tick_params(labelsize=8, color="0.7")
-    axes.spines[:].set_color("0.8")
+    _style(axes)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
 
 
@@ -159,8 +150,7 @@ def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
     axes.set_ylabel("y", fontsize=9)
     axes.grid(True, color="0.93", linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8, color="0.7")
-    axes.spines[:].set_color("0.8")
+    _style(axes)
 
 
 def _splits(scene: SceneRecord) -> dict[str, list[int]]:
@@ -171,3 +161,8 @@ def _splits(scene: SceneRecord) -> dict[str, list[int]]:
 def _unit(azimuth: Tensor, elevation: Tensor) -> Tensor:
     a, e = azimuth.deg2rad(), elevation.deg2rad()
     return torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], dim=-1)
+
+
+def _style(axes: "Axes") -> None:
+    axes.tick_params(labelsize=8, color="0.7")
+    axes.spines[:].set_color("0.8")

@@ -16,8 +16,14 @@ def _unknown(monkeypatch):
 
 def test_a_page_goes_without_photographs_and_says_so(caplog):
     typed = ["ckpt=a", "what=page"]
-    assert prepare._export(typed) == ["what.photographs=0", "what.max_views=0", *typed]
-    assert caplog.messages == ["The page will be without photographs: nobody knows it"]
+    assert prepare._export(typed) == ["photographs=false", *typed]
+    assert caplog.messages == ["what=page goes without photographs: nobody knows it"]
+
+
+def test_the_scene_is_named_only_for_exporters_that_need_photographs():
+    assert prepare._export(["ckpt=a", "what=volume"]) == ["ckpt=a", "what=volume"]
+    assert prepare._export(["ckpt=a"]) == ["ckpt=a"]
+    assert prepare._export(["ckpt=a", "what=my_own"])[0] == "photographs=false"
 
 
 @pytest.mark.parametrize(("wish", "said"), [([], 1), (["photographs=false"], 0)])

@@ -1,10 +1,12 @@
 """`nerf export` from end to end: what it writes, and what it says of bad input."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from support import extensions
 from support.running import said
 
 
@@ -60,6 +62,19 @@ def test_a_page_shows_the_photographs_and_what_is_known_of_the_run(nerf, last, f
     (tmp_path / "page.html").write_text("something else")
     said(nerf("export", f"ckpt={last}", "what=page", where), "page.html", "would be lost", "paths.output_dir=DIR")
     said(nerf("export", f"ckpt={last}", "what=page", "what.quality=huge", where), "what.quality=huge", "small, medium")
+
+
+def test_an_exporter_of_ones_own_gets_the_photographs_that_it_needs(nerf, last, capture, tmp_path):
+    searched = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
+    given = ("export", searched, f"ckpt={last}", "what=mean_colors", f"paths.output_dir={tmp_path}")
+    assert nerf(*given).code == 0
+    found = json.loads((tmp_path / "mean_colors.json").read_text())
+    images = np.load(capture)["images"]
+    assert found
+    for name, (photographed, _) in found.items():
+        np.testing.assert_allclose(photographed, images[int(name)].mean(axis=(0, 1)), atol=3e-3)
+    assert nerf(*given, "photographs=false").code == 0
+    assert json.loads((tmp_path / "mean_colors.json").read_text()) == {}
 
 
 def test_photographs_that_are_gone_are_said_and_left_out(nerf, last, tmp_path):

@@ -2,16 +2,13 @@
 
 import json
 import os
-import signal
 import sys
-import time
 from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from support.known_fields import INSIDE, solid
 from support.running import said, start
 from support.scenes import ball_scene, tiny_field
@@ -204,15 +201,6 @@ def test_a_render_that_was_stopped_goes_on(nerf, last, tmp_path, monkeypatch):
             assert (stopped / place).read_bytes() == (whole / place).read_bytes(), place
 
 
-def test_films_that_pages_play_by_themselves(nerf, last, tmp_path):
-    result = nerf("render", f"ckpt={last}", *SMALL, "format=animation", "path.fps=10", f"paths.output_dir={tmp_path}")
-    assert result.code == 0, result.err
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.webp", "video.webp"]
-    with Image.open(tmp_path / "video.webp") as found:
-        found.load()
-        assert (found.width, found.n_frames, found.info["duration"]) == (12, 2, 100)
-
-
 def test_panoramas_show_what_their_faces_show(last, rendered):
     """Ahead, the middle of a panorama is what a camera of 90 degrees sees."""
     width = ("path.width=64", "outputs=[rgb]")
@@ -231,12 +219,6 @@ def test_a_single_frame_is_a_film(last, rendered):
     assert rendered(last, "path.num_frames=1", frame=0)["video"].shape == (12, 12, 3)
 
 
-def test_other_settings_begin_anew(nerf, last, tmp_path, rendered):
-    before = rendered(last)["video"]
-    after = rendered(last, "path.elevation=60.0")["video"]
-    assert not np.array_equal(before, after)
-
-
 def test_a_film_is_of_one_precision(last, rendered):
     """Frames that are there already are those of the same precision only."""
     exact, mixed = ("trainer.precision=32-true", "trainer.precision=bf16-mixed")
@@ -244,29 +226,6 @@ def test_a_film_is_of_one_precision(last, rendered):
     after, alone = rendered(last, mixed)["video"], rendered(last, mixed, name="b")["video"]
     assert not np.array_equal(before, alone)
     assert np.array_equal(after, alone)
-
-
-@pytest.mark.slow
-def test_a_killed_render_goes_on_to_a_video(nerf, last, tmp_path):
-    arguments = [
-        "render",
-        f"ckpt={last}",
-        "path=orbit",
-        "path.num_frames=12",
-        "path.width=40",
-        f"paths.output_dir={tmp_path}",
-    ]
-    process = start(*arguments)
-    while process.poll() is None and len(list(tmp_path.glob(".frames/depth/frame_*.png"))) < 3:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
-    there = len(list(tmp_path.glob(".frames/depth/frame_*.png")))
-    assert 3 <= there < 12
-    result = nerf(*arguments)
-    assert result.code == 0, result.err
-    assert f"{there} of 12 frames are there already" in result.err
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
 
 
 @pytest.mark.exhaustive

@@ -5,28 +5,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.lpips import LPIPS, LPIPS_HINT, load_lpips
 
 # As published in torchvision's state dicts of alexnet and vgg16.
-ALEXNET = {
-    0: (64, 3, 11, 11),
-    3: (192, 64, 5, 5),
-    6: (384, 192, 3, 3),
-    8: (256, 384, 3, 3),
-    10: (256, 256, 3, 3),
-}
-VGG16 = {
-    0: (64, 3, 3, 3),
-    2: (64, 64, 3, 3),
-    5: (128, 64, 3, 3),
-    7: (128, 128, 3, 3),
-    10: (256, 128, 3, 3),
-    12: (256, 256, 3, 3),
-    14: (256, 256, 3, 3),
-    17: (512, 256, 3, 3),
-    19: (512, 512, 3, 3),
-    21: (512, 512, 3, 3),
-    24: (512, 512, 3, 3),
-    26: (512, 512, 3, 3),
-    28: (512, 512, 3, 3),
-}
+ALEXNET = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+_VGG = {0: (64, 3), 2: (64, 64), 5: (128, 64), 7: (128, 128), 10: (256, 128), 12: (256, 256), 14: (256, 256)}
+_VGG |= {17: (512, 256)} | dict.fromkeys((19, 21, 24, 26, 28), (512, 512))
+VGG16 = {index: (*channels, 3, 3) for index, channels in _VGG.items()}
 
 
 def torchvision_like(shapes):
@@ -55,6 +37,7 @@ def test_names_and_shapes_are_torchvisions(net, shapes):
 def test_equal_pictures_have_no_distance(lpips):
     picture = torch.rand(48, 64, 3)
     assert lpips(picture, picture) == 0.0
+    assert not any(parameter.requires_grad for parameter in lpips.parameters())
 
 
 def test_distance_is_symmetric_positive_and_grows_with_noise(lpips):
@@ -92,15 +75,6 @@ def test_too_small_a_picture_has_no_score(lpips):
         lpips(torch.rand(smallest - 1, 64, 3), torch.rand(smallest - 1, 64, 3))
 
 
-def test_nothing_learns(lpips):
-    assert not lpips.training
-    assert not any(parameter.requires_grad for parameter in lpips.parameters())
-
-
-def test_no_file_is_no_metric():
-    assert load_lpips(None) is None
-
-
 def test_a_missing_file_says_how_to_get_it(tmp_path):
     with pytest.raises(InputError) as caught:
         load_lpips(str(tmp_path / "alexnet.pth"))
@@ -131,8 +105,6 @@ def test_a_wrong_file_is_named(tmp_path):
     ("change", "words"),
     [
         (lambda tensor: tensor * float("nan"), "features.0.weight holds NaN or infinity"),
-        (lambda tensor: tensor / 0, "features.0.weight holds NaN or infinity"),
-        (lambda tensor: tensor.to(torch.complex64), "features.0.weight is of the type complex64"),
         (lambda tensor: tensor.to(torch.int8), "features.0.weight is of the type int8"),
     ],
 )

@@ -201,5 +201,3 @@ def test_what_an_animation_does_not_hold_is_said(tmp_path, caplog):
     with pytest.raises(InputError, match=r"what\.format=blender: the photographs are fisheye ones"):
         exported_in(tmp_path / "fish_out", round_, "blender")
     assert not (tmp_path / "fish_out").exists()
-    with pytest.raises(InputError, match=r"what\.fps=0"):
-        CamerasExport(fps=0)

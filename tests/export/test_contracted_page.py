@@ -13,8 +13,7 @@ from nerf_lightning.export.baking.contraction import Contraction, is_place, num_
 from nerf_lightning.export.baking.cost import measured_cost
 from nerf_lightning.export.baking.density import dilated
 from nerf_lightning.export.baking.marcher import Marcher
-from nerf_lightning.export.baking.payload import described, packed, unpacked
-from nerf_lightning.nerf.kernels.bricks.layout import kernels
+from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.types.rays import RayBundle
 
 
@@ -76,12 +75,6 @@ def test_depth_is_in_units_of_the_scene(baked):
     )  # the last 2 % are left out
 
 
-def test_what_is_packed_comes_back(baked):
-    again = unpacked(described(baked), packed(baked))
-    assert again.contraction == baked.contraction
-    np.testing.assert_array_equal(again.colors, baked.colors)
-
-
 def test_the_light_of_rays_is_stopped_where_it_is_and_all_of_it_is_shared_out():
     """In fog of constant density within a ball, from its middle and from beside it; closed form: 1 - exp(-sigma l)."""
     sigma, end, grid = 0.4, 2.5, 64
@@ -92,7 +85,7 @@ def test_the_light_of_rays_is_stopped_where_it_is_and_all_of_it_is_shared_out():
     ways = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     origins = torch.zeros(200, 3)
     origins[100:] = torch.tensor([0.5, -0.3, 0.2])
-    stopped = kernels("bricks.contracted").stopped_light(optical, origins.numpy(), ways.numpy(), space.near, 0.5)
+    stopped = kernels("contracted").stopped_light(optical, origins.numpy(), ways.numpy(), space.near, 0.5)
     along = (origins * ways).sum(dim=-1)
     length = -along + (along**2 + end**2 - origins.square().sum(dim=-1)).sqrt() - space.near
     assert stopped.sum() == pytest.approx(float((1 - torch.exp(-sigma * length)).sum()), rel=0.02)
@@ -109,8 +102,8 @@ def test_what_no_view_sees_is_left_out_and_what_is_missing_is_as_what_is_met():
     baked = baked_ball(48, 1, shiny_model(wall, inside=50.0), hall_record())
     assert baked.closed
     at = np.argwhere(baked.colored)
-    brick = np.stack(np.unravel_index(baked.bricks[at[:, 0]], baked.shape), axis=1)
-    places = torch.from_numpy(np.array(baked.lower) + np.array(baked.spacing) * (8 * brick + at[:, 1:])).float()
+    block = np.stack(np.unravel_index(baked.blocks[at[:, 0]], baked.shape), axis=1)
+    places = torch.from_numpy(np.array(baked.lower) + np.array(baked.spacing) * (8 * block + at[:, 1:])).float()
     assert baked.contraction.world(places).norm(dim=-1).max() < 3.2
     ways = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     none = torch.zeros(500)

@@ -226,7 +226,7 @@ def test_what_is_wrong_is_said_on_the_page(page, tmp_path):
         whole[: payload + 2000]: "This file is not whole: 0.00 MB of the scene's",
         whole[: whole.index('<script type="application/json"')]: "the file is not whole",
         whole[: payload + 400] + "AAAAAAAA" + whole[payload + 408 :]: "The scene in this file is damaged",
-        whole.replace('"bricks": ', '"bricks": 1'): "The scene in this file is damaged",
+        whole.replace('"blocks": ', '"blocks": 1'): "The scene in this file is damaged",
     }
     with opened("about:blank", 256, 360) as driver:
         for text, said in cases.items():

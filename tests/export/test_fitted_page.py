@@ -7,7 +7,6 @@ import pytest
 import torch
 from support.baked_ball import all_around, baked_ball, beside, quiet, record_of, shiny_model
 from support.contracted_hall import hall_model, hall_record, hall_scene
-from support.running import refused
 
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.fitting import _TrainingRays, _Values, fitted
@@ -151,4 +150,3 @@ def test_a_page_is_fitted_unless_the_cameras_have_corrections(tmp_path, monkeypa
         with torch.no_grad():
             what.export(shiny_model(), record_of(all_around()), tmp_path, 4096)
     assert steps == [7]
-    refused(PageExport, "small", None, 0, 0, -1, parts=("what.fit_steps=-1",))

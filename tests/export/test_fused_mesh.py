@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import psutil
 import pytest
 import torch
 import trimesh
@@ -88,31 +87,4 @@ def test_what_no_view_sees_is_refused_with_the_cure(tmp_path):
 def test_what_is_seen_too_badly_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(fused_mesh, "LEAST_WEIGHT", 1e3)
     with pytest.raises(InputError, match="No surface of ball is seen well enough"):
-        exported(tmp_path, solid(ball()), record())
-
-
-def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch):
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1_000_000_000}))
-    with pytest.raises(
-        InputError, match=r"2049 x 2049 x 2049 points, which takes 103\.\d GB.*what\.resolution=\d+ would"
-    ):
-        exported(tmp_path, solid(ball()), record(), resolution=2048)
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"threshold": 3.0}, r"what\.threshold=3\.0 belongs to what\.surface=density"),
-        ({"seen_only": False}, r"what\.seen_only=false asks for a closed mesh.*what\.surface=density"),
-        ({"truncation": 0.5}, r"what\.truncation=0\.5: give a number of cells from 1 to 64"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(settings, said):
-    with pytest.raises(InputError, match=said):
-        MeshExport(surface="tsdf", **settings)
-
-
-def test_without_numba_it_is_refused_and_density_is_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(fused_mesh, "twin", lambda module: None)
-    with pytest.raises(InputError, match=r"what\.surface=tsdf needs numba.*take what\.surface=density"):
         exported(tmp_path, solid(ball()), record())

@@ -69,8 +69,6 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(t
     assert not (tmp_path / "out").exists()
 
 
-def test_refusals(tmp_path):
-    with pytest.raises(InputError, match=r"what\.max_views=0"):
-        ImagesExport(max_views=0)
+def test_a_split_without_views_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"ball has no val views"):
         ImagesExport(split="val").export(solid(ball()), record(splits={"train": (0,), "val": ()}), tmp_path, TILE)

@@ -1,10 +1,8 @@
 """Meshes: the surface of known solids, in the user's frame, in every format; what cannot be meshed is refused."""
 
-import builtins
 import json
 import logging
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import psutil
@@ -18,9 +16,8 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.errors import InputError
-from nerf_lightning.export import mesh_files as mesh_libraries
 from nerf_lightning.export.density_grid import Lattice
-from nerf_lightning.export.marching_cubes import marching_cubes, without_floaters
+from nerf_lightning.export.density_mesh import marching_cubes, without_floaters
 from nerf_lightning.export.mesh import MeshExport
 from nerf_lightning.nerf.geometry.frames import similarity, unit_of, upright_rotation
 
@@ -243,42 +240,6 @@ def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypat
     with pytest.raises(InputError, match="4194304 x 4194304 x 4194304 points"):  # 64 bits count none
         exported(tmp_path, solid(ball()), record(), resolution=2**22 - 1)
     exported(tmp_path, solid(ball()), record(), resolution=20)
-
-
-def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch):
-    def absent(name):
-        if name.startswith("skimage"):
-            raise ImportError("No module named 'skimage'")
-        return import_module(name)
-
-    monkeypatch.setattr(mesh_libraries, "import_module", absent)
-    with pytest.raises(InputError, match=r"needs scikit-image, .*pip install 'nerf-lightning\[mesh\]'"):
-        exported(tmp_path, solid(ball()), record())
-
-
-def test_ndc_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"what=mesh: ball was trained in normalised device coordinates"):
-        exported(tmp_path, solid(ball()), record(space="ndc"))
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"resolution": 1}, {"threshold": 0.0}, {"min_share": 2.0}, {"faces": 2}],
-)
-def test_settings_that_make_no_sense_are_refused(tmp_path, settings):
-    with pytest.raises(InputError, match=f"what.{next(iter(settings))}="):
-        exported(tmp_path, solid(ball()), record(), **settings)
-
-
-def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
-    def full(self, content):
-        builtins.open(self, "wb").close()
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    with pytest.raises(OSError, match="No space left"):
-        exported(tmp_path, solid(ball()), record(), resolution=16)
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_arbitrary_similarity_keeps_faces_outward(tmp_path):

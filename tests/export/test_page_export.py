@@ -100,7 +100,7 @@ def test_without_photographs_the_cameras_are_still_there(tmp_path):
     assert "against the photographs" not in text
 
 
-def test_refusals(tmp_path):
+def test_what_is_no_page_of_ours_is_not_written_over(tmp_path):
     model, record = shiny_model(), record_of(all_around())
     target = tmp_path / "page.html"
     target.write_text("<html>somebody's own</html>")
@@ -109,8 +109,6 @@ def test_refusals(tmp_path):
     target.unlink()
     target.mkdir()
     refused(PageExport().export, model, record, tmp_path, 4096, parts=("page.html is a folder",))
-    refused(PageExport, "small", 4, parts=("what.resolution=4", "8 voxels or more"))
-    refused(PageExport, "small", None, -1, parts=("what.photographs=-1",))
 
 
 def test_a_file_that_is_no_page_or_not_whole_is_refused(page, tmp_path):

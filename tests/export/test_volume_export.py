@@ -5,7 +5,6 @@ import tracemalloc
 from dataclasses import replace
 
 import numpy as np
-import psutil
 import pytest
 import torch
 from support.known_fields import INSIDE, ball, solid
@@ -13,7 +12,6 @@ from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.density_grid import CHUNK
 from nerf_lightning.export.surface import PAIRS, looks_from_facing, looks_from_nearest
 from nerf_lightning.export.volume import BYTES_PER_POINT, VolumeExport
@@ -98,16 +96,3 @@ def test_points_are_looked_at_from_the_nearest_cameras_and_from_those_they_face(
     assert looks_from_nearest(at, eyes)[:, 0].tolist() == [[-1, 0, 0], [0, -1, 0], [0, 0, -1]]
     assert looks_from_facing(at, normal, eyes)[:, 0].tolist() == [[0, 0, 1], [0, -1, 0], [-1, 0, 0]]
     assert looks_from_nearest(at, eyes[:2]).shape == (2, 1, 3)
-
-
-def test_refusals(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"what=volume: ball was trained in normalised device coordinates"):
-        VolumeExport(8).export(solid(ball()), record(space="ndc"), tmp_path, 4096)
-    with pytest.raises(InputError, match=r"what\.resolution=1: give the number of cells"):
-        VolumeExport(1).export(solid(ball()), record(), tmp_path, 4096)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1e9}))
-    with pytest.raises(
-        InputError, match=r"12\.9 GB, and 0\.8 GB of memory can be had\. what\.resolution=\d+ would fit"
-    ):
-        VolumeExport(1024).export(solid(ball()), record(), tmp_path, 4096)
-    assert not list(tmp_path.iterdir())

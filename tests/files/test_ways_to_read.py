@@ -26,6 +26,7 @@ OURS = {
     "evaluation/protocol.py": ["read_text"],
     "training/launch/processes.py": ["open", "read_text"],
     "config/scene_overrides.py": ["read_text"],
+    "config/exporters.py": ["read_text"],
     "viewer/page.py": ["open"],
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
@@ -56,7 +57,6 @@ OTHERWISE = {
     "sfm/video_frames.py": ["imiter"],
     "files/atomic.py": ["open", "open"],
     "export/points.py": ["open"],
-    "export/las_file.py": ["open"],
     # The still picture of a page, of limited size, decoded and encoded anew.
     "report/gallery.py": ["open", "read_text"],
     "files/tensor_files.py": ["load"],

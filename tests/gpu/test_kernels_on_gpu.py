@@ -40,7 +40,8 @@ def test_tritons_perceptron_agrees_on_whole_numbers(cuda):
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 1 << 20])
 def test_triton_takes_any_number_of_points(count, cuda, generator):
-    assert backends.twin("hash_grid.cuda") is not None, backends.why_not("hash_grid.cuda")
+    kernels = "nerf_lightning.nerf.kernels.hash_grid.cuda"
+    assert backends.twin(kernels) is not None, backends.why_not(kernels)
     layout = hash_grid_layout(16, 19, 16, 2048)  # model=fast_large: the last entry's place takes 24 bits
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.randint(0, 4096, (count, 3), generator=generator) / 4096.0

@@ -82,6 +82,7 @@ def test_the_codecs_keep_colours_and_alpha(tmp_path, ending):
 
 def test_an_animation_has_alpha_too(tmp_path):
     with Image.open(filmed(tmp_path, "animation", alpha=True)) as picture:
+        assert (picture.width, picture.n_frames) == (32, 2)
         alpha = np.asarray(picture.convert("RGBA"))[..., 3]
     assert (alpha.min(), alpha.max()) == (0, 255)
 

@@ -1,3 +1,5 @@
+"""Films as one file: videos and animated pictures read back as what was written; what cannot be one leaves nothing."""
+
 import os
 import sys
 
@@ -5,10 +7,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from support.videos import read_video
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.video.encoding import pad_to_even, write_video
+from nerf_lightning.video.encoding import pad_to_even, write_animation, write_video
 
 COLORS = [(220, 40, 40), (40, 180, 60), (30, 60, 200), (250, 250, 250)]
 
@@ -117,3 +120,20 @@ def test_no_ffmpeg_says_how_to_get_it(tmp_path, monkeypatch):
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"ends in \.mp4"):
         write_video(tmp_path / "a.gif", plain(8, 8), fps=10)
+
+
+def test_an_animation_reads_back_and_goes_on_without_end(tmp_path):
+    colors, path = [COLORS[0], COLORS[1], COLORS[1], COLORS[3]], tmp_path / "new" / "orbit.webp"
+    write_animation(path, iter(plain(21, 32, colors)), fps=20, total=4)
+    with Image.open(path) as found:
+        assert (found.size, found.n_frames, found.info["loop"]) == ((32, 21), 3, 0)
+        for number, (color, duration) in enumerate([(COLORS[0], 50), (COLORS[1], 100), (COLORS[3], 50)]):
+            found.seek(number)
+            found.load()
+            assert found.info["duration"] == duration
+            assert np.abs(np.asarray(found.convert("RGB")).astype(int) - color).max() <= 6
+    with pytest.raises(ValueError, match="4 frames came, 5 were promised"):
+        write_animation(path.with_name("a.webp"), plain(8, 8), fps=20, total=5)
+    with pytest.raises(InputError, match=r"20000 x 1 pixels is larger than a WebP can be.*Lower path\.width"):
+        write_animation(path.with_name("b.webp"), plain(1, 20000), fps=20)
+    assert [file.name for file in path.parent.iterdir()] == ["orbit.webp"]

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.checkpoints.recorded_frame import as_trained
-from nerf_lightning.commands.export import beside_page
+from nerf_lightning.commands.export import beside
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
@@ -29,7 +29,7 @@ def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
         model = load_model(checkpoint).to(job.settings.device).eval()
         path = job.config.path.copy()
         path.update(PATH)
-        what.beside = beside_page(checkpoint, as_trained(job.scene, checkpoint), build(path))
+        what.beside = beside(checkpoint, as_trained(job.scene, checkpoint), build(path))
         with torch.no_grad():
             written = what.export(model, checkpoint.scene, folder, job.settings.inference_tile_points)
         say(*(f"page         {file}" for file in written))

@@ -1,4 +1,4 @@
-"""From a model to bytes in bricks: densities, who sees them, and their colours."""
+"""From a model to bytes in blocks: densities, who sees them, and their colours."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
 from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, density_grid, dilated
-from nerf_lightning.export.baking.lit_voxels import lit
+from nerf_lightning.export.baking.marcher import STEP
 from nerf_lightning.export.baking.seen_colors import (
     LOOKS,
     LOOKS_AROUND,
@@ -26,13 +26,23 @@ from nerf_lightning.export.baking.seen_colors import (
     to_bytes_of_colors,
 )
 from nerf_lightning.export.density_grid import Report
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks, kernels
+from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks, kernels
+from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.ray_generator import RayGenerator
+from nerf_lightning.nerf.models.render_image import view_rays
 from nerf_lightning.nerf.types.scene import SceneRecord
 
 # Voxels that stop least light are left out, as long as all of them together stop no larger a share of it: fog that is
 # hardly seen costs as much as walls.
 SHARE_LEFT_OUT = 0.035
+# Rays through the training views that are followed, at most: every other pixel tells as much.
+FOLLOWED_RAYS = 1_000_000
+# A scene that stops so much of their light is one that none comes from behind of.
+CLOSED = 0.98
+# Values at which all but so much of it is stopped are kept, and their neighbours: where the scene is closed, and where
+# what is left out would let the background through.
+LEFT_OUT_OF_CLOSED, LEFT_OUT = 0.01, 0.002
 
 
 @dataclass(frozen=True)
@@ -68,7 +78,7 @@ def bake(
         around = _who_sees(grid, voxels, record, LOOKS[num_harmonics], report)
         kept = _stopping(grid, around)
     else:
-        kept, closed = lit(grid, record)
+        kept, closed = _lit(grid, record)
         report("lit", 1.0)
         around = _who_sees(grid, np.argwhere(kept).astype(np.int32), record, LOOKS_AROUND, report)
     if not (kept.any() and (around.cameras[:, 0] >= 0).any()):
@@ -82,7 +92,7 @@ def bake(
     seen = (colored.world, colored.cameras, colored.light)
     fitted = fitted_colors(model, grid.places(colored.voxels), *seen, centers, num_harmonics, tile_points, report)
     fitted = sharpened(fitted, colored.voxels, grid.optical.shape)
-    return _in_bricks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T, closed)
+    return _in_blocks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T, closed)
 
 
 def _who_sees(
@@ -91,17 +101,18 @@ def _who_sees(
     """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
     world = in_world(grid.places(voxels), record)
     eyes, views = camera_views(record)
-    contraction = grid.contraction
+    contraction, spacing = grid.contraction, grid.spacing.numpy()
+    given = (grid.optical, voxels, world.numpy())
     if contraction is not None:
         units, eyes_of = contraction.unit(world).numpy(), contraction.unit(torch.from_numpy(eyes[:, :3])).numpy()
-        given = (voxels, world.numpy(), units, eyes_of, views, contraction.near / contraction.half)
-        cameras, light = kernels("bricks.contracted").seeing_cameras(grid.optical, *given, looks, TRIES_AROUND)
-        report("seen", 1.0)
-        return SeenVoxels(voxels, world, cameras, light)
-    spacing = grid.spacing.numpy()
-    in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / spacing, eyes[:, 3:]], axis=1)
-    asked = (voxels, world.numpy(), in_grid.astype(np.float32), views, (spacing / spacing.max()).astype(np.float32))
-    cameras, light = kernels().seeing_cameras(grid.optical, *asked, looks, TRIES)
+        asked = (units, eyes_of, views, contraction.near / contraction.half)
+        cameras, light = kernels("contracted").seeing_cameras(*given, *asked, looks, TRIES_AROUND)
+    else:
+        in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / spacing, eyes[:, 3:]], axis=1)
+        sides = (spacing / spacing.max()).astype(np.float32)
+        cameras, light = kernels("bounded").seeing_cameras(
+            *given, in_grid.astype(np.float32), views, sides, looks, TRIES
+        )
     report("seen", 1.0)
     return SeenVoxels(voxels, world, cameras, light)
 
@@ -116,28 +127,55 @@ def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:
     return dilated(kept)
 
 
-def _in_bricks(
+def _lit(grid: DensityGrid, record: SceneRecord) -> tuple[Bool[ndarray, "x y z"], bool]:
+    """Return which values stop the light that the training views see, and whether next to none gets past them all.
+
+    Most of a scene without bounds lies behind something.
+    """
+    contraction = grid.contraction
+    assert contraction is not None
+    views = record.splits["train"]
+    width, height = (side[list(views)].double() for side in (record.cameras.width, record.cameras.height))
+    smaller = min(1.0, (FOLLOWED_RAYS / float((width * height).sum())) ** 0.5)
+    cameras = at_most(record.cameras, max(8, int(smaller * float(torch.maximum(width, height).max()))))
+    rays_of = RayGenerator(cameras, record.near, record.far)
+    rays = [view_rays(rays_of, all_pixels(cameras, view))[0] for view in views]
+    origins = torch.cat([contraction.unit(each.origins).reshape(-1, 3) for each in rays]).float().numpy()
+    directions = torch.cat([each.directions.reshape(-1, 3) for each in rays]).float().numpy()
+    near = contraction.near / contraction.half
+    stopped = kernels("contracted").stopped_light(grid.optical, origins, directions, near, STEP)
+    falling = np.sort(stopped[stopped > 0])[::-1]
+    together = np.cumsum(falling, dtype=np.float64)
+    if not len(falling):
+        return stopped > 0, False
+    closed = bool(together[-1] >= CLOSED * len(origins))
+    share = 1.0 - (LEFT_OUT_OF_CLOSED if closed else LEFT_OUT)
+    least = falling[min(int(np.searchsorted(together, share * together[-1])), len(falling) - 1)]
+    return dilated(stopped >= least), closed
+
+
+def _in_blocks(
     grid: DensityGrid, voxels: Int[ndarray, "colored 3"], colors: UInt8[ndarray, "channels colored"], closed: bool
 ) -> BakedField:
-    bricks = _bricks_of(grid.optical > LEAST_OPTICAL)
-    place = np.full(bricks.shape, -1, np.int64)
-    place[bricks] = np.arange(np.count_nonzero(bricks))
+    blocks = _blocks_of(grid.optical > LEAST_OPTICAL)
+    place = np.full(blocks.shape, -1, np.int64)
+    place[blocks] = np.arange(np.count_nonzero(blocks))
     at, within = np.divmod(voxels, SIDE)
-    brick = place[tuple(at.T)]
-    there = brick >= 0
-    value = np.ravel_multi_index((brick[there], *within[there].T), (int(bricks.sum()), SIDE, SIDE, SIDE))
+    block = place[tuple(at.T)]
+    there = block >= 0
+    value = np.ravel_multi_index((block[there], *within[there].T), (int(blocks.sum()), SIDE, SIDE, SIDE))
     order = np.argsort(value)
-    colored = np.zeros((int(bricks.sum()), SIDE, SIDE, SIDE), bool)
+    colored = np.zeros((int(blocks.sum()), SIDE, SIDE, SIDE), bool)
     colored.reshape(-1)[value] = True
-    (nx, ny, nz), side = bricks.shape, SIDE
-    blocks = grid.optical.reshape(nx, side, ny, side, nz, side).transpose(0, 2, 4, 1, 3, 5)
+    (nx, ny, nz), side = blocks.shape, SIDE
+    values = grid.optical.reshape(nx, side, ny, side, nz, side).transpose(0, 2, 4, 1, 3, 5)
     (x, y, z), (a, b, c) = grid.lower.tolist(), grid.spacing.tolist()
     return BakedField(
         lower=(x, y, z),
         spacing=(a, b, c),
         shape=(nx, ny, nz),
-        bricks=np.flatnonzero(bricks).astype(np.int32),
-        density=to_bytes_of_density(blocks[bricks]),
+        blocks=np.flatnonzero(blocks).astype(np.int32),
+        density=to_bytes_of_density(values[blocks]),
         colored=colored,
         colors=np.ascontiguousarray(colors[:, there][:, order]),
         ranges=RANGES,
@@ -146,11 +184,11 @@ def _in_bricks(
     )
 
 
-def _bricks_of(dense: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
-    """Return the bricks in which something lies, or on whose border."""
+def _blocks_of(dense: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
+    """Return the blocks in which something lies, or on whose border."""
     padded = np.pad(dense, ((0, 1),) * 3)
     found = dense.copy()
     for a, b, c in np.ndindex(2, 2, 2):
-        # A brick's tile reaches one value further: what stands there is the first of the next brick.
+        # A block's tile reaches one value further: what stands there is the first of the next block.
         found |= padded[a : a + dense.shape[0], b : b + dense.shape[1], c : c + dense.shape[2]]
     return any_in_blocks(found, SIDE)

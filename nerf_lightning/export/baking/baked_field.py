@@ -1,14 +1,18 @@
-"""A radiance field as bytes in bricks: what a page holds, and how its numbers are read."""
+"""A radiance field as bytes in blocks: what a page holds, as one run of bytes and back, and how they are read."""
 
+import gzip
 import math
-from dataclasses import dataclass
+import zlib
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 from numpy import ndarray
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.contraction import Contraction
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE
+from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE
 
 LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
 """Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""
@@ -19,11 +23,13 @@ LEAST_MET = 0.3
 
 NO_CHANGE = 128
 """The byte of a coefficient that is nothing."""
+LEVEL = 6
+"""Of gzip; higher ones take many times as long, for one part in a hundred."""
 
 
 @dataclass(frozen=True)
 class BakedField:
-    """Density and colour at the corners of a lattice, in bricks of 8 x 8 x 8 values.
+    """Density and colour at the corners of a lattice, in blocks of 8 x 8 x 8 values.
 
     A byte q of density is an optical depth of 2^(a + b q) - 2^a along a way as long as a voxel (its longest side): a
     step of any length has its own opacity.
@@ -36,11 +42,11 @@ class BakedField:
     spacing: tuple[float, float, float]
     """Scene units between values, along each axis."""
     shape: tuple[int, int, int]
-    """Bricks along each axis."""
-    bricks: Int[ndarray, "bricks"]
-    """Which bricks there are: x * (ny * nz) + y * nz + z, rising."""
-    density: UInt8[ndarray, "bricks 8 8 8"]
-    colored: Bool[ndarray, "bricks 8 8 8"]
+    """Blocks along each axis."""
+    blocks: Int[ndarray, "blocks"]
+    """Which blocks there are: x * (ny * nz) + y * nz + z, rising."""
+    density: UInt8[ndarray, "blocks 8 8 8"]
+    colored: Bool[ndarray, "blocks 8 8 8"]
     """Which values have a colour: those that can be seen."""
     colors: UInt8[ndarray, "channels colored"]
     """Three channels for each spherical harmonic; the coloured values in their order."""
@@ -63,12 +69,12 @@ class BakedField:
 
     @property
     def index(self) -> Int[ndarray, "x y z"]:
-        """The number of each brick, -1 where there is none."""
+        """The number of each block, -1 where there is none."""
         index = np.full(math.prod(self.shape), -1, np.int32)
-        index[self.bricks] = np.arange(len(self.bricks))
+        index[self.blocks] = np.arange(len(self.blocks))
         return index.reshape(self.shape)
 
-    def channel(self, number: int) -> UInt8[ndarray, "bricks 8 8 8"]:
+    def channel(self, number: int) -> UInt8[ndarray, "blocks 8 8 8"]:
         """Return a channel of all values; those without a colour are black, and the same from all sides."""
         values = np.full(self.colored.shape, 0 if number < 3 else NO_CHANGE, np.uint8)
         values[self.colored] = self.colors[number]
@@ -91,9 +97,9 @@ def to_bytes_of_density(optical: Float[ndarray, "*any"]) -> UInt8[ndarray, "*any
 
 
 def tiles_of(
-    values: Integer[ndarray, "bricks 8 8 8"], index: Int[ndarray, "x y z"], empty: int
-) -> Integer[ndarray, "bricks 9 9 9"]:
-    """Return the bricks with a border beyond their last values: the first ones of the next bricks, else `empty`."""
+    values: Integer[ndarray, "blocks 8 8 8"], index: Int[ndarray, "x y z"], empty: int
+) -> Integer[ndarray, "blocks 9 9 9"]:
+    """Return the blocks with a border beyond their last values: the first ones of the next blocks, else `empty`."""
     tiles = np.full((len(values), TILE, TILE, TILE), empty, values.dtype)
     tiles[:, :SIDE, :SIDE, :SIDE] = values
     place = np.argwhere(index >= 0)
@@ -105,3 +111,69 @@ def tiles_of(
         part = tiles[(slice(None), *(border if each else own for each in (a, b, c)))]
         part[there] = values[(other[there], *(0 if each else own for each in (a, b, c)))]
     return tiles
+
+
+def described(baked: BakedField) -> dict[str, Any]:
+    """Return what must be known to read the bytes, as JSON has it."""
+    return {
+        "lower": list(baked.lower),
+        "spacing": list(baked.spacing),
+        "length": baked.length,
+        "shape": list(baked.shape),
+        "blocks": len(baked.blocks),
+        "colored": int(baked.colors.shape[1]),
+        "harmonics": baked.num_harmonics,
+        "exponents": [LEAST_EXPONENT, EXPONENT_STEP],
+        "ranges": list(baked.ranges),
+        "closed": baked.closed,
+        "contraction": None if baked.contraction is None else asdict(baked.contraction),
+    }
+
+
+def packed(baked: BakedField) -> bytes:
+    """Return the bytes, compressed: blocks' numbers, densities, which values are coloured (bits), then each channel."""
+    parts = (
+        baked.blocks.astype("<i4"),
+        baked.density,
+        np.packbits(baked.colored, bitorder="little"),
+        np.ascontiguousarray(baked.colors),
+    )
+    # Without a time: the same field makes the same file.
+    return gzip.compress(b"".join(part.tobytes() for part in parts), LEVEL, mtime=0)
+
+
+def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
+    """Return the field that `described` and `packed` have made these of.
+
+    Raises:
+        InputError: they have not, or not all of it is there.
+    """
+    try:
+        raw = gzip.decompress(content)
+        blocks, colored, channels = int(about["blocks"]), int(about["colored"]), 3 * int(about["harmonics"])
+        sizes = (4 * blocks, SIDE**3 * blocks, SIDE**3 * blocks // 8, channels * colored)
+        if len(raw) != sum(sizes):
+            raise ValueError(f"{len(raw)} bytes, and not {sum(sizes)}")
+        numbers, density, bits, colors = np.split(np.frombuffer(raw, np.uint8), np.cumsum(sizes)[:-1])
+        x, y, z = about["lower"]
+        along_x, along_y, along_z = about["spacing"]
+        nx, ny, nz = about["shape"]
+        low, high = about["ranges"]
+        outside = about["contraction"]
+        if outside is not None:
+            cx, cy, cz = map(float, outside["center"])
+            outside = Contraction((cx, cy, cz), float(outside["half"]), float(outside["near"]))
+        return BakedField(
+            (x, y, z),
+            (along_x, along_y, along_z),
+            (nx, ny, nz),
+            np.frombuffer(numbers.tobytes(), "<i4").astype(np.int32),
+            density.reshape(blocks, SIDE, SIDE, SIDE),
+            np.unpackbits(bits, bitorder="little").astype(bool).reshape(blocks, SIDE, SIDE, SIDE),
+            colors.reshape(channels, colored),
+            (low, high),
+            outside,
+            bool(about["closed"]),
+        )
+    except (OSError, EOFError, zlib.error, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"The field in the page is damaged or cut off: {error}. Export it again.") from error

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# Bricks have to end where the inner cube does, at a quarter of the grid.
+# Blocks have to end where the inner cube does, at a quarter of the grid.
 EVEN = 16
 # Of the voxels that a scene in a box would have along its side: as many again lie around it.
 SHARE = 0.75
@@ -18,7 +18,7 @@ EDGE = 1e-4
 
 @dataclass(frozen=True)
 class Contraction:
-    """The inner cube, and how close to a camera the field begins (`kernels.bricks.contracted` has the equation)."""
+    """The inner cube, and how close to a camera the field begins (`voxel_kernels.contracted` has the equation)."""
 
     center: tuple[float, float, float]
     """Scene frame."""

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.ndimage import binary_dilation
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
@@ -13,7 +14,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.contraction import Contraction, is_place, num_values
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, any_in_blocks
+from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -34,7 +35,7 @@ MORE_BYTES = 16
 
 @dataclass(frozen=True)
 class DensityGrid:
-    """Optical depths, at lower + spacing (i, j, k); each side is a multiple of a brick's."""
+    """Optical depths, at lower + spacing (i, j, k); each side is a multiple of a block's."""
 
     lower: Float[Tensor, "3"]
     spacing: Float[Tensor, "3"]
@@ -133,10 +134,10 @@ def _nothing(record: SceneRecord) -> str:
 
 
 def _fill(model: Model, grid: DensityGrid, tile_points: int, report: Report) -> None:
-    """Ask for the densities of the bricks in or beside which the second look has found something."""
-    coarse = np.argwhere(np.ones([-(-side // STRIDE) for side in grid.optical.shape], bool))
-    found = _asked(model, grid, (STRIDE * coarse).astype(np.int32), tile_points, report, "coarse")
-    candidates = _bricks_around((found > LEAST_OPTICAL).reshape([-(-side // STRIDE) for side in grid.optical.shape]))
+    """Ask for the densities of the blocks in or beside which the second look has found something."""
+    sides = [-(-side // STRIDE) for side in grid.optical.shape]
+    found = _asked(model, grid, STRIDE * np.argwhere(np.ones(sides, bool)).astype(np.int32), tile_points, report)
+    candidates = any_in_blocks(dilated((found > LEAST_OPTICAL).reshape(sides)), SIDE // STRIDE)  # within a stride
     corner = SIDE * np.argwhere(candidates).astype(np.int32)
     within = np.argwhere(np.ones((SIDE,) * 3, bool)).astype(np.int32)
     for part in tiles(len(corner), max(1, CHUNK // SIDE**3)):
@@ -151,7 +152,6 @@ def _asked(
     voxels: Int[ndarray, "voxels 3"],
     tile_points: int,
     report: Report | None = None,
-    stage: str = "",
 ) -> Float[ndarray, "voxels"]:
     device = next(model.parameters()).device
     optical = np.empty(len(voxels), np.float32)
@@ -159,25 +159,11 @@ def _asked(
         density = model.density(grid.places(voxels[part]).to(device)).cpu().numpy()
         optical[part] = grid.lengths(voxels[part]) * density
         if report is not None:
-            report(stage, part.stop / len(voxels))
+            report("coarse", part.stop / len(voxels))
     return optical
 
 
-def _bricks_around(found: Bool[ndarray, "x y z"]) -> Bool[ndarray, "bx by bz"]:
-    """Return the bricks within a stride of what was found; two strides make a brick."""
-    return any_in_blocks(dilated(found), SIDE // STRIDE)
-
-
 def dilated(mask: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
-    """Return the mask with all neighbours, those across edges and corners among them.
-
-    >>> int(dilated(np.pad(np.ones((1, 1, 1), bool), 2)).sum())
-    27
-    """
-    grown = mask.copy()
-    for axis in range(3):
-        before = np.moveaxis(grown.copy(), axis, 0)
-        into = np.moveaxis(grown, axis, 0)
-        into[1:] |= before[:-1]
-        into[:-1] |= before[1:]
+    """Return the mask with all neighbours, those across edges and corners among them."""
+    grown: Bool[ndarray, "x y z"] = binary_dilation(mask, np.ones((3, 3, 3), bool))
     return grown

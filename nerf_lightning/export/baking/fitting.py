@@ -17,8 +17,8 @@ from nerf_lightning.export.baking.baked_field import LEAST_MET, BakedField, tile
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.baking.seen_colors import in_coarse_steps
 from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.voxel_kernels.layout import VoxelBlocks, Wanted, kernels
 from nerf_lightning.nerf.kernels.adam.step import adam_step
-from nerf_lightning.nerf.kernels.bricks.layout import Bricks, Wanted, kernels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.randomness import RayRandom, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
@@ -45,7 +45,7 @@ def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, rep
     Args:
         baked: the field.
         scene: the photographs, in the frame of the model.
-        record: what it was trained on: what it was not trained on is not fitted to, either.
+        record: what it was trained on; to nothing else it is fitted.
         steps: how many; 0 leaves the field as it is.
         report: told how much is done.
 
@@ -79,7 +79,7 @@ class _Values:
         rows = np.full(baked.colored.shape, -1, np.int32)
         rows[baked.colored] = np.arange(baked.colors.shape[1])
         self.owner = tiles_of(rows, self.marcher.index, empty=-1)
-        self.owned: Bool[ndarray, "bricks 9 9 9"] = self.owner >= 0
+        self.owned: Bool[ndarray, "blocks 9 9 9"] = self.owner >= 0
         self.row = self.owner[self.owned]
         together = np.concatenate([baked.density[baked.colored][None], baked.colors]).T
         self.values = torch.from_numpy(together.astype(np.float32, order="C"))
@@ -89,17 +89,10 @@ class _Values:
     def look_at(self, wanted: Wanted) -> float:
         """Note which way to go, and return the sum of the squared errors of the rays."""
         baked, marcher = self.baked, self.marcher
-        field = Bricks(
-            marcher.index,
-            marcher.density,
-            marcher.colors,
-            self.owner,
-            baked.scale,
-            STEP,
-            outside=baked.contraction is not None,
-        )
+        outside = baked.contraction is not None
+        field = VoxelBlocks(marcher.index, marcher.density, marcher.colors, self.owner, baked.scale, STEP, outside)
         least_met = LEAST_MET if baked.closed else 0.0
-        error: float = kernels("bricks.gradients").gradients(field, wanted, least_met, self.gradient.numpy())
+        error: float = kernels("gradients").gradients(field, wanted, least_met, self.gradient.numpy())
         return error
 
     def move(self, rate: float, step: int) -> None:

@@ -10,8 +10,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.export.baking.baked_field import LEAST_MET, NO_CHANGE, BakedField, tiles_of
+from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.kernels.bricks.layout import kernels
 from nerf_lightning.nerf.types.rays import RayBundle
 
 STEP = 0.5
@@ -46,29 +46,17 @@ class Marcher:
         """Return what rays meet in the box, or in all of space."""
         shape, contraction = rays.near.shape, self.baked.contraction
         origins, directions, basis, lengths, way = self.in_grid(rays)
-        found = kernels("bricks.cpu" if contraction is None else "bricks.contracted").march_tiles(
-            origins,
-            directions,
-            basis,
-            self.index,
-            self.density,
-            self.colors,
-            self.baked.scale,
-            STEP,
-            lengths if contraction is None else contraction.near / contraction.half,
-        )
+        field = (self.index, self.density, self.colors, self.baked.scale, STEP)
+        least = lengths if contraction is None else contraction.near / contraction.half
+        march = kernels("bounded" if contraction is None else "contracted").march_tiles
+        found = march(origins, directions, basis, *field, least)
         columns = torch.from_numpy(found)
         depth = way * columns[:, 4] / columns[:, 3].clamp(min=1e-6)
         met = columns[:, 3:4].clamp(min=LEAST_MET) if self.baked.closed else torch.ones(1)
         columns[:, :4] /= met
-        mean: Float[ndarray, "columns"] = found[:, 5:].mean(axis=0)
-        return MarchedRays(
-            columns[:, :3].view(*shape, 3),
-            columns[:, 3].view(shape),
-            depth.view(shape),
-            float(mean[0]),
-            float(mean[1]),
-        )
+        densities, colors = found[:, 5:].mean(axis=0).tolist()
+        rgb, opacity = columns[:, :3].view(*shape, 3), columns[:, 3].view(shape)
+        return MarchedRays(rgb, opacity, depth.view(shape), densities, colors)
 
     def in_grid(
         self, rays: RayBundle

@@ -88,7 +88,7 @@ def fitted_colors(
         light: how much arrives there.
         centers: where the cameras stand, in the world.
         num_harmonics: 1, 4 or 9.
-        tile_points: most points that go through a field at once.
+        tile_points: most points at once.
         report: told how much is done.
     """
     device = next(model.parameters()).device
@@ -117,12 +117,9 @@ def fitted_colors(
 def sharpened(
     fitted: Float[Tensor, "voxels harmonics 3"], voxels: Int[ndarray, "voxels 3"], shape: tuple[int, ...]
 ) -> Float[Tensor, "voxels harmonics 3"]:
-    """Return coefficients that differ more from their six neighbours', as mixing between voxels makes them differ less.
+    """Return coefficients of voxels in a grid that differ more from those of their six neighbours.
 
-    Args:
-        fitted: at the voxels.
-        voxels: their numbers in the grid.
-        shape: of the grid.
+    Mixing between voxels makes them differ less.
     """
     values = fitted.flatten(1).numpy()
     number = np.full([side + 2 for side in shape], -1, np.int32)

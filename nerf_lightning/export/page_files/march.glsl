@@ -1,5 +1,5 @@
-// Steps through bricks of density and colour (baked_field.py); marcher.py takes the same ones.
-// Places are in voxels; a tile of 9 x 9 x 9 values is a brick of 8 with the first values of the next ones.
+// Steps through blocks of density and colour (baked_field.py); marcher.py takes the same ones.
+// Places are in voxels; a tile of 9 x 9 x 9 values is a block of 8 with the first values of the next ones.
 precision highp float;
 precision highp int;
 precision highp sampler3D;
@@ -72,7 +72,7 @@ vec3 slope(vec3 start, vec3 within) {
 float through = 1.0, depth = 0.0;
 vec3 color = vec3(0.0), normal = vec3(0.0);
 
-// What a step of a share of a voxel's length stops at a place of a brick, at a distance in the scene.
+// What a step of a share of a voxel's length stops at a place of a block, at a distance in the scene.
 void stop(int tile, vec3 within, float share, float away, vec3 look) {
   vec3 start = 9.0 * vec3(tile % atlas.x, tile / atlas.x % atlas.y, tile / (atlas.x * atlas.y));
   vec3 coordinate = (start + within.zyx + 0.5) / vec3(atlas * 9);
@@ -91,7 +91,7 @@ void stop(int tile, vec3 within, float share, float away, vec3 look) {
 }
 
 #ifdef CONTRACTED
-// As kernels/bricks/contracted.py: rays are straight in each part of the contracted cube.
+// As voxel_kernels/contracted.py: rays are straight in each part of the contracted cube.
 float largest(vec3 each) { return max(each.x, max(each.y, each.z)); }
 
 float ahead(float way, float speed, float r, float v) {
@@ -118,14 +118,14 @@ void march(vec3 eye_place, vec3 look) {
     float speed = length(along);
     along /= speed;
     vec3 at = (place + 2.0) / cell;
-    ivec3 brick = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
-    int tile = texelFetch(index, brick.zyx, 0).x;
+    ivec3 block = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
+    int tile = texelFetch(index, block.zyx, 0).x;
     float way = ahead(cell * (tile >= 0 ? step_length : max(way_out(at, along), 0.0) + 0.01), speed, r, v);
     if (way < 0.0) return;
     if (tile >= 0) {
       at += 0.5 * step_length * along;
       float shrunk = min(1.0, 2.0 - largest(abs(at * cell - 2.0)));
-      vec3 within = clamp(at - SIDE * vec3(brick), 0.0, SIDE);
+      vec3 within = clamp(at - SIDE * vec3(block), 0.0, SIDE);
       stop(tile, within, way * shrunk * shrunk / cell, half_side * (t + 0.5 * way), look);
     }
     t += way;
@@ -155,15 +155,15 @@ void march(vec3 origin, vec3 look) {
     float t = enter + (number + 0.5) * step_length;
     if (t >= leave) return;
     vec3 at = origin + t * along;
-    ivec3 brick = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
-    int tile = texelFetch(index, brick.zyx, 0).x;
+    ivec3 block = clamp(ivec3(at) / 8, ivec3(0), shape - 1);
+    int tile = texelFetch(index, block.zyx, 0).x;
     if (tile < 0) {
       float beyond = t + way_out(at, along);
       number = max(number + 1.0, ceil((beyond - enter) / step_length - 0.5));
       continue;
     }
     number += 1.0;
-    stop(tile, clamp(at - SIDE * vec3(brick), 0.0, SIDE), step_length * far / voxel, t * far, look);
+    stop(tile, clamp(at - SIDE * vec3(block), 0.0, SIDE), step_length * far / voxel, t * far, look);
   }
 }
 #endif

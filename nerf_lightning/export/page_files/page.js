@@ -47,52 +47,52 @@ async function readField(about) {
 }
 
 function partsOf(about, bytes) {
-  const values = SIDE ** 3 * about.bricks;
-  const sizes = [4 * about.bricks, values, values / 8, 3 * about.harmonics * about.colored];
+  const values = SIDE ** 3 * about.blocks;
+  const sizes = [4 * about.blocks, values, values / 8, 3 * about.harmonics * about.colored];
   if (bytes.byteLength !== sizes.reduce((sum, size) => sum + size)) {
     throw new Refusal("The scene in this file is damaged: it does not have the size that it says. Fetch it again.");
   }
   const starts = sizes.map((_, i) => sizes.slice(0, i).reduce((sum, size) => sum + size, 0));
   const [numbers, density, mask, colors] = starts.map((start, i) => new Uint8Array(bytes, start, sizes[i]));
-  return { numbers: new Int32Array(bytes, numbers.byteOffset, about.bricks), density, mask, colors };
+  return { numbers: new Int32Array(bytes, numbers.byteOffset, about.blocks), density, mask, colors };
 }
 
-// ---- Tiles: bricks with the first values of the next ones -------------------------------------------------------
+// ---- Tiles: blocks with the first values of the next ones -------------------------------------------------------
 
 function indexOf(about, numbers) {
   const index = new Int32Array(about.shape[0] * about.shape[1] * about.shape[2]).fill(-1);
-  numbers.forEach((number, brick) => { index[number] = brick; });
+  numbers.forEach((number, block) => { index[number] = block; });
   return index;
 }
 
 function neighboursOf(about, numbers, index) {
   const [nx, ny, nz] = about.shape, found = new Int32Array(8 * numbers.length);
-  numbers.forEach((number, brick) => {
+  numbers.forEach((number, block) => {
     const x = Math.floor(number / (ny * nz)), y = Math.floor(number / nz) % ny, z = number % nz;
     for (let corner = 0; corner < 8; corner++) {
       const [i, j, k] = [x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)];
-      found[8 * brick + corner] = i < nx && j < ny && k < nz ? index[(i * ny + j) * nz + k] : -1;
+      found[8 * block + corner] = i < nx && j < ny && k < nz ? index[(i * ny + j) * nz + k] : -1;
     }
   });
   return found;
 }
 
-// Every place of a tile: in which of the eight bricks it lies, and where there.
+// Every place of a tile: in which of the eight blocks it lies, and where there.
 const PLACES = Array.from({ length: TILE ** 3 }, (_, place) => {
   const at = [Math.floor(place / TILE ** 2), Math.floor(place / TILE) % TILE, place % TILE];
   const corner = at.reduce((sum, each) => 2 * sum + (each === SIDE ? 1 : 0), 0);
   return [corner, at.reduce((sum, each) => SIDE * sum + each % SIDE, 0), at];
 });
 
-function fillChannel(into, channel, values, empty, neighbours, bricks, atlas) {
+function fillChannel(into, channel, values, empty, neighbours, blocks, atlas) {
   const width = TILE * atlas[0], slice = width * TILE * atlas[1];
   const offsets = PLACES.map(([, , [a, b, c]]) => 4 * (a * slice + b * width + c) + channel);
-  for (let brick = 0; brick < bricks; brick++) {
-    const column = brick % atlas[0], row = Math.floor(brick / atlas[0]) % atlas[1];
-    const layer = Math.floor(brick / (atlas[0] * atlas[1]));
+  for (let block = 0; block < blocks; block++) {
+    const column = block % atlas[0], row = Math.floor(block / atlas[0]) % atlas[1];
+    const layer = Math.floor(block / (atlas[0] * atlas[1]));
     const start = 4 * TILE * (layer * slice + row * width + column);
     for (let place = 0; place < PLACES.length; place++) {
-      const other = neighbours[8 * brick + PLACES[place][0]];
+      const other = neighbours[8 * block + PLACES[place][0]];
       into[start + offsets[place]] = other < 0 ? empty : values[SIDE ** 3 * other + PLACES[place][1]];
     }
   }
@@ -107,10 +107,10 @@ function spread(channel, field, colored, empty) {
   return values;
 }
 
-function atlasOf(bricks, most) {
-  const across = Math.min(Math.ceil(Math.cbrt(bricks)), Math.floor(most / TILE));
-  const down = Math.min(across, Math.ceil(bricks / across));
-  const deep = Math.ceil(bricks / (across * down));
+function atlasOf(blocks, most) {
+  const across = Math.min(Math.ceil(Math.cbrt(blocks)), Math.floor(most / TILE));
+  const down = Math.min(across, Math.ceil(blocks / across));
+  const deep = Math.ceil(blocks / (across * down));
   if (deep * TILE > most) {
     throw new Refusal("This device cannot hold a scene of this size. Ask for the file of a smaller quality (what.quality=small).");
   }
@@ -130,7 +130,7 @@ class Picture {
       throw new Refusal("This browser does not have WebGL2, so the scene cannot be turned: here is a still picture of it. Current versions of Chrome, Firefox and Safari have it.");
     }
     this.gl = gl;
-    this.atlas = atlasOf(about.bricks, gl.getParameter(gl.MAX_3D_TEXTURE_SIZE));
+    this.atlas = atlasOf(about.blocks, gl.getParameter(gl.MAX_3D_TEXTURE_SIZE));
     this.program = this.linked();
     gl.useProgram(this.program);
     this.upload(field);
@@ -173,7 +173,7 @@ class Picture {
     const size = this.atlas.map((count) => TILE * count), channels = 3 * about.harmonics;
     for (let unit = 0; 4 * unit <= channels; unit++) {
       const bytes = new Uint8Array(4 * size[0] * size[1] * size[2]);
-      const fill = (into, values, empty) => fillChannel(bytes, into, values, empty, neighbours, about.bricks, this.atlas);
+      const fill = (into, values, empty) => fillChannel(bytes, into, values, empty, neighbours, about.blocks, this.atlas);
       for (let into = 0; into < 4; into++) {
         const channel = unit === 0 ? into : 4 * unit - 1 + into, empty = channel < 3 ? 0 : NO_CHANGE;
         if (unit === 0 && into === 3) fill(3, field.density, 0);

@@ -20,6 +20,12 @@ from typing import Any
 import torch
 
 ROOM = "nerf_lightning"
+KERNELS = "nerf_lightning.nerf.kernels"
+CPU_TWINS = (
+    *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
+    *("render.cpu", "render.gradients"),
+)
+"""The modules of this room that numba compiles."""
 LONG_SECONDS = 2.0
 # What triton says where there is no C compiler, and where that finds no headers.
 NO_COMPILER = ("C compiler", "CalledProcessError")
@@ -32,7 +38,11 @@ _reasons: dict[str, str] = {}
 
 @functools.cache
 def twin(module: str) -> ModuleType | None:
-    """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible."""
+    """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible.
+
+    Args:
+        module: its full name; it has a function `trial` that runs each of its kernels once, on next to nothing.
+    """
     library = "triton" if module.endswith(".cuda") else "numba"
     try:
         if library == "numba":
@@ -78,9 +88,8 @@ def why_not(module: str) -> str:
 
 
 def _imported(module: str) -> ModuleType:
-    name = f"nerf_lightning.nerf.kernels.{module}"
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(module)
     except RuntimeError as error:
         if "no locator available" not in str(error):  # numba's words for a cache that it cannot write
             raise
@@ -88,7 +97,7 @@ def _imported(module: str) -> ModuleType:
         "numba cannot write its cache (beside the program, in the user's cache folder, or in NUMBA_CACHE_DIR where "
         "that is set). Set NUMBA_CACHE_DIR to a folder that can be written."
     )
-    return importlib.import_module(name)
+    return importlib.import_module(module)
 
 
 def _stamp_with_sources(module: ModuleType) -> None:
@@ -175,15 +184,15 @@ def is_on(module: str) -> bool:
 
 
 def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
-    """Return a numba module for tensors on the CPU; else None."""
+    """Return a numba module of this room (`march.cpu`) for tensors on the CPU; else None."""
     if device.type != "cpu" or not is_on(module):
         return None
-    return twin(module)
+    return twin(f"{KERNELS}.{module}")
 
 
 def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
-    """Return a triton module for tensors on a CUDA device; else None."""
-    return twin(module) if device.type == "cuda" and is_on(module) else None
+    """Return a triton module of this room for tensors on a CUDA device; else None."""
+    return twin(f"{KERNELS}.{module}") if device.type == "cuda" and is_on(module) else None
 
 
 def can_compile(device: torch.device) -> bool:

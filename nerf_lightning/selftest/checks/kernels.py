@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerf_lightning.config.exporters import kernel_modules
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam.step import adam_step, adam_step_torch
-from nerf_lightning.nerf.kernels.compile import CPU_TWINS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
@@ -112,9 +112,9 @@ def checks(place: Place) -> list[Check]:
 def _twins(place: Place) -> list[Check]:
     """Return a check for each compiled kernel: whether it runs at all. What it computes, the checks below say."""
     if place.is_cuda:
-        return [_loads("hash_grid.cuda", "triton"), _loads("mlp.cuda", "triton")]
+        return [_loads(f"{backends.KERNELS}.{each}.cuda", "triton") for each in ("hash_grid", "mlp")]
     if place.device.type == "cpu":
-        found = [_loads(name, "numba") for name in CPU_TWINS]
+        found = [_loads(name, "numba") for name in kernel_modules()]
         return [*found, _absent("hash_grid (triton)", "it is for GPUs, and the device here is the CPU")]
     return []
 
@@ -125,8 +125,8 @@ def _loads(module: str, library: str) -> Check:
             raise CannotRun(f"{backends.why_not(module)}: plain torch does its work, many times slower")
         return 0.0
 
-    name = f"{module.rpartition('.')[0]} ({library}): compiles and runs"
-    return Check(name, 0.0, "it was compiled and gave finite numbers", difference)
+    name = module.removeprefix(f"{backends.KERNELS}.").removesuffix(".cpu").removesuffix(".cuda")
+    return Check(f"{name} ({library}): compiles and runs", 0.0, "it was compiled and gave finite numbers", difference)
 
 
 def _absent(name: str, reason: str) -> Check:

@@ -9,8 +9,7 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
-from nerf_lightning.nerf.kernels.backends import can_compile, without
-from nerf_lightning.nerf.kernels.compile import CPU_TWINS
+from nerf_lightning.nerf.kernels.backends import CPU_TWINS, can_compile, without
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.products import Products

@@ -54,14 +54,16 @@ class PathFrame:
         """How many of the user's units make one of the scene's."""
         return unit_of(self.to_user)
 
-    def point(self, name: str, given: Sequence[int | float] | None) -> Float[Tensor, "3"] | None:
-        """Return a point that the user gave, in scene coordinates; None where none was given.
+    def point(
+        self, name: str, given: Sequence[int | float] | None, otherwise: Float[Tensor, "3"] | None = None
+    ) -> Float[Tensor, "3"]:
+        """Return a point that the user gave, in scene coordinates; where none was given, another (the centre).
 
         Raises:
             InputError: it is not three finite numbers; `name` is the setting.
         """
         if given is None:
-            return None
+            return self.center if otherwise is None else otherwise
         check_setting(name, given, is_point(given), "three finite numbers, [x, y, z], in the capture's own frame")
         point = torch.tensor([[float(number) for number in given]], dtype=torch.float64)
         return points_from_user(point, self.to_user.double())[0].to(self.center)

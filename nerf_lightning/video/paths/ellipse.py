@@ -34,9 +34,6 @@ class Ellipse(CameraPath):
         turns: full circles; negative goes clockwise.
         start: degrees from the long axis at which it begins.
         target: what it looks at, [x, y, z] in the capture's own frame; None: what the photographs look at.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     scale: float = 1.0
@@ -54,8 +51,8 @@ class Ellipse(CameraPath):
     @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the ellipse."""
-        given = around.point("target", self.target)
         focus = focus_point(around.poses)
+        target = around.point("target", self.target, focus)
         up = normalize(around.up, dim=0)
         east = horizontal(up)
         level = torch.stack([east, torch.linalg.cross(up, east)])
@@ -67,7 +64,6 @@ class Ellipse(CameraPath):
         low, middle, high = torch.quantile(offsets @ up, torch.tensor([0.1, 0.5, 0.9]).to(up))
         height = middle + self.rise * 0.5 * (high - low) * angle.sin()
         eyes = focus + flat + height[:, None] * up
-        target = focus if given is None else given
         return self.pinholes(look_at(eyes, target.expand_as(eyes), up), around)
 
     def _angles(self, long: float, short: float) -> Float[Tensor, "frames"]:

@@ -41,9 +41,8 @@ class KeyframeCurve:
         self._keys = keyframe_poses(keyframes, around).double()
         even = even_speed(self._keys, around.radius, closed)
         self.knots = torch.tensor(times, dtype=self._keys.dtype) if times else even
-        targets = [around.point("file", each.look_at) for each in keyframes]
-        held = [target for target in targets if target is not None]
-        self._targets = torch.stack(held).double() if len(held) == len(targets) else None
+        targets = [around.point("file", each.look_at) for each in keyframes if each.look_at is not None]
+        self._targets = torch.stack(targets).double() if len(targets) == len(keyframes) else None
         logs = [[math.log(keyframe_focal(each, around))] for each in keyframes]
         self._log_focal = torch.tensor(logs, dtype=self.knots.dtype)
 
@@ -81,7 +80,6 @@ def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Te
     poses = [torch.zeros(0, 3, 4).to(around.center)]
     for number, each in enumerate(keyframes, start=1):
         eye = around.point("file", each.position)
-        assert eye is not None
         up = normalize(around.up, dim=0) if each.up is None else around.direction(each.up)
         ahead = around.direction(each.ahead)
         if float(torch.linalg.cross(ahead, up).norm()) < LEAST_SINE:

@@ -20,9 +20,6 @@ class LookAt(CameraPath):
         start: [x, y, z] in the capture's own frame; None: where the first photograph was taken.
         end: [x, y, z] in the capture's own frame; None: where the last photograph was taken.
         target: [x, y, z] in the capture's own frame; None: the middle of the scene.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     start: list[int | float] | None = None
@@ -31,11 +28,9 @@ class LookAt(CameraPath):
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the drive."""
-        start, end = around.point("start", self.start), around.point("end", self.end)
-        start = around.poses[0, :, 3] if start is None else start
-        end = around.poses[-1, :, 3] if end is None else end
+        start = around.point("start", self.start, around.poses[0, :, 3])
+        end = around.point("end", self.end, around.poses[-1, :, 3])
         target = around.point("target", self.target)
-        target = around.center if target is None else target
         share = torch.linspace(0, 1, self.num_frames).to(start)[:, None]
         eyes = start + share * (end - start)
         return self.pinholes(look_at(eyes, target.expand_as(eyes), around.up), around)

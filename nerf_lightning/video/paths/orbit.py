@@ -25,9 +25,6 @@ class Orbit(CameraPath):
         turns: full circles; negative goes clockwise.
         start: azimuth of the first camera in degrees; 0 is on the world's x axis where up is z.
         center: what it goes around, [x, y, z] in the capture's own frame; None: the middle of the scene.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     elevation: float = 30.0
@@ -47,8 +44,7 @@ class Orbit(CameraPath):
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the circle."""
-        given = around.point("center", self.center)
-        center = around.center if given is None else given
+        center = around.point("center", self.center)
         radius = around.radius if self.radius is None else self.radius / around.unit
         eyes = center + radius * self._directions(around.up)
         return self.pinholes(look_at(eyes, center.expand_as(eyes), around.up), around)

@@ -24,9 +24,6 @@ class Pan(CameraPath):
         position: where to stand instead, [x, y, z] in the capture's own frame, looking at the middle of the scene.
         sweep: degrees to turn in all; 360 makes a panorama, negative turns to the left.
         tilt: degrees to look higher than the photograph.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     view: int | str = 0
@@ -44,10 +41,8 @@ class Pan(CameraPath):
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras that turn."""
         pose = around.poses[find_views("view", [self.view], around.view_names, len(around.poses))[0]]
-        eye, ahead = around.point("position", self.position), -pose[:, 2]
-        if eye is None:
-            eye = pose[:, 3]
-        else:
+        eye, ahead = around.point("position", self.position, pose[:, 3]), -pose[:, 2]
+        if self.position is not None:
             ahead = normalize(around.center - eye, dim=0)
         up = normalize(around.up, dim=0)
         right = normalize(torch.linalg.cross(ahead, up), dim=0)

@@ -21,9 +21,6 @@ class PhotographPath(CameraPath):
         views: photographs in the order of the path, each by its name, a pattern ("IMG_01*") or its number from 0;
             None: all, in the capture's order.
         closed: go back to the first one at the end; the last frame then precedes the first.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     views: list[str | int] | None = None

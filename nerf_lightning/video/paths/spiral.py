@@ -22,9 +22,6 @@ class Spiral(CameraPath):
         reach: size of the spiral as a share of how far the photographs were taken apart.
         turns: full circles; on the way the camera goes once nearer and back.
         target: what it looks at, [x, y, z] in the capture's own frame; None: the middle of the scene.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     reach: float = 0.7
@@ -39,8 +36,7 @@ class Spiral(CameraPath):
     @own_precision
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the spiral, the last of which precedes the first."""
-        given = around.point("target", self.target)
-        target = around.center if given is None else given
+        target = around.point("target", self.target)
         mean = average_pose(around.poses)
         offsets = (around.poses[:, :, 3] - mean[:, 3]) @ mean[:, :3]
         # The outermost tenth of the photographs does not count: there, only few of them see the same.

@@ -50,7 +50,7 @@ def test_a_kernel_that_does_not_compile_leaves_the_work_to_its_reference(anew, m
     for _ in range(2):
         adam_step(parameter, grad.clone(), torch.zeros(3), torch.zeros(3), 0.5, 1.0, (0.0, 0.0), 1e-15)
     torch.testing.assert_close(parameter, torch.tensor([0.0, 1.0, 2.0]))
-    assert backends.why_not("adam.cpu") == "RuntimeError: LLVM cannot select this"
+    assert backends.why_not("nerf_lightning.nerf.kernels.adam.cpu") == "RuntimeError: LLVM cannot select this"
     assert len(caplog.records) == 1
     assert "the torch twins of its kernels run instead" in caplog.text
 
@@ -62,8 +62,8 @@ def test_whoever_waits_for_the_compiler_is_told_once(anew, monkeypatch, caplog, 
     monkeypatch.setattr(backends.importlib, "import_module", lambda name: slow)
     monkeypatch.setattr(backends, "LONG_SECONDS", 0.05)
     with caplog.at_level(logging.INFO):
-        backends.twin("hash_grid.cpu")
-        backends.twin("march.cpu")
+        backends.twin("nerf_lightning.nerf.kernels.hash_grid.cpu")
+        backends.twin("nerf_lightning.nerf.kernels.march.cpu")
     assert [each.count("the first time only") for each in caplog.messages] == [1] * said
 
 
@@ -100,8 +100,8 @@ def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(ane
     numba.config.CACHE_DIR = ""
     monkeypatch.setattr(backends.importlib, "import_module", without_cache)
     with caplog.at_level(logging.WARNING):
-        assert backends.twin("march.cpu") is found
-        assert backends.twin("adam.cpu") is found
+        assert backends.twin("nerf_lightning.nerf.kernels.march.cpu") is found
+        assert backends.twin("nerf_lightning.nerf.kernels.adam.cpu") is found
     assert len(asked) == 3
     assert os.access(numba.config.CACHE_DIR, os.W_OK)
     assert [record.getMessage().partition(" (")[0] for record in caplog.records] == [
@@ -113,7 +113,9 @@ def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(ane
 def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
     (tmp_path / "file").touch()
     places = {"NUMBA_CACHE_DIR": f"{tmp_path}/file/below", "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
-    program = "from nerf_lightning.nerf.kernels.backends import twin; print(twin('adam.cpu'))"
+    program = (
+        "from nerf_lightning.nerf.kernels.backends import twin; print(twin('nerf_lightning.nerf.kernels.adam.cpu'))"
+    )
     result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
     assert "adam/cpu.py" in result.stdout, result.stderr
     assert "Set NUMBA_CACHE_DIR" in result.stderr
@@ -123,7 +125,7 @@ KEPT = """
 import logging
 logging.basicConfig()
 from nerf_lightning.nerf.kernels.backends import twin
-print(twin("adam.cpu"))
+print(twin("nerf_lightning.nerf.kernels.adam.cpu"))
 """
 
 

@@ -33,7 +33,7 @@ def values_and_gradients(fn, table, points, grad, layout):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("features", [1, 2, 4])
 def test_the_numba_twin_equals_the_reference(layout, features):
-    assert backends.twin("hash_grid.cpu") is not None
+    assert backends.twin("nerf_lightning.nerf.kernels.hash_grid.cpu") is not None
     given = inputs(layout, features, reach=1.2)  # some points lie outside
     fast = values_and_gradients(interpolate, *given, layout)
     slow = values_and_gradients(interpolate_torch, *given, layout)

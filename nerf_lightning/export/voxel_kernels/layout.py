@@ -1,4 +1,4 @@
-"""Bricks: a grid of values cut into cubes, of which those are kept that hold something."""
+"""Blocks: a grid of values cut into cubes, of which those are kept that hold something."""
 
 from dataclasses import dataclass
 from types import ModuleType
@@ -10,21 +10,22 @@ from numpy import ndarray
 from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.kernels.backends import twin, why_not
 
+ROOM = "nerf_lightning.export.voxel_kernels"
 SIDE = 8
-"""Values along a side of a brick."""
+"""Values along a side of a block."""
 TILE = SIDE + 1
-"""And with the border that the next bricks lend, so that every place of a brick lies between values of its tile."""
+"""And with the border that the next blocks lend, so that every place of a block lies between values of its tile."""
 
 
 @dataclass(frozen=True)
-class Bricks:
+class VoxelBlocks:
     """A baked field as the kernels take it."""
 
     index: Int[ndarray, "x y z"]
-    """The number of each brick's tile, -1 where it is empty."""
-    density: UInt8[ndarray, "bricks 9 9 9"]
-    colors: UInt8[ndarray, "bricks 9 9 9 channels"]
-    owner: Int[ndarray, "bricks 9 9 9"]
+    """The number of each block's tile, -1 where it is empty."""
+    density: UInt8[ndarray, "blocks 9 9 9"]
+    colors: UInt8[ndarray, "blocks 9 9 9 channels"]
+    owner: Int[ndarray, "blocks 9 9 9"]
     """Which row of a table each value of a tile is of; -1: none."""
     scale: Float[ndarray, "numbers"]
     step: float
@@ -40,23 +41,22 @@ class Wanted:
     directions: Float[ndarray, "rays 3"]
     looks: Float[ndarray, "rays basis"]
     lengths: Float[ndarray, "rays"]
-    """As `bricks.cpu.march_tiles` takes them; outside, the distance at which each begins."""
+    """As `bounded.march_tiles` takes them; outside, the distance at which each begins."""
     rgb: Float[ndarray, "rays 3"]
     behind: Float[ndarray, "rays 3"]
     """The colours of the background."""
 
 
-def kernels(module: str = "bricks.cpu") -> ModuleType:
-    """Return the compiled kernels, of scenes in a box, `bricks.contracted`, or `bricks.gradients` of both.
-
-    Without them, a page would take hours.
+def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.") -> ModuleType:
+    """Return a module of this folder; without these kernels the work would take hours.
 
     Raises:
         InputError: they cannot be compiled here.
     """
-    found = twin(module)
+    name = f"{ROOM}.{module}"
+    found = twin(name)
     if found is None:
-        raise InputError(f"Baking needs numba, which cannot be used here: {why_not(module)}. Reinstall numba.")
+        raise InputError(f"{asked_by} needs numba, which cannot be used here: {why_not(name)}. {cure}")
     return found
 
 

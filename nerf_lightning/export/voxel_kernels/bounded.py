@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from numba import njit
 from numpy import ndarray
 
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
+from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
 OPAQUE_DEPTH = np.float32(6.0)
@@ -105,7 +105,7 @@ def _light(optical, filled, voxel, eye, sides):
 @njit(fastmath=True)
 @no_type_check
 def _way_out(x, y, z, dx, dy, dz):
-    # How far it is to the end of the brick that a place lies in.
+    # How far it is to the end of the block that a place lies in.
     return min(_ahead(x, dx), min(_ahead(y, dy), _ahead(z, dz)))
 
 
@@ -126,8 +126,8 @@ def march_tiles(
     directions: Float[ndarray, "rays 3"],
     looks: Float[ndarray, "rays basis"],
     index: Int[ndarray, "x y z"],
-    density: UInt8[ndarray, "bricks 9 9 9"],
-    colors: UInt8[ndarray, "bricks 9 9 9 channels"],
+    density: UInt8[ndarray, "blocks 9 9 9"],
+    colors: UInt8[ndarray, "blocks 9 9 9 channels"],
     scale: Float[ndarray, "numbers"],
     step: float,
     lengths: Float[ndarray, "rays"],
@@ -138,7 +138,7 @@ def march_tiles(
         origins: in voxels.
         directions: unit, in voxels.
         looks: spherical harmonics of the direction in the world.
-        index: the number of each brick's tile, -1 where it is empty.
+        index: the number of each block's tile, -1 where it is empty.
         density: bytes.
         colors: bytes, three for each harmonic.
         scale: the exponents of density 0 and of one more, and the half range of each degree's coefficients.

@@ -1,4 +1,4 @@
-"""The kernels of `bricks.cpu` for all of space: rays are straight in each part of a contracted cube.
+"""The kernels of `bounded` for all of space: rays are straight in each part of a contracted cube.
 
 Space is measured in halves of the inner cube's side, from its middle: u. Its contraction keeps the inner cube, and
 brings what lies beyond each of its faces into a box on that face: with r = max |u|, p = u / r, but for the largest
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 from numpy import ndarray
 
-from nerf_lightning.nerf.kernels.bricks.cpu import (
+from nerf_lightning.export.voxel_kernels.bounded import (
     HALF,
     LEAST_ALPHA,
     LEAST_LIGHT,
@@ -30,14 +30,14 @@ from nerf_lightning.nerf.kernels.bricks.cpu import (
     look_at,
     note,
 )
-from nerf_lightning.nerf.kernels.bricks.layout import SIDE, TILE, any_in_blocks
+from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 MOST_STEPS = 4096
 FARTHEST = np.float32(1e4)
 """Halves of the inner cube: beyond, places in the grid are no longer told apart."""
 INTO_NEXT = np.float32(0.01)
-"""Voxels beyond the end of an empty brick, so that the next one is found."""
+"""Voxels beyond the end of an empty block, so that the next one is found."""
 LEAST_STOPPED = np.float32(1e-4)
 """Less of a ray's light is not worth noting."""
 TWO, NEVER = np.float32(2.0), np.float32(-1.0)
@@ -81,7 +81,7 @@ def _seeing(first, last, optical, filled, voxels, places, units, eyes, views, ne
     count, most = eyes.shape[0], cameras.shape[1]
     for voxel in range(first, last):
         found = 0
-        # As in `bricks.cpu`: neighbours begin with different cameras.
+        # As in `bounded`: neighbours begin with different cameras.
         start = (voxels[voxel, 0] * 73 + voxels[voxel, 1] * 179 + voxels[voxel, 2] * 283) % count
         for turn in range(min(tries, count)):
             camera = (start + turn * 7919) % count
@@ -242,19 +242,19 @@ def march_tiles(
     directions: Float[ndarray, "rays 3"],
     looks: Float[ndarray, "rays basis"],
     index: Int[ndarray, "x y z"],
-    density: UInt8[ndarray, "bricks 9 9 9"],
-    colors: UInt8[ndarray, "bricks 9 9 9 channels"],
+    density: UInt8[ndarray, "blocks 9 9 9"],
+    colors: UInt8[ndarray, "blocks 9 9 9 channels"],
     scale: Float[ndarray, "numbers"],
     step: float,
     near: float,
 ) -> Float[ndarray, "rays 7"]:
-    """Return what `bricks.cpu.march_tiles` does, distances in u.
+    """Return what `bounded.march_tiles` does, distances in u.
 
     Args:
         origins: in u.
         directions: unit.
         looks: spherical harmonics of the direction in the world.
-        index: the number of each brick's tile, -1 where it is empty.
+        index: the number of each block's tile, -1 where it is empty.
         density: bytes.
         colors: bytes, three for each harmonic.
         scale: the exponents of density 0 and of one more, and the half range of each degree's coefficients.
@@ -280,7 +280,7 @@ def _march(first, last, origins, directions, looks, index, density, colors, scal
 @njit
 @no_type_check
 def walk(origin, along, index, density, scale, step, near, samples):
-    """Note where a ray's light is stopped, as that of `bricks.cpu` does."""
+    """Note where a ray's light is stopped, as that of `bounded` does."""
     spacing = np.float32(4.0 / (index.shape[0] * SIDE))
     nothing, doubling = np.exp2(scale[0]), LOG_2 * scale[1]
     (ox, oy, oz), (dx, dy, dz) = origin, along

@@ -7,21 +7,21 @@ from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
-from nerf_lightning.nerf.kernels.bricks.contracted import walk as walk_outside
-from nerf_lightning.nerf.kernels.bricks.cpu import MOST_SAMPLES, ONE, SAMPLE, _corner, color_at, walk
-from nerf_lightning.nerf.kernels.bricks.layout import TILE, Bricks, Wanted
+from nerf_lightning.export.voxel_kernels.bounded import MOST_SAMPLES, ONE, SAMPLE, _corner, color_at, walk
+from nerf_lightning.export.voxel_kernels.contracted import walk as walk_outside
+from nerf_lightning.export.voxel_kernels.layout import TILE, VoxelBlocks, Wanted
 from nerf_lightning.nerf.kernels.threads import in_parallel
 
 ZERO = np.float32(0.0)
 
 
 def gradients(
-    bricks: Bricks, wanted: Wanted, least_met: float, gradient: Float[ndarray, "2 rows channels_and_1"]
+    blocks: VoxelBlocks, wanted: Wanted, least_met: float, gradient: Float[ndarray, "2 rows channels_and_1"]
 ) -> float:
     """Add, for each value, the derivative of half the squared errors by its bytes: of density, and of each channel.
 
     Args:
-        bricks: the field.
+        blocks: the field.
         wanted: rays and their colours.
         least_met: what rays miss is as what they meet if they meet so much at least; 0: it is the background.
         gradient: of one half of the rays, and of the other: always two, so that sums do not depend on threads.
@@ -34,8 +34,8 @@ def gradients(
     def part(number: int) -> float:
         rays = slice(0, middle) if number == 0 else slice(middle, None)
         arrays = (wanted.origins, wanted.directions, wanted.looks, wanted.lengths, wanted.rgb, wanted.behind)
-        field = (bricks.index, bricks.density, bricks.colors, bricks.owner, bricks.scale, np.float32(bricks.step))
-        given = (*field, bricks.outside, np.float32(least_met))
+        field = (blocks.index, blocks.density, blocks.colors, blocks.owner, blocks.scale, np.float32(blocks.step))
+        given = (*field, blocks.outside, np.float32(least_met))
         return float(_gradients(*(each[rays] for each in arrays), *given, gradient[number]))
 
     return sum(in_parallel(part, [0, 1]))
@@ -133,6 +133,6 @@ def trial() -> None:
     """Run the kernel once on next to nothing; it raises whatever its compiler raises."""
     tile = np.ones((1, TILE, TILE, TILE), np.uint8)
     index, owner = np.zeros((1, 1, 1), np.int32), np.zeros(tile.shape, np.int32)
-    bricks = Bricks(index, tile, tile[..., None].repeat(3, -1), owner, np.ones(4, np.float32), 1.0, False)
+    blocks = VoxelBlocks(index, tile, tile[..., None].repeat(3, -1), owner, np.ones(4, np.float32), 1.0, False)
     three, one = np.ones((2, 3), np.float32), np.ones(2, np.float32)
-    gradients(bricks, Wanted(three, three, one[:, None], one, three, three), 0.0, np.zeros((2, 1, 4), np.float32))
+    gradients(blocks, Wanted(three, three, one[:, None], one, three, three), 0.0, np.zeros((2, 1, 4), np.float32))
