@@ -13,8 +13,9 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.console import say
-from nerf_lightning.export.base import Beside, Export, RunsExport
+from nerf_lightning.export.base import Export, PageExtras, RunsExport
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
@@ -44,8 +45,8 @@ def export_one(config: DictConfig) -> list[Path]:
     path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
     opened = open_checkpoint(config, float32=True)
-    if what.needs_density and opened.model.needs_photographs:
-        opened.model.density(torch.zeros(1, 3, device=opened.settings.device))  # or says by name that there is none
+    if what.needs_density:
+        point_field(opened.model)
     photographs = read_photographs(config, opened) if what.needs_photographs and config.photographs else None
     what.beside = beside(opened.checkpoint, photographs, path)
     default = beside_checkpoint(opened.checkpoint.path, "export")
@@ -71,7 +72,7 @@ def export_runs(config: DictConfig) -> list[Path]:
         return what.export(runs, folder, page_maker(export_one))
 
 
-def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> Beside:
+def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> PageExtras:
     """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene.
 
     Raises:
@@ -85,4 +86,4 @@ def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath |
     ]
     corrected = checkpoint.choices.get("correction", "none") != "none"
     keyframes = () if path is None else page_path(path, checkpoint.scene, run)
-    return Beside(photographs, corrected, tuple(known), keyframes)
+    return PageExtras(photographs, corrected, tuple(known), keyframes)

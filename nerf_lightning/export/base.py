@@ -12,7 +12,7 @@ from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
 
 @dataclass(frozen=True)
-class Beside:
+class PageExtras:
     """What belongs to a checkpoint and is not in it."""
 
     photographs: Scene | None = None
@@ -36,7 +36,7 @@ class Export(ABC):
     """Whether it says where matter is, and not only what is seen."""
     kernels: tuple[str, ...] = ()
     """Full names of modules of compiled kernels that it uses, each with a `trial`: compiled at installation."""
-    beside: Beside = Beside()
+    beside: PageExtras = PageExtras()
     """What the command has found beside the checkpoint."""
 
     @abstractmethod

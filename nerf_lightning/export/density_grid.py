@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.errors import InputError
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
 
@@ -75,7 +75,7 @@ def sample_density(
     density = np.empty(lattice.num_points, np.float32)
     for chunk in lattice.chunks():
         points = lattice.points(chunk)
-        parts = [model.density(points[part].to(device)).cpu() for part in tiles(len(points), tile_points)]
+        parts = [point_field(model).density(points[part].to(device)).cpu() for part in tiles(len(points), tile_points)]
         density[chunk] = torch.cat(parts).numpy()
         report(stage, chunk.stop / lattice.num_points)
     return density.reshape(lattice.shape)

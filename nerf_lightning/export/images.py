@@ -39,6 +39,8 @@ MILLIMETRE = 1e-3
 class ImagesExport(Export):
     """Write folders of pictures: `depth` (16-bit PNG, and float32 .npy), `opacity`, `normals`, and `images.json`.
 
+    Each channel of the model's field has a folder of float32 .npy arrays.
+
     Where the capture's unit is known, depth is in metres, and the PNG in millimetres as depth cameras write it, unless
     something lies further away than these reach.
 
@@ -62,7 +64,7 @@ class ImagesExport(Export):
         require_room(record.cameras, views, record.view_names)
         names = {view: f"{view:04d}_{_plain(record.view_names[view])}" for view in views}
         depths, opacities, directions = (make_folder(folder, name) for name in KINDS)
-        farthest = 0.0
+        farthest, channels = 0.0, dict[str, Path]()
         with StageProgress({"pictures": 10.0, "depth": 1.0}) as report:
             for number, view in enumerate(views):
                 seen = see(model, record, record.cameras, view, tile_points)
@@ -72,6 +74,9 @@ class ImagesExport(Export):
                 _save_opacity(opacities / f"{names[view]}.png", seen.opacity)
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
                 save_png(directions / f"{names[view]}.png", to_bytes(normals))
+                for name, values in seen.channels.items():
+                    channels[name] = make_folder(folder, name)
+                    _save_array(channels[name] / f"{names[view]}.npy", values.numpy())
                 report("pictures", (number + 1) / len(views))
             scale = _scale(record, farthest)
             for number, view in enumerate(views):
@@ -81,7 +86,7 @@ class ImagesExport(Export):
         write_json(about, self._described(record, names, scale))
         said = "millimetres" if scale == MILLIMETRE and record.metres_per_unit is not None else f"{scale:.4g} of these"
         say(f"depth        in {told_length(record)[1]}; a step of the 16-bit PNG is {said}")
-        return [depths, opacities, directions, about]
+        return [depths, opacities, directions, *channels.values(), about]
 
     def _views(self, record: SceneRecord) -> list[int]:
         everything = tuple(range(len(record.view_names)))
@@ -124,7 +129,7 @@ def _plain(name: str) -> str:
     return plain[: -len(Path(plain).suffix)] if Path(plain).suffix.lower() in ENDINGS else plain
 
 
-def _save_array(path: Path, array: Float[ndarray, "height width"]) -> None:
+def _save_array(path: Path, array: Float[ndarray, "height width *channels"]) -> None:
     # Given a file, numpy writes through buffers of C's, and says nothing where the disk is too full for the last one.
     content = io.BytesIO()
     np.save(content, array)

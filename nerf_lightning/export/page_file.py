@@ -20,7 +20,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.baked_field import BakedField, described, packed, unpacked
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
-from nerf_lightning.export.base import Beside
+from nerf_lightning.export.base import PageExtras
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular, read_text
@@ -67,7 +67,7 @@ class Page:
 
 
 def page_of(
-    marcher: Marcher, record: SceneRecord, beside: Beside, max_photographs: int, facts: list[tuple[str, str]]
+    marcher: Marcher, record: SceneRecord, beside: PageExtras, max_photographs: int, facts: list[tuple[str, str]]
 ) -> Page:
     """Return the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
     field = packed(marcher.baked)
@@ -164,7 +164,7 @@ def _camera(cameras: Cameras, view: int) -> dict[str, Any]:
     return {"eye": eye, "axes": [right, up, back], "focal": focal, "center": center, "width": width, "height": height}
 
 
-def _view(record: SceneRecord, beside: Beside, view: int | None) -> ViewOnPage:
+def _view(record: SceneRecord, beside: PageExtras, view: int | None) -> ViewOnPage:
     if view is None:
         return ViewOnPage("start", "")
     name, scene = record.view_names[view], beside.photographs

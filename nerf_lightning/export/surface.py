@@ -10,7 +10,7 @@ from torch.nn import functional
 from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles, weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.quadrature import composite
@@ -46,7 +46,7 @@ def surface_level(model: Model, record: SceneRecord, tile_points: int) -> float 
     seen = seen[((seen >= record.aabb[0]) & (seen <= record.aabb[1])).all(dim=-1)]
     if not len(seen):
         return None
-    density = torch.cat([model.density(part.to(device)).cpu() for part in seen.split(tile_points)])
+    density = torch.cat([point_field(model).density(part.to(device)).cpu() for part in seen.split(tile_points)])
     density = density[density > 0]  # on the very edge of an empty cell there may be none
     return float(density.quantile(QUANTILE)) if len(density) else None
 
@@ -119,7 +119,7 @@ def short_rays(
     edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
     intervals, origins = RaySamples(edges), at - before * look
     positions = origins[:, None] + intervals.midpoints[..., None] * look[:, None]
-    output = model.at(Points(positions, look[:, None]))
+    output = point_field(model).query(Points(positions, look[:, None]))
     near, beyond = torch.zeros(len(at), device=at.device), None if closed else torch.zeros_like(at)
     return composite(output, intervals, RayBundle(origins, look, near, near + before + behind, look), beyond)
 

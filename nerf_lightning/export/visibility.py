@@ -38,6 +38,8 @@ class SeenView:
     points: Float[Tensor, "height width 3"]
     normals: Float[Tensor, "height width 3"]
     """Unit, facing the camera; zero where the depth has no slope to speak of."""
+    channels: dict[str, Float[Tensor, "height width _"]]
+    """What else the model's field says, by name."""
 
 
 def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
@@ -64,7 +66,7 @@ def see(model: Model, record: SceneRecord, cameras: Cameras, view: int, tile_poi
     picture = render_picture(model, rays_of, view, record.background, tile_points)
     depth, points = picture_surface(rays_of, view, picture)
     normals = normals_from_depth(points) if min(depth.shape) > 1 else torch.zeros_like(points)
-    return SeenView(picture.rgb, picture.opacity, depth, points, normals)
+    return SeenView(picture.rgb, picture.opacity, depth, points, normals, picture.channels)
 
 
 def nearest_views(cameras: Cameras, view: int, others: Sequence[int], count: int) -> list[int]:

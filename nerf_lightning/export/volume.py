@@ -15,7 +15,7 @@ from nerf_lightning.export.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.nerf.geometry.frames import unit_of
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -94,5 +94,6 @@ def _seen(
     model: Model, points: Float[Tensor, "points 3"], eyes: Float[Tensor, "cameras 3"]
 ) -> UInt8[Tensor, "points 3"]:
     device, looks = next(model.parameters()).device, looks_from_nearest(points, eyes)
-    colors = [model.at(Points(points.to(device), look.to(device))).rgb.cpu() / len(looks) for look in looks]
+    query = point_field(model).query
+    colors = [query(Points(points.to(device), look.to(device))).rgb.cpu() / len(looks) for look in looks]
     return to_bytes(sum(colors, torch.zeros(len(points), 3)))

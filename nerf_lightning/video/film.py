@@ -21,7 +21,7 @@ from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.encoding import CODECS, require_encoder
 from nerf_lightning.video.exr import Channels, exr_channels, require_openexr
 from nerf_lightning.video.frames import FilmFrames, Range
-from nerf_lightning.video.panels import FILMS, film_pictures, panel
+from nerf_lightning.video.panels import FILMS, channel_picture, film_name, film_pictures, panel
 from nerf_lightning.video.paths.base import CameraPath
 from nerf_lightning.video.settings import ENDINGS, FilmSettings
 from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
@@ -95,8 +95,10 @@ def film_steps(
         subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
     )
     require_room(shots[0].cameras, settings, len(subjects))
+    for name in [name for name in settings.outputs if name not in FILMS]:
+        channel_picture(name, shots[0].picture(0))  # or says that there is none, before anything is written
     first = shots[0].subject.scene
-    films = ["mosaic"] if settings.mosaic else [FILMS[name] for name in settings.outputs]
+    films = ["mosaic"] if settings.mosaic else [film_name(name) for name in settings.outputs]
     if settings.form == "exr":
         films = ["exr"]  # all in one file
     frames = FilmFrames(

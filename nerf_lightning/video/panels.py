@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.visualization.pictures import (
     depth_picture,
@@ -18,7 +19,7 @@ from nerf_lightning.visualization.pictures import (
 )
 
 FILMS = {"rgb": "video", "depth": "depth", "opacity": "opacity", "normals": "normals", "levels": "levels"}
-"""What can be shown, and the name of its film."""
+"""What can be shown of every model, and the name of its film. Any other name is a channel of the model's field."""
 
 _PAPER = 255
 
@@ -48,7 +49,31 @@ def panel(
         return to_bytes(faded(0.5 + 0.5 * normals, picture.opacity))
     if output == "levels" and picture.first_rgb is not None:
         return error_picture(picture.first_rgb, picture.rgb)
-    return to_bytes(picture.rgb)
+    return to_bytes(picture.rgb) if output in FILMS else channel_picture(output, picture)
+
+
+def film_name(output: str) -> str:
+    """Return the name of the film of an output."""
+    return FILMS.get(output, output)
+
+
+def channel_picture(name: str, picture: Picture) -> UInt8[Tensor, "height width 3"]:
+    """Return a channel as a picture: one number a pixel in grey, three as colours, more in the colour of the largest.
+
+    Numbers are shown as they are, from 0 to 1.
+
+    Raises:
+        InputError: the model's field has no such channel.
+    """
+    if name not in picture.channels:
+        known = [*FILMS, *picture.channels]
+        raise InputError(f"outputs: this model shows no {name}. Choose one or more of {', '.join(known)}.")
+    values = picture.channels[name]
+    if values.shape[-1] in (1, 3):
+        return to_bytes(values.expand(*values.shape[:-1], 3))
+    hues = torch.arange(values.shape[-1]) / values.shape[-1]
+    colors = 0.5 + 0.5 * torch.cos(2 * torch.pi * (hues[:, None] + torch.tensor([0.0, 1 / 3, 2 / 3])))
+    return to_bytes(faded(colors[values.argmax(dim=-1)], picture.opacity))
 
 
 def film_pictures(
@@ -72,10 +97,9 @@ def film_pictures(
         rows = [row((each[name], prefix + name) for name in each) for each, prefix in named]
         return {"mosaic": _framed(_stacked(rows, size), size)}
     if not several:
-        return {FILMS[name]: picture for name, picture in panels[0].items()}
-    return {
-        FILMS[name]: _framed(row(zip((each[name] for each in panels), labels, strict=True)), size) for name in panels[0]
-    }
+        return {film_name(name): picture for name, picture in panels[0].items()}
+    beside = {name: row(zip((each[name] for each in panels), labels, strict=True)) for name in panels[0]}
+    return {film_name(name): _framed(picture, size) for name, picture in beside.items()}
 
 
 def _stacked(rows: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int) -> UInt8[Tensor, "height width 3"]:

@@ -29,7 +29,7 @@ class FilmSettings:
     """What is filmed. Distances and places are in the frame and the units of the capture's own files."""
 
     outputs: tuple[str, ...] = ("rgb", "depth")
-    """Keys of `export.panels.FILMS`."""
+    """Keys of `video.panels.FILMS`, or channels of the model's field."""
     mosaic: bool = False
     """One film of all outputs, in place of one for each."""
     form: Form = "video"
@@ -57,8 +57,10 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         if not isinstance(config[name], bool):
             raise InputError(f"{name}={config[name]} does not fit: it must be true or false.")
     outputs = tuple(map(str, as_list(config["outputs"])))
-    if not outputs or len(set(outputs)) < len(outputs) or not set(outputs) <= set(FILMS):
-        raise InputError(f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, each once.")
+    if not outputs or len(set(outputs)) < len(outputs) or not all(map(str.isidentifier, outputs)):
+        raise InputError(
+            f"outputs={list(outputs)}: choose one or more of {', '.join(FILMS)}, or channels of the model, each once."
+        )
     if config["format"] not in get_args(Form):
         raise InputError(
             f"format={config['format']}: choose video (mp4), webm (VP9), prores (ProRes 4444 in mov), animation (WebP, "

@@ -52,7 +52,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_gradients_are_those_of_what_the_page_shows(ball, hall, case):
-    """Beside differences of the marcher's errors, many bytes moved at once."""
+    """PageExtras differences of the marcher's errors, many bytes moved at once."""
     baked, scene, depths = case(ball, hall)
     # Nothing is clamped, and little so thin that it is left out, which no gradient knows of: without that rule, 3 %.
     baked = replace(baked, density=np.clip(baked.density, *depths), colors=np.clip(baked.colors, 90, 160))

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -13,14 +14,20 @@ from support.running import refused
 from support.scenes import ball_scene
 from support.steps import rays_of
 
+from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.step import TrainStep
+from nerf_lightning.video.film import film
+from nerf_lightning.video.settings import FilmSettings
+from nerf_lightning.video.shots import Subject
 
 SEARCHED = f"hydra.searchpath=[file://{Path(extensions.__file__).parent / 'conf'}]"
 SMALL_GRID = ["encoder.first.log2_table_size=10", "encoder.second.num_frequencies=3"]
@@ -37,6 +44,7 @@ ADDED = {
     "a code for each photograph": ["model=nerf_tiny", "field=nerf_mlp_with_codes"],
     "an encoder with a penalty": ["model=fast_small", "encoder=kplanes"],
     "a structural loss beside the squared error": ["model=nerf_tiny", "loss=mse_dssim", "field.width=16"],
+    "a semantic channel": ["model=semantic"],
     "a model of its own kind": ["model=voxels", "model.resolution=12", "sampler@model.sampler=stratified_32"],
 }  # fmt: skip
 
@@ -86,6 +94,27 @@ def test_each_term_of_a_weighted_sum_is_told_apart_and_their_sum_is_minimised():
     assert float(seen.terms["dssim"].min()) > 0
     torch.testing.assert_close(seen.losses, seen.terms["mse"] + seen.terms["dssim"])
     torch.testing.assert_close(seen.terms["mse"], seen.color_errors)
+
+
+def test_a_channel_is_trained_rendered_filmed_and_exported_without_being_listed(tmp_path):
+    scene, step = ball_scene(num_views=8, size=16, background="black"), a_step(ADDED["a semantic channel"])
+    loader, optimizer = RayBatches(scene, step.progress, 0, 96), step.new_optimizer()
+    terms = [step(loader.at(0, step.progress.rays_seen), optimizer).terms["bright"].sum() for _ in range(40)]
+    assert float(torch.stack(terms[-5:]).mean()) < 0.9 * float(torch.stack(terms[:5]).mean())
+    model = step.model.eval()
+    seen = render_picture(model, step.rays, 0, "black", 4096)
+    assert seen.channels["bright"].shape == (16, 16, 2)
+    torch.testing.assert_close(seen.channels["bright"].sum(dim=-1), seen.opacity)
+    record, shown = scene_record(scene), FilmSettings(outputs=("rgb", "bright"), form="frames")
+    path = build(composed("render", "path=orbit", "path.num_frames=2", "path.width=12").path)
+    _, classes = film([Subject(model, record, "black")], path, 4096, tmp_path, shown)
+    assert len(list(classes.glob("*.png"))) == 2
+    assert classes.name == "bright"
+    with pytest.raises(InputError, match=r"this model shows no dark\. Choose one or more of rgb, .*bright"):
+        film([Subject(model, record, "black")], path, 4096, tmp_path / "b", FilmSettings(outputs=("dark",)))
+    ImagesExport(split="test").export(model, record, tmp_path, 4096)
+    arrays = [np.load(file) for file in sorted((tmp_path / "bright").glob("*.npy"))]
+    assert [array.shape for array in arrays] == [(16, 16, 2)] * len(record.splits["test"])
 
 
 def test_a_weighted_sum_refuses_what_does_not_fit():

@@ -8,7 +8,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.baking.bake import bake
-from nerf_lightning.export.base import Beside
+from nerf_lightning.export.base import PageExtras
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -51,5 +51,5 @@ def baked_ball(resolution: int = 48, harmonics: int = 4, model=None, record=None
         return bake(model or shiny_model(), record or record_of(all_around()), resolution, harmonics, 4096, quiet)
 
 
-def beside(scene, *facts) -> Beside:
-    return Beside(scene, facts=tuple(facts))
+def beside(scene, *facts) -> PageExtras:
+    return PageExtras(scene, facts=tuple(facts))

@@ -15,7 +15,7 @@ from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.contraction import Contraction, is_place, num_values
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
 from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
 
@@ -156,7 +156,7 @@ def _asked(
     device = next(model.parameters()).device
     optical = np.empty(len(voxels), np.float32)
     for part in tiles(len(voxels), tile_points):
-        density = model.density(grid.places(voxels[part]).to(device)).cpu().numpy()
+        density = point_field(model).density(grid.places(voxels[part]).to(device)).cpu().numpy()
         optical[part] = grid.lengths(voxels[part]) * density
         if report is not None:
             report("coarse", part.stop / len(voxels))

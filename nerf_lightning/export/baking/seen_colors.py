@@ -14,7 +14,7 @@ from nerf_lightning.export.baking.baked_field import NO_CHANGE
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
@@ -105,7 +105,7 @@ def fitted_colors(
         asked = (chosen >= 0).flatten()
         points = Points(at.flatten(0, 1)[asked].to(device), directions.flatten(0, 1)[asked].to(device))
         rgb = torch.zeros(len(asked), 3)
-        rgb[asked] = model.at(points).rgb.float().cpu()
+        rgb[asked] = point_field(model).query(points).rgb.float().cpu()
         basis = harmonics(directions)
         weighted = (basis * weight[..., None]).mT
         left = weighted @ basis + ridge * weight.sum(dim=1)[:, None, None]

@@ -23,9 +23,8 @@ from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import DenseSampler
 from nerf_lightning.nerf.types.photographs import Photographs
-from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle, RaySamples
-from nerf_lightning.nerf.types.renderings import DenseRendering, FieldOutput, Rendering
+from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
 from nerf_lightning.nerf.types.scene import DRAWN, Scene
 
 DEEP = 8.0
@@ -46,11 +45,6 @@ RANGES = {
     "smoothness": (0.0, 1e6),
 }
 
-NO_POINTS = (
-    "model=view_transformer makes pictures of rays and knows neither density nor colour of points, so there is nothing "
-    "to make a mesh, points, a volume or a page of. Films and pictures (nerf render) it can make; for the others train "
-    "a model of the scene, such as model=fast."
-)
 LEAST_SEEN = 0.5
 """Of rays that are rendered together: rays past the corners of all photographs are nothing to speak of."""
 STARTS = {"largest": Largest, "spread": Spread}
@@ -143,7 +137,7 @@ class ViewTransformer(Model):
         """There is one round."""
         return ("views",)
 
-    def look_at(self, photographs: Photographs) -> None:
+    def set_source_images(self, photographs: Photographs) -> None:
         """Take the photographs that rays are rendered from, in the place of earlier ones.
 
         Raises:
@@ -178,7 +172,7 @@ class ViewTransformer(Model):
         """
         tables = self.tables
         if tables is None:
-            raise InputError("model=view_transformer renders from photographs, and was given none: call look_at first.")
+            raise InputError("model=view_transformer was given no photographs: call set_source_images first.")
         tables.move_to(rays.near.device)
         photographs = tables.photographs
         sources = choose_sources(photographs, rays, self.num_sources, random)
@@ -217,14 +211,6 @@ class ViewTransformer(Model):
     def points_per_ray(self, training: bool) -> float:
         """Return samples times sources: each point is looked at in every view."""
         return float(self.sampler.num_samples_after(0) * self.num_sources)
-
-    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Refuse: there is none."""
-        raise InputError(NO_POINTS)
-
-    def at(self, points: Points) -> FieldOutput:
-        """Refuse: points have neither density nor colour by themselves."""
-        raise InputError(NO_POINTS)
 
     def fit_to(self, scene: Scene) -> None:
         """Nothing of a scene is kept: any may follow."""

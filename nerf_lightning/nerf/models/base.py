@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
@@ -28,7 +29,7 @@ class Model(nn.Module, ABC):
     needs_whole_batch: bool = False
     """True where the result for one ray depends on the others; such a model is never cut into tiles."""
     needs_photographs: bool = False
-    """True where it renders a scene from photographs: `look_at` is called before the first rays."""
+    """True where it renders a scene from photographs: `set_source_images` is called before the first rays."""
     baselines: Baselines | None = None
     """Mean PSNR (dB) of views that are shown by so many photographs, without the model, for each way to do so."""
 
@@ -71,18 +72,10 @@ class Model(nn.Module, ABC):
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""
 
     @abstractmethod
-    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        """Return the density per unit length, as the last round's rays find it."""
-
-    @abstractmethod
-    def at(self, points: Points) -> FieldOutput:
-        """Return density and colour of points by themselves, as the last round's field has them."""
-
-    @abstractmethod
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""
 
-    def look_at(self, photographs: Photographs) -> None:
+    def set_source_images(self, photographs: Photographs) -> None:
         """Take the photographs that rays are rendered from, in the place of earlier ones; most models need none.
 
         They are no part of the model's state: no checkpoint carries them.
@@ -124,6 +117,33 @@ class Model(nn.Module, ABC):
     def compile_fields(self) -> list[str]:
         """Compile the fields of rounds with static shapes (torch.compile), and return the rounds' names."""
         return []
+
+
+class PointField(Model):
+    """A model of one scene, which has density and colour at points by themselves: exporters ask it for both."""
+
+    @abstractmethod
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Return the density per unit length, as the last level's rays find it."""
+
+    @abstractmethod
+    def query(self, points: Points) -> FieldOutput:
+        """Return what the last level's field says of points."""
+
+
+def point_field(model: Model) -> PointField:
+    """Return a model that has density and colour at points.
+
+    Raises:
+        InputError: it renders rays alone.
+    """
+    if isinstance(model, PointField):
+        return model
+    raise InputError(
+        f"{type(model).__name__} renders rays and has neither density nor colour at points, so there is nothing to "
+        "make a mesh, points, a volume or a page of. nerf render films it; for the others train a model of the scene, "
+        "such as model=fast."
+    )
 
 
 def norm_of_gradients(module: nn.Module) -> Float[Tensor, ""]:

@@ -61,11 +61,11 @@ class DenseLevel(Level):
     ) -> DenseRendering:
         """Sample, ask the field at the midpoints, composite."""
         samples = self.sampler(rays, history, random)
-        seen = self.look(points_along(rays, samples, random, self.field.sees_cones))
+        seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
         if random is not None:
             seen = soften_near_gradients(seen, samples.midpoints, self.whole_gradients_from)
         return composite(seen, samples, rays, background)
 
-    def look(self, points: Points) -> FieldOutput:
+    def field_output(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""
         return self.field(points)

@@ -12,4 +12,4 @@ def show_photographs(model: Model, scene: Scene) -> None:
         InputError: they are too few, or of a kind that the model cannot look at.
     """
     if model.needs_photographs:
-        model.look_at(photographs_of(scene, scene.sources))
+        model.set_source_images(photographs_of(scene, scene.sources))

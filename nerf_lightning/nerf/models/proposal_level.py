@@ -60,7 +60,7 @@ class ProposalLevel(DenseLevel):
         with torch.set_grad_enabled(torch.is_grad_enabled() and self._learns):
             return super().forward(rays, background, history, random)
 
-    def look(self, points: Points) -> FieldOutput:
+    def field_output(self, points: Points) -> FieldOutput:
         """Return the density, and black."""
         density, _ = self.field.density(points)
         return FieldOutput(density, density.new_zeros(*density.shape, 3))

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.geometry.contraction import Contracted
-from nerf_lightning.nerf.models.base import Model, norm_of_gradients
+from nerf_lightning.nerf.models.base import PointField, norm_of_gradients
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.products import Products
@@ -17,7 +17,7 @@ from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 from nerf_lightning.nerf.types.scene import Scene
 
 
-class RadianceModel(Model):
+class RadianceModel(PointField):
     """The original NeRF is two levels, coarse (stratified) and fine (importance); the last one is the picture.
 
     Args:
@@ -77,7 +77,7 @@ class RadianceModel(Model):
         """Return the density per unit length, as the last level's rays find it."""
         return self.last.density(positions)
 
-    def at(self, points: Points) -> FieldOutput:
+    def query(self, points: Points) -> FieldOutput:
         """Return density and colour of points by themselves, as the last level's field has them."""
         return self.last.field(points)
 

@@ -5,7 +5,7 @@ from torch import nn
 from torch.nn.functional import grid_sample, softplus
 
 from nerf_lightning.nerf.geometry.boxes import to_unit_cube
-from nerf_lightning.nerf.models.base import Model
+from nerf_lightning.nerf.models.base import PointField
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler
@@ -13,7 +13,7 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 
-class VoxelModel(Model):
+class VoxelModel(PointField):
     """A grid over the scene's box.
 
     Args:
@@ -37,9 +37,9 @@ class VoxelModel(Model):
 
     def forward(self, rays, background, random):
         samples = self.sampler(rays, [], random)
-        return [composite(self.at(points_along(rays, samples, random)), samples, rays, background)]
+        return [composite(self.query(points_along(rays, samples, random)), samples, rays, background)]
 
-    def at(self, points):
+    def query(self, points):
         cube = 2.0 * to_unit_cube(points.positions, self.aabb) - 1.0
         found = grid_sample(self.grid, cube.reshape(1, 1, 1, -1, 3), align_corners=True)
         found = found.reshape(4, *cube.shape[:-1])
@@ -47,7 +47,7 @@ class VoxelModel(Model):
         return FieldOutput(density=inside * softplus(found[0]), rgb=found[1:].sigmoid().movedim(0, -1))
 
     def density(self, positions):
-        return self.at(Points(positions)).density
+        return self.query(Points(positions)).density
 
     def points_per_ray(self, training):
         return float(self.sampler.num_samples_after(0))

@@ -17,7 +17,7 @@ def looking_model(scene=None, views=range(6), **changes) -> ViewTransformer:
     """A model of seeded weights, looking at views of a scene."""
     torch.manual_seed(1)
     model = ViewTransformer(StratifiedSampler(6), **(SETTINGS | {"image_width": 8, "image_blocks": 1} | changes))
-    model.look_at(photographs_of(ball_scene() if scene is None else scene, list(views)))
+    model.set_source_images(photographs_of(ball_scene() if scene is None else scene, list(views)))
     return model
 
 
