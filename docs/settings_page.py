@@ -4,9 +4,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.manual.catalogue import Command, Group, command_named
-from nerf_lightning.manual.pages import said
-from nerf_lightning.manual.settings import Setting
+from nerf_lightning.manual.catalogue import Command, Setting, command_named
+from nerf_lightning.manual.pages import brief
 
 HEAD = """# Settings
 
@@ -21,36 +20,34 @@ def write(folder: Path) -> None:
     for name in sorted(find_commands(), key=lambda name: name != "train"):
         command = command_named(name)
         assert command is not None
-        lines += [f"## nerf {name}", "", *_table(each for each in command.own if not each.is_section)]
+        lines += [f"## nerf {name}", "", *_table(command.written)]
         for group in command.groups:
-            if group.typed not in told:
-                told.add(group.typed)
+            if group not in told:
+                told.add(group)
                 lines += _of_group(command, group)
     (folder / "settings.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _of_group(command: Command, group: Group) -> Iterator[str]:
-    default = command.chosen.get(group.typed)
-    yield from (f"### {group.typed}", "")
-    if default is not None and len(group.options) > 1:
-        yield from (f"`{default.name}` where nothing is said.", "")
-    if len(group.options) > 1:
+def _of_group(command: Command, group: str) -> Iterator[str]:
+    default, options = command.chosen.get(group), command.options[group]
+    yield from (f"### {group}", "")
+    if len(options) > 1:
+        if default is not None:
+            yield from (f"`{default.typed}` where nothing is said.", "")
         yield from ("| option | what it is |", "|---|---|")
-        yield from (f"| `{option.name}` | {_cell(option.summary)} |" for option in group.options)
+        yield from (f"| `{option.typed}` | {_cell(brief(option.about[0]))} |" for option in options)
         yield ""
-    yield from _table(
-        each for option in group.options for each in option.settings if each.meaning and not each.is_section
-    )
+    yield from _table(each for option in options for each in option.settings)
 
 
 def _table(settings: Iterable[Setting]) -> Iterator[str]:
-    rows = {(each.key, each.meaning): each for each in settings}
+    rows = {(each.key, each.meaning): each for each in settings if each.text and each.is_own}
     if not rows:
         return
     yield from ("| setting | what it means | takes |", "|---|---|---|")
     for each in rows.values():
-        takes = f"{each.kind.words}{f': {each.bounds}' if each.bounds else ''}"
-        yield f"| `{each.key}={_cell(each.text)}` | {_cell(said(each))} | {_cell(takes)} |"
+        takes = f"`{_cell(each.takes)}`" if each.takes else ""
+        yield f"| `{each.key}={_cell(each.text)}` | {_cell(each.meaning)} | {takes} |"
     yield ""
 
 

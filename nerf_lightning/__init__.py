@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 
 _OFFERED = {
     "Cameras": "nerf_lightning.nerf.types.scene",
-    "InputError": "nerf_lightning.errors",
+    "InputError": "nerf_lightning.messages.errors",
     "Picture": "nerf_lightning.nerf.models.render_image",
     "RadianceFieldSystem": "nerf_lightning.training.system",
     "RayDataModule": "nerf_lightning.data.datamodule",

@@ -1,7 +1,7 @@
 """Types of what the package offers when it is asked for (`__init__.py`)."""
 
 from nerf_lightning.data.datamodule import RayDataModule as RayDataModule
-from nerf_lightning.errors import InputError as InputError
+from nerf_lightning.messages.errors import InputError as InputError
 from nerf_lightning.nerf.models.render_image import Picture as Picture
 from nerf_lightning.nerf.types.scene import Cameras as Cameras
 from nerf_lightning.nerf.types.scene import Scene as Scene

@@ -31,11 +31,11 @@ from nerf_lightning.bench.stages import (
 from nerf_lightning.bench.table import min_median_max, print_table
 from nerf_lightning.compute.machine import peak_memory, seconds_of
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.console import say, stderr_console
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.console import say, stderr_console
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.render_image import render_rays

@@ -20,10 +20,10 @@ from rich.table import Table
 from nerf_lightning.bench.noise_capture import write_noise_capture
 from nerf_lightning.bench.scaling_point import Point, measure_point
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.console import StdoutConsole, say, stderr_console
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.console import StdoutConsole, say, stderr_console
+from nerf_lightning.messages.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.compute.machine import peak_memory, seconds_of
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 WARMUP_STEPS, WINDOWS, LEAST_SECONDS = 3, 5, 0.15
 

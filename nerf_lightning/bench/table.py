@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from nerf_lightning.console import StdoutConsole, spoken
+from nerf_lightning.messages.console import StdoutConsole, spoken
 
 
 def min_median_max(values: list[float]) -> dict[str, float]:

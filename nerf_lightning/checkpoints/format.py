@@ -4,10 +4,10 @@ from typing import get_args
 
 import torch
 
-from nerf_lightning.budgets import allowed
 from nerf_lightning.checkpoints.packing import packed_format
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.schema import (
     Choice,
     Description,

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.budgets import allowed, require_within
+from nerf_lightning.files.budgets import allowed, require_within
 from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Record, Text, Unfit, Whole
 
 NumberType = Literal["float32", "float16", "int8"]

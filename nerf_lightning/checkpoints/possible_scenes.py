@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf_lightning.budgets import require_within
-from nerf_lightning.escaping import require_printable
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.schema import Unfit
+from nerf_lightning.messages.escaping import require_printable
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import is_rigid

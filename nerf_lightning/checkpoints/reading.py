@@ -23,10 +23,10 @@ from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
 from nerf_lightning.checkpoints.format import scene as scene_format
 from nerf_lightning.checkpoints.packing import unpacked
 from nerf_lightning.checkpoints.possible_scenes import require_possible_refinement, require_possible_scene
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.schema import Unfit, shown
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"

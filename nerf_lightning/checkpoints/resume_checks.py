@@ -10,8 +10,8 @@ from torch import Tensor
 from nerf_lightning.checkpoints.format import KEY
 from nerf_lightning.checkpoints.optimizer_state import Build, require_fitting_optimizer
 from nerf_lightning.data.ray_batches import batch_sizes
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.schema import Description, Plain, Unfit, like
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
 CURE = (

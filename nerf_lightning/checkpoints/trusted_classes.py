@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.base import Model

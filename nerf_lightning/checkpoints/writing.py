@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from nerf_lightning.checkpoints.reading import LAST, PREVIOUS
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import FULL
+from nerf_lightning.messages.errors import InputError
 
 
 def write_checkpoint(checkpoint: dict[str, Any], target: Path) -> None:

@@ -1,12 +1,11 @@
-"""Hydra's own options (`--cfg job`, `--config-dir DIR`), told from overrides by Hydra's own parser."""
+"""The words of a command line: Hydra's own options, by Hydra's own parser, and paths, quoted or made overrides."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
-from hydra._internal.utils import get_args_parser
-
-from nerf_lightning.errors import InputError
 from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.messages.errors import InputError
 
 COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve", "--config-dir", "--hydra-help")
 
@@ -20,6 +19,8 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     >>> options_first(["seed=1", "--cfg", "job", "model=nerf", "-m"])
     ['--cfg=job', '--multirun', 'seed=1', 'model=nerf']
     """
+    from hydra._internal.utils import get_args_parser  # imported late: `--help` needs no Hydra
+
     parser = get_args_parser()
     parser.error = _refuse  # type: ignore[method-assign]
     unasked = vars(parser.parse_args([]))
@@ -38,3 +39,39 @@ def _refuse(message: str) -> NoReturn:
     option = next((word for word in message.split() if word.startswith("--")), "")
     hint = did_you_mean(option, COMMON)
     raise InputError(f"{message}.{hint} nerf COMMAND --hydra-help lists the options; settings are given as key=value.")
+
+
+def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
+    """Return the arguments with those that are paths gathered into `key=...`.
+
+    A path is what has no `=`, or what is there: the folders of a sweep's jobs are named `0_seed=0`.
+
+    Raises:
+        InputError: there are several where one is wanted.
+    """
+    paths = [
+        word for word in arguments if not word.startswith(("-", "+", "~")) and ("=" not in word or Path(word).exists())
+    ]
+    if not paths:
+        return arguments
+    from nerf_lightning.config.overrides import quoted  # brings Hydra
+
+    if len(paths) > 1 and not several:
+        raise InputError(f"{key}: one folder is wanted, and {len(paths)} were given: {', '.join(paths)}.")
+    value = f"[{','.join(map(quoted, paths))}]" if several else quoted(paths[0])
+    return [*(word for word in arguments if word not in paths), f"{key}={value}"]
+
+
+def quoted_paths(arguments: list[str]) -> list[str]:
+    """Return the arguments, the values quoted that are paths with a `=` in them, which Hydra would not read.
+
+    The folders of a sweep's jobs have one: `ckpt=outputs/sweeps/SWEEP/0_seed=0`.
+    """
+    return [_with_quotes(word) if word.count("=") > 1 and not word.startswith("-") else word for word in arguments]
+
+
+def _with_quotes(word: str) -> str:
+    from nerf_lightning.config.overrides import quoted
+
+    key, _, value = word.partition("=")
+    return f"{key}={quoted(value)}" if "=" in value and Path(value).exists() else word

@@ -1,12 +1,11 @@
 """`nerf help`, `nerf COMMAND --help`, and the words behind them: answered from conf/ and docstrings, without Hydra."""
 
 import shutil
-from collections.abc import Iterable
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.manual.catalogue import Command, command_named
+from nerf_lightning.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.manual.pages import command_page, page_of
 from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.messages.errors import InputError
 
 FLAGS = ("-h", "--help")
 NARROWEST, WIDEST = 60, 120
@@ -43,7 +42,7 @@ def _found(word: str, names: list[str]) -> str:
         page = page_of(_command(name), word, _width())
         if page is not None:
             return page
-    known = {each for name in names for each in _names(_command(name))}
+    known = {each for name in names for each in known_names(_command(name))}
     where = f"nerf {names[0]} has" if len(names) == 1 else "There is"
     raise InputError(f"{where} no setting or group {word}.{did_you_mean(word.partition('=')[0], sorted(known))}")
 
@@ -52,11 +51,6 @@ def _command(name: str) -> Command:
     found = command_named(name)
     assert found is not None
     return found
-
-
-def _names(asked: Command) -> Iterable[str]:
-    yield from (group.typed for group in asked.groups)
-    yield from (setting.key for _, setting in asked.settings)
 
 
 def _width() -> int:

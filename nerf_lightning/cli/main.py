@@ -13,17 +13,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from nerf_lightning.budgets import Budgets, allow, allow_as_typed
-from nerf_lightning.cli.bare_paths import quoted_paths
-from nerf_lightning.cli.broken_pipe import ends_quietly
+from nerf_lightning.cli.arguments import quoted_paths
 from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.cli.process import ends_quietly
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.cli.working_directory import require_no_settings_here
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.files.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -150,7 +150,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
     with explained(command):
         from nerf_lightning.cli.arguments import options_first
-        from nerf_lightning.cli.one_composition import compose_once
+        from nerf_lightning.cli.loading import compose_once
         from nerf_lightning.config.search_path import search_extensions
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])

@@ -7,10 +7,10 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from nerf_lightning.cli.bare_paths import named_paths
+from nerf_lightning.cli.arguments import named_paths
 from nerf_lightning.cli.loading import quick_imports
 from nerf_lightning.compute.slurm import was_requeued
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import option_names
+from nerf_lightning.messages.errors import InputError
 
 if TYPE_CHECKING:
     from nerf_lightning.runs.sweep_record import SweepRecord

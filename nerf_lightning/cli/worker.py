@@ -8,9 +8,9 @@ import json
 import sys
 from pathlib import Path
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.cli.main import command_module, explained
 from nerf_lightning.cli.process import quick_end
+from nerf_lightning.files.budgets import Budgets, allow
 
 
 def main() -> None:

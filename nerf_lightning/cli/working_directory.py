@@ -7,7 +7,7 @@
 import os
 import sys
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 SETTINGS = {
     ".numba_config.yaml": "numba, whose settings can be given as variables (NUMBA_...)",

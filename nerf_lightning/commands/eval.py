@@ -6,8 +6,8 @@ from omegaconf import DictConfig
 from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import as_known, open_checkpoint
-from nerf_lightning.console import say
 from nerf_lightning.evaluation.protocol import measured_of
+from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes
 

@@ -12,9 +12,9 @@ from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.console import say
 from nerf_lightning.export.base import Export, PageExtras, RunsExport
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.messages.console import say
 from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.report.metrics import facts

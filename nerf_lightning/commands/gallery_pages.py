@@ -8,8 +8,8 @@ from hydra.core.hydra_config import HydraConfig
 from nerf_lightning.config.compose import composed_job
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.config.scene_overrides import UnknownScene, scene_overrides
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.page import Quality
+from nerf_lightning.messages.errors import InputError
 
 # Of what was given for the gallery, what holds for each page.
 PASSED_ON = ("trainer", "budgets.")

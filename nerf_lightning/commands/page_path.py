@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.as_keyframes import as_keyframes
 from nerf_lightning.video.paths.auto import AutoPath

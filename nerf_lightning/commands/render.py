@@ -10,9 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import LoadedModel, open_checkpoints, scene_to_look_at
-from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.training.launch.processes import on_all_processes

@@ -7,11 +7,11 @@ from omegaconf import DictConfig
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.scene_overrides import scene_overrides
-from nerf_lightning.console import say
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
-from nerf_lightning.errors import InputError, require_one_of
 from nerf_lightning.files.links import require_nothing_from_outside
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.output_folder import output_folder

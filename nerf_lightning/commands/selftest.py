@@ -1,45 +1,81 @@
 """Say whether this machine computes right: kernels, precisions, trainings, files; a table for a bug report."""
 
+import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
+from rich.progress import track
 
 from nerf_lightning import __version__
+from nerf_lightning.compute.devices import has_tf32
+from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.console import say
 from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_console
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.products import Products
 from nerf_lightning.runs.output_folder import output_folder
-from nerf_lightning.selftest.all_checks import bar_of_checks, carry_out, find_checks
+from nerf_lightning.selftest import command_line, kernels, training
+from nerf_lightning.selftest.check import Row, carried_out, remarks, result_table
 from nerf_lightning.selftest.machine import machine
-from nerf_lightning.selftest.place import place_for, require_known_device
-from nerf_lightning.selftest.table import machine_lines, print_rows
 from nerf_lightning.training.launch.trainer import TrainerSettings
+
+TRAINERS = {"cpu": "cpu", "cuda": "gpu"}
 
 
 def run(config: DictConfig) -> None:
     """Check what the config's trainer chooses, print a table, write selftest.json.
 
     Raises:
+        InputError: the device is neither a CPU nor a GPU of CUDA.
         SystemExit: something is wrong (exit code 1).
     """
     began = time.perf_counter()
     settings: TrainerSettings = build(config.trainer)
-    require_known_device(settings)
+    if settings.device_type not in TRAINERS:
+        raise InputError(
+            f"nerf selftest knows CPUs and NVIDIA GPUs, and trainer.accelerator chose {settings.device_type}. Use "
+            "trainer=cpu; for TPUs there is make test-xla."
+        )
+    settings.prepare_machine()
     folder = output_folder(config.paths.output_dir, Path(config.paths.root_dir) / "selftest")
-    with place_for(settings) as place:
-        checks = find_checks(place)
-        with bar_of_checks(len(checks)) as announce:
-            rows = carry_out(checks, announce)
-    print_rows(rows, settings.describe(), time.perf_counter() - began)
+    rows = _rows(settings)
+    StdoutConsole(width=120).print(result_table(rows, f"nerf selftest: {settings.describe()}"))
+    counts = ", ".join(f"{sum(row.outcome == each for row in rows)} {each}" for each in ("ok", "wrong", "not run"))
+    say(*remarks(rows), f"{counts}; {spoken(time.perf_counter() - began)}")
     known = {"nerf_lightning": __version__} | environment() | machine(settings.device)
-    say(*machine_lines(known))
-    right = all(row.outcome != "wrong" for row in rows)
-    file = folder / "selftest.json"
-    result: dict[str, Any] = {"right": right, "device": settings.describe(), "machine": known}
-    write_json(file, result | {"checks": [row.as_dict() for row in rows]})
-    say(f"written to {file}")
-    if not right:
+    say(*(f"{name.replace('_', ' ')}: {_in_words(value)}" for name, value in known.items()))
+    result = {"right": all(row.outcome != "wrong" for row in rows), "device": settings.describe(), "machine": known}
+    write_json(folder / "selftest.json", result | {"checks": [asdict(row) for row in rows]})
+    say(f"written to {folder / 'selftest.json'}")
+    if not result["right"]:
         raise SystemExit(1)
+
+
+def _rows(settings: TrainerSettings) -> list[Row]:
+    """Do all checks; what is written for them vanishes at the end."""
+    device, chosen = settings.device, PRODUCTS[settings.precision]
+    precisions: tuple[Products, ...] = ("float32", "bfloat16")
+    if has_tf32(settings.device_type):
+        precisions = ("float32", "tf32", "bfloat16")
+    trainer = [f"trainer={TRAINERS[settings.device_type]}", f"trainer.precision={settings.precision}"]
+    with tempfile.TemporaryDirectory(prefix="nerf-selftest-") as work:
+        runs = command_line.CommandLine(Path(work), trainer)
+        try:
+            checks = [
+                *kernels.checks(device, precisions),
+                *training.checks(device, precisions, settings.compile or settings.device_type == "cuda"),
+                *command_line.checks(runs, device, chosen),
+            ]
+            return [carried_out(check) for check in track(checks, transient=True, console=stderr_console())]
+        finally:
+            runs.pool.shutdown(cancel_futures=True)
+
+
+def _in_words(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {part}" for key, part in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

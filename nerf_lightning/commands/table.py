@@ -5,13 +5,13 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
-from nerf_lightning.console import say
-from nerf_lightning.errors import require_one_of
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import require_one_of
 from nerf_lightning.report.curves import psnr_curve
 from nerf_lightning.report.table_page import write_table_page
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
-from nerf_lightning.runs.table import ORDERS, no_curve, result_table
+from nerf_lightning.runs.table import ORDERS, result_table
 from nerf_lightning.runs.table_files import Row, write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 
@@ -25,8 +25,9 @@ def run(config: DictConfig) -> int:
     folders = [Path(name) for name in _names(config.runs)]
     scenes, models = (None if names is None else _names(names) for names in (config.scenes, config.models))
     found = find_results(folders, config.measured, scenes, models)
-    curve_of = psnr_curve if config.curves else no_curve
-    rows, notes = result_table(found, config.sort, bool(config.published), bool(config.force), curve_of)
+    rows, notes = result_table(
+        found, config.sort, bool(config.published), bool(config.force), psnr_curve if config.curves else None
+    )
     count = len(found.measured)
     title = f"{count} run{'' if count == 1 else 's'}, sorted by {config.sort}"
     out = config.out or config.paths.output_dir

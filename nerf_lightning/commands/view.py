@@ -4,8 +4,8 @@ from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.console import say
 from nerf_lightning.data.captures.checks import known_background
+from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
 from nerf_lightning.viewer.admission import named_places
 from nerf_lightning.viewer.page import Page, open_in_browser, require_viser

@@ -12,7 +12,7 @@ from torch import distributed
 
 from nerf_lightning.compute import xla_device
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Linear, cpu_gains_by_bfloat16, cpu_multiplies_bfloat16
 

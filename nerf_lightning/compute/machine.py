@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 # Of the memory that is free, so much may be taken.
 SHARE_OF_FREE = 0.8

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, distributed, nn
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 Item = TypeVar("Item")
 

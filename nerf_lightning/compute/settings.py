@@ -17,7 +17,7 @@ from nerf_lightning.compute.devices import (
     suited,
     working_device,
 )
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Products
 

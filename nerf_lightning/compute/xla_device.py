@@ -5,7 +5,7 @@ from typing import Literal
 
 from lightning.pytorch.accelerators import XLAAccelerator
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 ACCELERATOR: type[XLAAccelerator] = XLAAccelerator
 """Lightning's, which counts TPU chips; tests put one here that takes XLA's CPU device."""

@@ -11,9 +11,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
-from nerf_lightning.console import spoken
 from nerf_lightning.data.captures.space import model_for
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
 from nerf_lightning.nerf.types.scene import Scene
 

@@ -7,7 +7,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 OURS = "nerf_lightning."
 PLAIN = (bool, int, float, str, type(None))

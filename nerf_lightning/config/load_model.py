@@ -8,12 +8,12 @@ import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 
-from nerf_lightning.budgets import allowed, require_within
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import require_fitting_values
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed, require_within
 from nerf_lightning.files.yaml_files import plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.samplers.base import Sampler

@@ -12,7 +12,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.config.unknown_names import unknown_name
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")

@@ -16,7 +16,7 @@ from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.captures.joined import shown_capture
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.types.scene import Scene

@@ -10,10 +10,10 @@ import yaml
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_a_class, row_of
 from nerf_lightning.config.overrides import leaves, quoted
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal, listed
 
 PLAIN = (bool, int, float, str)
 TAKEN = (Trust.PLAIN, Trust.IF_THERE)

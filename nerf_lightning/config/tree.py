@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.text import Text
 from rich.tree import Tree
 
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.messages.escaping import for_terminal
 
 
 def print_tree(config: DictConfig, console: Console) -> None:

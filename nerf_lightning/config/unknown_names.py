@@ -4,7 +4,7 @@ import re
 
 from nerf_lightning.config.overrides import PLAIN
 from nerf_lightning.files.folders import option_names
-from nerf_lightning.manual.catalogue import Command, command_named
+from nerf_lightning.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.manual.suggestions import did_you_mean, near
 
 KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")
@@ -37,17 +37,16 @@ def _no_option(group: str, name: str) -> str | None:
 
 
 def _no_setting(name: str, value: str | None, asked: Command) -> str:
-    having = [f"{option.group}={option.name}" for option, setting in asked.settings if option and setting.key == name]
+    having = [each.source for each in asked.settings if each.key == name]
     if having:
         return f"{name} is a setting of {_listed(having)}, and something else is chosen. nerf help {name} tells of it."
-    groups = [group.typed for group in asked.groups]
-    close = near(name, dict.fromkeys([*groups, *(setting.key for _, setting in asked.settings)]))
+    close = near(name, known_names(asked))
     told = f"nerf {asked.name} has no setting {name}."
     if close:
         given = f"={value}" if value and PLAIN.fullmatch(value) else ""
         return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"
     training = command_named("train")
-    if training is not None and any(name in (each.key, option and option.group) for option, each in training.settings):
+    if training is not None and name in known_names(training):
         return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."
     return f"{told} nerf {asked.name} --help lists what it has; +{name}=VALUE adds one of your own."
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress

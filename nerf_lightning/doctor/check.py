@@ -11,7 +11,7 @@ from nerf_lightning.doctor.features import Corners
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.doctor.proofs import Proof
 from nerf_lightning.doctor.view_statistics import Looks
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
 PAIRS_AT_ONCE = 1 << 24

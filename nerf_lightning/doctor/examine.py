@@ -12,7 +12,7 @@ from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
 from nerf_lightning.doctor.matches import find_matches
 from nerf_lightning.doctor.view_statistics import look_at_view, stacked
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
 CHECKS: tuple[CheckFn, ...] = (

@@ -7,8 +7,8 @@ from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.doctor import cameras, views
 from nerf_lightning.doctor.check import Check, Given
 from nerf_lightning.doctor.examine import examine
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 QUICK: tuple[Callable[[Given], Check], ...] = (

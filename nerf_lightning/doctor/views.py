@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.doctor.check import Check, Evidence, Given, rows_at_once
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
 from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.types.scene import Scene

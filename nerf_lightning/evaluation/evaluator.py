@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.console import tracked
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.camera_fit import fitted_camera
 from nerf_lightning.evaluation.color_fit import exposure_fitted
 from nerf_lightning.evaluation.geometry_errors import depth_error, normal_error
@@ -21,6 +19,8 @@ from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.evaluation.metrics import image_metrics, masked_out
 from nerf_lightning.evaluation.metrics_files import of_captures, summary, write_metrics
 from nerf_lightning.evaluation.protocol import Colors, environment, measured_how
+from nerf_lightning.messages.console import tracked
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth

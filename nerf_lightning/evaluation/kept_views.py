@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.escaping import for_file_name
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.escaping import for_file_name
 from nerf_lightning.visualization.pictures import mosaic, panels, save_png
 
 PARTS = ("truth", "render", "depth", "error")

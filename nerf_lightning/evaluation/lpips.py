@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.products import own_precision
 
 LPIPS_HINT = (

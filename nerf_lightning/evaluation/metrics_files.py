@@ -8,11 +8,11 @@ from typing import Any
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.machine import peak_memory
-from nerf_lightning.escaping import for_csv
 from nerf_lightning.evaluation.lpips import LPIPS_HINT
 from nerf_lightning.evaluation.metrics import mean_over_images, median_over_images, worst_of_images
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.messages.escaping import for_csv
 
 METRICS = ("psnr", "cc_psnr", "ssim", "lpips", "depth_error", "normal_error")
 COLUMNS = ("name", *METRICS, "seconds")

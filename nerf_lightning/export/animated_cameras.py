@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
 from nerf_lightning.nerf.types.scene import Cameras, LensModel
 

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import torch
 
-from nerf_lightning.escaping import for_colmap
 from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
 from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.escaping import for_colmap
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation
 from nerf_lightning.nerf.models.base import Model

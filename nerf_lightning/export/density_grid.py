@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord

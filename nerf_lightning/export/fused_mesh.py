@@ -9,11 +9,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Lattice, Report
 from nerf_lightning.export.density_mesh import marching_cubes
 from nerf_lightning.export.voxel_kernels.layout import kernels
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model

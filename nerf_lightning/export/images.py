@@ -11,15 +11,15 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.console import StageProgress, say
 from nerf_lightning.data.pixels.images import ENDINGS
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_file_name
 from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.visibility import SeenView, require_room, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.console import StageProgress, say
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_file_name
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates
 from nerf_lightning.nerf.geometry.frames import directions_to_user, told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset

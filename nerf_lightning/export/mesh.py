@@ -10,8 +10,6 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.console import StageProgress
-from nerf_lightning.errors import InputError
 from nerf_lightning.export import density_mesh, fused_mesh
 from nerf_lightning.export.base import Export, refuse_ndc, require_free, require_setting
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution
@@ -29,6 +27,8 @@ from nerf_lightning.export.texture import (
 )
 from nerf_lightning.export.visibility import seen_faces
 from nerf_lightning.export.voxel_kernels.layout import ROOM
+from nerf_lightning.messages.console import StageProgress
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import upright_rotation
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 

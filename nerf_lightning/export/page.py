@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Literal, get_args
 
-from nerf_lightning.console import StageProgress, say
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.bake import bake
 from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.fitting import fitted
@@ -12,6 +10,8 @@ from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export, require_setting
 from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
 from nerf_lightning.export.voxel_kernels.layout import ROOM
+from nerf_lightning.messages.console import StageProgress, say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord, Space
 

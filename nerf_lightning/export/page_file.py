@@ -16,7 +16,6 @@ from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.baked_field import BakedField, described, packed, unpacked
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
@@ -24,6 +23,7 @@ from nerf_lightning.export.base import PageExtras
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.ray_generator import RayGenerator

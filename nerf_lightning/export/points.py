@@ -12,12 +12,12 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.console import StageProgress
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.console import StageProgress
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most
 from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset

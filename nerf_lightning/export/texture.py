@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.export.mesh_files import require_library
 from nerf_lightning.export.surface import short_rays
 from nerf_lightning.export.voxel_kernels.layout import kernels
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.geometry.cameras import camera_coordinates, project
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.models.base import Model

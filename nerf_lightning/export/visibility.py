@@ -10,9 +10,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.density_grid import Report
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, seen_at
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth

@@ -8,12 +8,12 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.console import StageProgress
 from nerf_lightning.export.base import Export, refuse_ndc, require_free
 from nerf_lightning.export.density_grid import Lattice, Report, require_resolution, sample_density
 from nerf_lightning.export.surface import looks_from_nearest
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import write_json
+from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles

@@ -14,10 +14,10 @@ from urllib.parse import urlsplit
 from filelock import FileLock
 from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from nerf_lightning.console import progress_bar
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.regular import open_regular, open_to_append
+from nerf_lightning.messages.console import progress_bar
+from nerf_lightning.messages.errors import InputError
 
 TIMEOUT = 10.0
 CHUNK = 1 << 16

@@ -24,8 +24,9 @@ def conf_file(name: str) -> Path:
 
 
 def option_names(group: str) -> list[str]:
-    """Return the names of the yaml files of a group, those of extensions included."""
-    return sorted({file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")})
+    """Return the options of a group (`encoder`, or `encoder@direction_encoder`), those of extensions included."""
+    name = group.partition("@")[0]
+    return sorted({file.stem for folder in conf_folders() for file in (folder / name).glob("*.yaml")})
 
 
 def default_folder(kind: str) -> Path:

@@ -8,7 +8,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from nerf_lightning.escaping import for_html
+from nerf_lightning.messages.escaping import for_html
 
 
 def rendered(template: Path, **values: Any) -> str:

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.budgets import allowed, require_within
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.files.budgets import allowed, require_within
 from nerf_lightning.files.regular import read_text
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 CURE = "Export it again, or mend it with a json checker."
 

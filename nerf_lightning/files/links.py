@@ -4,8 +4,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.walk import walk
+from nerf_lightning.messages.errors import InputError
 
 
 def require_no_way_out(folder: Path) -> None:

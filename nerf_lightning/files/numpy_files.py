@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Shaped
 from numpy import ndarray
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 HEADER_BYTES = 1 << 14
 """numpy itself reads no header longer than 10,000 characters."""

@@ -5,8 +5,8 @@ import stat
 from io import BufferedReader
 from pathlib import Path
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 
 SETTING = "NERF_LIGHTNING_CACHE or scene.cache_dir"
 OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH

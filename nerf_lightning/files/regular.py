@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 # Of posix; Windows has neither FIFOs nor devices among its files.
 WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)

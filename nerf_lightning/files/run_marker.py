@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 def require_run(folder: Path) -> None:

@@ -16,9 +16,9 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from nerf_lightning.budgets import allowed, require_within
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed, require_within
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 
 CALLED = {
     "collections OrderedDict",

@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
-from nerf_lightning.budgets import allowed
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.regular import read_text
+from nerf_lightning.messages.errors import InputError
 
 MOST_BITS = 1000
 """Of a whole number: larger ones are no floating-point numbers, and Python writes only some thousand digits."""

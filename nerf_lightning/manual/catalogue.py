@@ -1,209 +1,178 @@
 """What a command can be told: its groups with their options, and all settings, read from conf/ without Hydra."""
 
-from dataclasses import dataclass
+import re
+from collections.abc import Callable
 from functools import cache, cached_property
+from typing import NamedTuple
 
 from nerf_lightning.files.folders import conf_file, option_names
-from nerf_lightning.manual.commented_yaml import CommentedYaml, Entry, brief, read_commented
-from nerf_lightning.manual.settings import Setting, maker_of, settings_in
+from nerf_lightning.manual.docstrings import Constructor, constructor
+from nerf_lightning.manual.yaml_comments import CommentedYaml, Entry, read_commented
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""
+TAKES = {"bool": "bool", "int": "int", "float": "float", "seq": "list"}
 
 
-@dataclass(frozen=True)
-class Option:
-    """One yaml of a group, put where a command has the group."""
+class Setting(NamedTuple):
+    """One setting of one yaml, or a section of settings."""
 
-    group: str
-    name: str
-    place: str
-    """The section that it fills; empty for one whose keys stand for themselves."""
-    file: CommentedYaml
-    entry: Entry
-    """Its settings, those included that it has from the options it is based on."""
+    key: str
+    text: str
+    """The value as the yaml has it; empty for a section."""
+    takes: str
+    """The type of what may be given."""
+    meaning: str
+    """The sentence of the docstring, and that of the comment beside it."""
+    source: str
+    """The yaml: an option such as `scene=colmap`, or the command."""
+    is_own: bool
+    """Whether it belongs to that group or command, which may also set those of others."""
+
+
+class Option(NamedTuple):
+    """One yaml of a group."""
+
+    typed: str
+    """How it is chosen, such as `scene=colmap`."""
+    about: list[str]
+    """The comment at the top of its yaml, and the docstring of what it builds."""
+    is_global: bool
+    settings: list[Setting]
+    """Its own, those of the options that it is based on, and of those that it chooses for its parts."""
     chosen: dict[str, str]
-    """What it chooses of other groups, by the place."""
+    """The options that it chooses in other groups."""
 
-    @property
-    def summary(self) -> str:
-        """What it is, in one line: its yaml's first sentence, else that of the class it builds."""
-        maker = maker_of(self.entry)
-        return brief(self.file.header or ("" if maker is None else maker.summary))
+
+class Command:
+    """What one command has. A group is named as it is typed, such as `sampler@model.levels.fine.sampler`."""
+
+    def __init__(self, name: str, file: CommentedYaml):
+        self.name = name
+        self.template = file.entries["hydra.help.template"].text
+        self.groups = {group: name for group, name in file.defaults if group not in ("_self_", "hydra")}
+        """With the option of the command's defaults list, in its order."""
+        places = {place(group) for group in self.groups}
+        own = {key: entry for key, entry in file.entries.items() if root(key) != "hydra"}
+        self.written = _settings(own, f"nerf {name}", lambda key: root(key) not in places)
+        """The settings of its own yaml."""
+
+    @cached_property
+    def options(self) -> dict[str, list[Option]]:
+        """The options by group: its own groups, then those that options have for parts, such as a level's sampler."""
+        own = {group: options(group) for group in self.groups}
+        parts = [part for each in own.values() for one in each for part in one.chosen if "@" in part]
+        return own | {group: options(group) for group in (*parts, *OF_SWEEPS)}
 
     @cached_property
     def settings(self) -> list[Setting]:
-        """Its own settings, and those of the options that it chooses for parts of itself."""
-        own = list(settings_in(self.entry, self.place))
-        placed = ((place, name) for place, name in self.chosen.items() if "@" in place)
-        return own + [
-            setting
-            for place, name in placed
-            for setting in option(place.partition("@")[0], name, place.partition("@")[2]).settings
-        ]
-
-
-@dataclass(frozen=True)
-class Group:
-    """A group of options as a command has it."""
-
-    name: str
-    """Its folder in conf/."""
-    place: str
-    """The section that it fills."""
-    chosen: str | None
-    """The option where nobody chooses."""
-
-    @property
-    def typed(self) -> str:
-        """What a person types before `=`."""
-        return self.name if self.place == self.name.replace("/", ".") else f"{self.name}@{self.place}"
-
-    @property
-    def options(self) -> list[Option]:
-        """All of them, by name."""
-        return [option(self.name, name, self.place) for name in option_names(self.name)]
-
-
-@dataclass(frozen=True)
-class Command:
-    """What one command has."""
-
-    name: str
-    file: CommentedYaml
-
-    @cached_property
-    def groups(self) -> list[Group]:
-        """Its groups, in the order of its defaults list."""
-        listed = (_group(typed, chosen) for typed, chosen in self.file.defaults if typed != "_self_")
-        return [group for group in listed if group.name != "hydra"]
-
-    @cached_property
-    def brought(self) -> list[Group]:
-        """The groups that its options have for parts of theirs, such as the sampler of a level."""
-        chosen = (pair for group in self.groups for each in group.options for pair in each.chosen.items())
-        places = {group.typed for group in self.groups}
-        typed = dict.fromkeys(typed for typed, _ in chosen if "@" in typed and typed not in places)
-        return [_group(each, None) for each in (*typed, *OF_SWEEPS)]
-
-    @cached_property
-    def own(self) -> list[Setting]:
-        """The settings that stand in its own yaml, without what it sets of its groups."""
-        return [each for each in self._written if _root(each.key) not in self._places]
-
-    @cached_property
-    def settings(self) -> list[tuple[Option | None, Setting]]:
-        """Every setting, with the option that has it; None for the command itself.
-
-        What an option only sets, and another group has, is left out: `assignments` has it.
-        """
-        return self._settings([*self.groups, *self.brought])
-
-    def settings_below(self, root: str) -> list[tuple[Option | None, Setting]]:
-        """Return those of them that begin with a word such as `trainer`: far fewer files are read for it."""
-        return self._settings([group for group in (*self.groups, *self.brought) if _root(group.place) == root])
-
-    def _settings(self, groups: list[Group]) -> list[tuple[Option | None, Setting]]:
-        found: dict[tuple[str, str, str], tuple[Option | None, Setting]] = {
-            ("", "", s.key): (None, s) for s in self.own
-        }
-        for group in groups:
-            for each in group.options:
-                for setting in each.settings:
-                    if _root(setting.key) == _root(group.place):
-                        found.setdefault((group.name, each.name, setting.key), (each, setting))
-        return list(found.values())
+        """Every setting of its yaml and of all options."""
+        every = (option for options in self.options.values() for option in options)
+        return [*self.written, *(setting for option in every for setting in option.settings)]
 
     @cached_property
     def chosen(self) -> dict[str, Option]:
-        """The options that it has where nothing is said, by what is typed for their group."""
-        names = {group.typed: group.chosen for group in self.groups}
-        options: dict[str, Option] = {}
-        for _ in self.groups:  # what is chosen may choose in its turn
-            options = {
-                group.typed: option(group.name, names[group.typed], group.place)
-                for group in self.groups
-                if names[group.typed]
-            }
-            names |= {typed: name for each in options.values() for typed, name in each.chosen.items() if typed in names}
-        return options
-
-    def default(self, key: str) -> str:
-        """Return the value that a setting has where nothing is said; of several options', the first one's.
-
-        Raises:
-            KeyError: there is no such setting.
-        """
-        own = (each.text for each in self._written if each.key == key)
-        by_models = (
-            each.text
-            for found in self.chosen.values()
-            if found.file.is_global
-            for each in found.settings
-            if each.key == key
-        )
-        by_groups = (each.text for found in self.chosen.values() for each in found.settings if each.key == key)
-        anywhere = (each.text for _, each in self.settings if each.key == key)
-        for text in (*own, *by_models, *by_groups, *anywhere):
-            return text
-        raise KeyError(key)
-
-    def assignments(self, key: str) -> list[tuple[str, str]]:
-        """Return who sets a setting of another group, such as `model=fast`, and to what; the command itself first."""
-        found = [
-            (f"nerf {self.name}", each.text) for each in self._written if each.key == key and _root(key) in self._places
-        ]
-        for group in (group for group in self.groups if group.place != _root(key)):
-            for each in (each for each in group.options if each.file.is_global):
-                found += [
-                    (f"{group.typed}={each.name}", setting.text) for setting in each.settings if setting.key == key
-                ]
+        """The options chosen by default."""
+        names, found = dict(self.groups), dict[str, Option]()
+        for _ in names:  # what is chosen may choose in its turn
+            found = {group: read_option(group, name) for group, name in names.items() if name}
+            names |= {group: name for each in found.values() for group, name in each.chosen.items() if group in names}
         return found
 
-    @cached_property
-    def _written(self) -> list[Setting]:
-        return list(settings_in(self.file.root, ""))
-
-    @cached_property
-    def _places(self) -> set[str]:
-        return {group.place for group in self.groups} | {"hydra"}
+    def default(self, key: str) -> str:
+        """Return the value of a setting if nothing is chosen; if only unchosen options have it, the first one's."""
+        in_order = sorted(self.chosen.values(), key=lambda each: not each.is_global)
+        candidates = (*self.written, *(setting for each in in_order for setting in each.settings), *self.settings)
+        return next(each.text for each in candidates if each.key == key)
 
 
 @cache
 def command_named(name: str) -> Command | None:
-    """Return what a command has; None where there is none of the name."""
+    """Return a command's catalogue; None if there is no such command."""
     file = conf_file(name)
     return Command(name, read_commented(file)) if file.is_file() else None
 
 
-@cache
-def option(group: str, name: str, place: str) -> Option:
-    """Return an option of a group, as it fills a section."""
-    file = read_commented(conf_file(f"{group}/{name}"))
-    entry, chosen = _resolved(file, group, "" if file.is_global else place)
-    return Option(group, name, "" if file.is_global else place, file, entry, chosen)
+def known_names(command: Command) -> list[str]:
+    """Return a command's groups and settings, each once."""
+    return list(dict.fromkeys([*command.groups, *(setting.key for setting in command.settings)]))
 
 
-def _resolved(file: CommentedYaml, group: str, place: str) -> tuple[Entry, dict[str, str]]:
-    """Return a yaml's settings over those of the options that it is based on, and what all of them choose."""
-    entry, chosen = Entry(), {}
-    for typed, name in file.defaults:
-        typed = typed.removeprefix("override ")
-        base = conf_file((typed[1:] if typed.startswith("/") else f"{group}/{typed}").removesuffix("@_here_"))
-        if name is not None:
-            name_of_group, _, below = typed.removeprefix("/").partition("@")
-            where = ".".join(filter(None, (place, below))) if below else ""
-            chosen[f"{name_of_group}@{where}" if where else name_of_group] = name
-        elif base.is_file():
-            theirs, also = _resolved(read_commented(base), group, place)
-            entry, chosen = theirs.over(entry), chosen | also
-    return file.root.over(entry), chosen
+def place(group: str) -> str:
+    """Return the section that a group fills."""
+    name, _, package = group.partition("@")
+    return package or name.replace("/", ".")
 
 
-def _group(typed: str, chosen: str | None) -> Group:
-    name, _, place = typed.partition("@")
-    return Group(name, place or name.replace("/", "."), chosen)
-
-
-def _root(key: str) -> str:
+def root(key: str) -> str:
+    """Return the first word of a dotted key."""
     return key.partition(".")[0]
+
+
+def options(group: str) -> list[Option]:
+    """Return a group's options."""
+    return [read_option(group, name) for name in option_names(group)]
+
+
+@cache
+def read_option(group: str, name: str) -> Option:
+    """Read one option of a group."""
+    folder, typed, section = group.partition("@")[0], f"{group}={name}", place(group)
+    file = read_commented(conf_file(f"{folder}/{name}"))
+    entries, chosen = _merged(file, folder, "" if file.is_global else f"{section}.")
+    settings = _settings(entries, typed, lambda key: root(key) == root(section))
+    maker = _maker(entries, section)
+    about = [text for text in (file.header, maker and maker.summary) if text]
+    parts = (read_option(part, name) for part, name in chosen.items() if "@" in part)
+    return Option(typed, about, file.is_global, settings + [each for part in parts for each in part.settings], chosen)
+
+
+def _merged(file: CommentedYaml, folder: str, prefix: str) -> tuple[dict[str, Entry], dict[str, str]]:
+    """Merge a yaml over the options that it is based on, and collect what all of them choose."""
+    entries, chosen = dict[str, Entry](), dict[str, str]()
+    for typed, name in file.defaults:
+        group, at, package = typed.removeprefix("override ").removeprefix("/").partition("@")
+        base = conf_file(group if "/" in typed else f"{folder}/{group}")
+        if name is not None:
+            chosen[f"{group}@{prefix}{package}" if at else group] = name
+        elif base.is_file():
+            theirs, also = _merged(read_commented(base), folder, prefix)
+            entries, chosen = entries | theirs, chosen | also
+    for key, (text, kind, comment) in file.entries.items():
+        base_entry = entries.get(prefix + key)
+        entries[prefix + key] = Entry(text, kind, comment or (base_entry.comment if base_entry else ""))
+    return entries, chosen
+
+
+def _maker(entries: dict[str, Entry], section: str) -> Constructor | None:
+    target = entries.get(f"{section}._target_")
+    return None if target is None else constructor(target.text)
+
+
+def _settings(entries: dict[str, Entry], source: str, is_own: Callable[[str], bool]) -> list[Setting]:
+    found: dict[str, Setting] = {}
+    for key, entry in entries.items():
+        section, _, name = key.rpartition(".")
+        maker, parent = _maker(entries, section), found.get(section)
+        argument = maker.arguments.get(name) if maker else None
+        built = _maker(entries, key)
+        documented = argument.meaning if argument else built.summary if built else ""
+        # A table that is one argument, such as scene.download: its sentence is that of all that is in it.
+        texts = [documented, entry.comment] if documented or entry.comment or maker or not parent else [parent.meaning]
+        takes = argument.takes if argument else TAKES.get(entry.type, "")
+        meaning = " ".join(sentence(text, takes) for text in texts if text)
+        if not name.startswith("_"):
+            found[key] = Setting(key, entry.text, takes, meaning, source, is_own(key))
+    return list(found.values())
+
+
+def sentence(text: str, takes: str = "") -> str:
+    """Return a phrase as a sentence; a literal value at its beginning stays as it is.
+
+    >>> sentence("most views; None: all"), sentence("auto takes a GPU", "'auto' | null")
+    ('Most views; null: all.', 'auto takes a GPU.')
+    """
+    text = re.sub(r"\bNone\b", "null", text.replace("`", "")).strip()
+    first = text.split(maxsplit=1)[0].rstrip(":,;")
+    is_value = f"'{first}'" in takes or "_" in first or first == "null"
+    return (text if is_value else text[0].upper() + text[1:]) + ("" if text.endswith((".", "!", "?", ":")) else ".")

@@ -1,19 +1,17 @@
 """What `nerf help` prints: a command, a group, one option of it, a section of settings, or one setting."""
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from textwrap import fill
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.manual.catalogue import Command, Group, Option
-from nerf_lightning.manual.commented_yaml import brief
-from nerf_lightning.manual.settings import Setting, maker_of
+from nerf_lightning.manual.catalogue import Command, Option, Setting
 from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.messages.errors import InputError
 
 COLUMN = 34
 """Where the sentences of a list begin."""
-PLACEHOLDER = re.compile(r"^\$(GROUPS|SETTINGS)\b:?(.*)$", re.MULTILINE)
+PLACEHOLDER = re.compile(r"^\$(GROUPS|SETTINGS):(.*)$", re.MULTILINE)
+END = re.compile(r"(?<=\.)\s+(?=[A-Z`*-]|$)|;\s")
 
 
 def command_page(command: Command, width: int) -> str:
@@ -23,137 +21,89 @@ def command_page(command: Command, width: int) -> str:
     """
 
     def listed(found: re.Match[str]) -> str:
-        names = found[2].split()
-        return "\n".join(
-            _setting_lines(command, names, width) if found[1] == "SETTINGS" else _groups(command, names, width)
-        )
+        kind, names = found[1], found[2].split()
+        if kind == "GROUPS":
+            return "\n".join(_groups(command, names, width))
+        return "\n".join(_row(f"{key}={command.default(key)}", _meaning(command, key), width) for key in names)
 
-    return PLACEHOLDER.sub(listed, template(command)).rstrip()
-
-
-def template(command: Command) -> str:
-    """Return what the yaml of a command says of it, with the places of its lists."""
-    return str(command.file.root.below["hydra"].below["help"].below["template"].value)
+    return PLACEHOLDER.sub(listed, command.template).rstrip()
 
 
 def page_of(command: Command, word: str, width: int) -> str | None:
-    """Return the full text of a group, an option, a section or a setting; None where the command has no such thing."""
+    """Return the full text of a group, an option, a section or a setting; None if the command has no such thing."""
     name, _, value = word.lstrip("+~").partition("=")
-    groups = [group for group in (*command.groups, *command.brought) if name in (group.typed, group.name)]
-    for group in groups:
-        option = next((each for each in group.options if each.name == value), None)
-        if option is not None:
-            return _option_page(group, option, width)
+    for group in (each for each in command.options if name in (each, each.partition("@")[0])):
+        options = {option.typed.partition("=")[2]: option for option in command.options[group]}
+        if value in options:
+            return _option_page(options[value], width)
         if value:
-            raise InputError(
-                f"There is no {word}.{did_you_mean(value, [each.name for each in group.options], f'{name}=')}"
-            )
-    below = [pair for pair in command.settings if pair[1].key == name or pair[1].key.startswith(f"{name}.")]
-    if groups and len(groups[0].options) > 1:
-        return _group_page(groups[0], width)
-    about = [_described(setting, width) for _, setting in below if setting.key == name and setting.is_section][:1]
-    keys = dict.fromkeys(setting.key for _, setting in below if not setting.is_section)
+            raise InputError(f"There is no {word}.{did_you_mean(value, options, f'{name}=')}")
+        if len(options) > 1:
+            rows = [_row(key, brief(option.about[0]), width) for key, option in options.items()]
+            return "\n".join([f"{group}=OPTION", "", *rows, "", f"nerf help {group}=OPTION lists the settings of one."])
+    below = [each for each in command.settings if f"{each.key}.".startswith(f"{name}.")]
+    about = [_described(each, width) for each in below if each.key == name and not each.text][:1]
+    keys = dict.fromkeys(each.key for each in below if each.text)
     return "\n\n".join([*about, *(_setting_page(command, key, width) for key in keys)]) or None
 
 
-def _setting_lines(command: Command, keys: Iterable[str], width: int) -> Iterator[str]:
-    known: dict[str, Setting] = {}
-    for _, setting in command.settings:
-        known.setdefault(setting.key, setting)
-    for key in keys:
-        yield _row(f"{key}={command.default(key)}", brief(said(known[key])), width)
+def brief(text: str) -> str:
+    """Return the first sentence of a text, up to its semicolon, for a list.
+
+    >>> brief("Shrink by 2.5 and more; else not. Others are refused.")
+    'Shrink by 2.5 and more'
+    """
+    return END.split(text.replace("`", "").strip(), maxsplit=1)[0].removesuffix(".")
+
+
+def _meaning(command: Command, key: str) -> str:
+    return next(brief(each.meaning) for each in command.settings if each.key == key and each.is_own)
 
 
 def _groups(command: Command, in_full: list[str], width: int) -> Iterator[str]:
-    chosen = [group for group in command.groups if len(group.options) > 1 or group.name in in_full]
-    for group in sorted(chosen, key=lambda group: group.name not in in_full):
-        default = f" (default {command.chosen[group.typed].name})" if group.typed in command.chosen else ""
-        if group.name in in_full and group.typed == group.name:
-            yield f"  {group.typed}{default}"
-            yield from (_row(f"  {group.typed}={option.name}", option.summary, width) for option in group.options)
-        else:
-            yield _row(group.typed, ", ".join(option.name for option in group.options) + default, width)
+    for group in sorted(command.groups, key=lambda group: group not in in_full):
+        options = command.options[group]
+        default = f" (default {command.chosen[group].typed.partition('=')[2]})" if group in command.chosen else ""
+        if group in in_full:
+            yield f"  {group}{default}"
+            yield from (_row(f"  {option.typed}", brief(option.about[0]), width) for option in options)
+        elif len(options) > 1:
+            yield _row(group, ", ".join(option.typed.partition("=")[2] for option in options) + default, width)
 
 
-def _row(left: str, right: str, width: int) -> str:
-    start = f"  {left:<{COLUMN - 3}} "
-    if len(start) > COLUMN:
-        return f"{start}\n{fill(right, width, initial_indent=' ' * COLUMN, subsequent_indent=' ' * COLUMN)}"
-    return fill(right, width, initial_indent=start, subsequent_indent=" " * COLUMN, break_long_words=False)
-
-
-def _group_page(group: Group, width: int) -> str:
-    default = f"; {group.chosen} where nothing is said" if group.chosen else ""
-    lines = [f"{group.typed}=OPTION{default}", ""]
-    lines += [_row(option.name, option.summary, width) for option in group.options]
-    return "\n".join([*lines, "", f"nerf help {group.typed}=OPTION lists the settings of one."])
-
-
-def _option_page(group: Group, option: Option, width: int) -> str:
-    maker = maker_of(option.entry)
-    parts = [f"{group.typed}={option.name}", _paragraph(option.file.header or option.summary, width, 2)]
-    if maker is not None and option.file.header:
-        parts.append(_paragraph(maker.summary, width, 2))
-    settings = [each for each in option.settings if not each.is_section]
-    chosen = [f"{place}={name}" for place, name in option.chosen.items()]
-    of_others = [f"{each.key}={each.text}" for each in settings if not each.meaning]
-    parts += [
-        _paragraph(f"{word} {', '.join(what)}", width, 2)
-        for word, what in (("Chooses", chosen), ("Sets", of_others))
-        if what
-    ]
-    return "\n\n".join([*parts, *(_described(each, width) for each in settings if each.meaning)])
+def _option_page(option: Option, width: int) -> str:
+    chosen = [f"{group}={name}" for group, name in option.chosen.items()]
+    of_others = [f"{each.key}={each.text}" for each in option.settings if each.text and not each.is_own]
+    lists = [f"{word} {', '.join(what)}" for word, what in (("Chooses", chosen), ("Sets", of_others)) if what]
+    own = [_described(each, width) for each in option.settings if each.text and each.is_own]
+    return "\n\n".join([option.typed, *(_paragraph(text, width, 2) for text in option.about + lists), *own])
 
 
 def _setting_page(command: Command, key: str, width: int) -> str:
-    """Return all that is known of a setting; where options mean different things by it, each."""
-    alike: dict[tuple[str, str, str], list[tuple[Option | None, Setting]]] = {}
-    for option, setting in command.settings:
-        if setting.key == key:
-            alike.setdefault((setting.meaning, setting.kind.words, setting.bounds), []).append((option, setting))
-    set_by = command.assignments(key)
-    pages = []
-    for pairs in alike.values():
-        values = dict.fromkeys(setting.text for _, setting in pairs)
-        several = len(alike) > 1 or len(values) > 1
-        shown = next(iter(values)) if len(alike) > 1 else command.default(key)
-        having = [f"{each.group}={each.name} {setting.text}" for each, setting in pairs if each is not None and several]
-        pages.append(_described(replace(pairs[0][1], text=shown), width) + _list("With", having, width))
-    setting_it = [f"{who} to {text}" for who, text in set_by]
-    return "\n\n".join(pages) + _list("Set by", setting_it, width)
-
-
-def _list(word: str, items: list[str], width: int) -> str:
-    return f"\n{_paragraph(' '.join((word, ', '.join(items))), width, 4)}" if items else ""
+    """Return all that is known of a setting; if options mean different things by it, each."""
+    every, default = [each for each in command.settings if each.key == key], command.default(key)
+    alike: dict[tuple[str, str], list[Setting]] = {}
+    for each in [each for each in every if each.is_own] or every:
+        alike.setdefault((each.meaning, each.takes), []).append(each)
+    lines = [f"{key}={default}"]
+    for settings in alike.values():
+        if len(alike) > 1:
+            lines.append(_paragraph(f"With {', '.join(each.source for each in settings)}:", width, 2))
+        lines += _described(settings[0], width).splitlines()[1:]
+    values = [f"{each.source} {each.text}" for each in every if each.text != default]
+    return "\n".join([*lines, *([_paragraph(f"Set by {', '.join(values)}", width, 4)] if values else [])])
 
 
 def _described(setting: Setting, width: int) -> str:
-    name = setting.key if setting.is_section else f"{setting.key}={setting.text}"
-    lines = [name, _paragraph(said(setting), width, 4)]
-    if setting.note:
-        lines.append(_paragraph(sentence(setting.note), width, 4))
-    if setting.kind.words:
-        lines.append(
-            _paragraph(f"Takes {setting.kind.words}{f': {setting.bounds}' if setting.bounds else ''}", width, 4)
-        )
-    return "\n".join(lines)
+    lines = [f"{setting.key}={setting.text}" if setting.text else setting.key, _paragraph(setting.meaning, width, 4)]
+    return "\n".join([*lines, *([_paragraph(f"Takes {setting.takes}", width, 4)] if setting.takes else [])])
 
 
-def said(setting: Setting) -> str:
-    """Return what a setting means, as a sentence."""
-    return sentence(setting.meaning, (*setting.kind.choices, setting.text))
-
-
-def sentence(text: str, values: Iterable[str] = ()) -> str:
-    """Return a phrase of a docstring as a person reads it; the name of a value at its beginning stays small.
-
-    >>> sentence("most views; None: all"), sentence("auto takes a GPU", ["auto"])
-    ('Most views; null: all.', 'auto takes a GPU.')
-    """
-    text = re.sub(r"\bNone\b", "null", text.replace("`", "")).strip()
-    first = re.match(r"[\w-]*", text)
-    is_value = first is None or first[0] in values or "_" in first[0] or first[0] == "null"
-    return (text if is_value else text[:1].upper() + text[1:]) + ("" if text.endswith((".", "!", "?")) else ".")
+def _row(left: str, right: str, width: int) -> str:
+    start, indent = f"  {left:<{COLUMN - 3}} ", " " * COLUMN
+    if len(start) > COLUMN:
+        return f"{start}\n{fill(right, width, initial_indent=indent, subsequent_indent=indent)}"
+    return fill(right, width, initial_indent=start, subsequent_indent=indent, break_long_words=False)
 
 
 def _paragraph(text: str, width: int, indent: int) -> str:

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
 from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.config.compose import compose_config
@@ -16,7 +15,8 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator

@@ -4,15 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands.train import train as train_in_folder
 from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.config.compose import composed_job
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.config.messages import in_words
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import Budgets, allow
 from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.notebook.trained_model import TrainedModel, load
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.processes import num_processes

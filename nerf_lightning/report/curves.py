@@ -11,10 +11,10 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from nerf_lightning.budgets import allowed
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.visualization.figures import new_figure
 
 Curve = tuple[Sequence[int], Sequence[float]]

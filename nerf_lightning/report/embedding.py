@@ -9,9 +9,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from nerf_lightning.data.pixels.images import read_rgba
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
+from nerf_lightning.messages.errors import InputError
 
 LONGEST_SIDE = 1600
 LOSSLESS_PIXELS = 1 << 18

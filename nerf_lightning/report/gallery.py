@@ -15,15 +15,15 @@ from markupsafe import Markup
 from PIL import Image
 
 from nerf_lightning.config.key_meanings import meaning_of
-from nerf_lightning.console import StageProgress, say, spoken
 from nerf_lightning.data.pixels.images import MOST_SCANS, jpeg_scans
-from nerf_lightning.errors import InputError, require_one_of
-from nerf_lightning.escaping import for_terminal, listed
 from nerf_lightning.export.base import RunsExport
 from nerf_lightning.export.page import QUALITIES, Quality, require_no_other
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.console import StageProgress, say, spoken
+from nerf_lightning.messages.errors import InputError, require_one_of
+from nerf_lightning.messages.escaping import for_terminal, listed
 from nerf_lightning.report.pages import address_from, page_of_run
 from nerf_lightning.runs.summary import RunSummary, differing_keys, read_run
 

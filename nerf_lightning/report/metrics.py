@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.console import spoken
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
 from nerf_lightning.evaluation.metrics_files import COLUMNS
 from nerf_lightning.files.json_files import number
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.embedding import embedded_file
 from nerf_lightning.report.page import Pairs, ViewOnPage
 

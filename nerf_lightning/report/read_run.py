@@ -4,14 +4,14 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from nerf_lightning.budgets import allowed
 from nerf_lightning.checkpoints.reading import newest_checkpoint
-from nerf_lightning.console import StageProgress
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
+from nerf_lightning.messages.console import StageProgress
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import curve_drawings, read_curves
 from nerf_lightning.report.embedding import embedded, embedded_file, embedded_video
 from nerf_lightning.report.metrics import facts, per_image, tables, views_on_page

@@ -27,13 +27,13 @@ from nerf_lightning.compute.slurm import slurm_job, was_requeued
 from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.instantiate import required_path
 from nerf_lightning.config.overrides import key_of, to_type
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
 from nerf_lightning.files.made_folders import make_folder, make_new_folder
 from nerf_lightning.files.run_marker import require_run
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 
 log = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.escaping import EscapingFormatter
 from nerf_lightning.files.regular import open_to_append
+from nerf_lightning.messages.escaping import EscapingFormatter
 
 FORM = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 

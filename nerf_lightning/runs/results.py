@@ -7,14 +7,14 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
-from nerf_lightning.budgets import allowed
 from nerf_lightning.config.key_meanings import PLACES, meaning_of
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.evaluation.metrics_files import METRICS
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.runs.summary import RunSummary, read_note, read_run, told_settings
 
 Measured = Literal["run", "eval"]

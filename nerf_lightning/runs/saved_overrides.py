@@ -15,10 +15,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.config.key_meanings import CHOSEN_GROUPS, PART, SWEEP_GROUPS, Trust, is_removable, meaning_of
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import read_sweep, sweep_record
 
 OPTION = re.compile(r"[\w-]+(/[\w-]+)*", re.ASCII)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 
 CLASS = "._target_"
 

@@ -19,9 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.slurm import slurm_job
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.made_folders import remove_empty
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
@@ -107,9 +107,9 @@ def watched(run: Callable[[], None]) -> None:
 
 def _end() -> list[JobRecord]:
     # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
-    from nerf_lightning.console import say
+    from nerf_lightning.messages.console import say
     from nerf_lightning.runs.sweep_table import job_rows
-    from nerf_lightning.runs.table_files import write_rows
+    from nerf_lightning.runs.table_files import write_csv, write_markdown
     from nerf_lightning.runs.table_screen import print_rows
 
     sweep = _begun[-1]
@@ -122,7 +122,8 @@ def _end() -> list[JobRecord]:
         return records
     rows = job_rows(records, sweep.folder)
     print_rows(rows, f"sweep {sweep.folder}", "The files below hold all of it.")
-    write_rows(rows, sweep.folder, "sweep")
+    write_csv(rows, sweep.folder / "sweep.csv")
+    write_markdown(rows, sweep.folder / "sweep.md")
     say(f"table        {sweep.folder / 'sweep.md'}, sweep.csv")
     if any(record.state in ("running", "stopped") for record in records):
         say(f"go on with   {sweep.go_on_with()}")

@@ -63,7 +63,9 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     sweep_folder, own = Path(hydra.sweep.dir), Path(hydra.runtime.output_dir)
     elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
     if elsewhere:
-        from nerf_lightning.console import label_lines  # rich takes its time, and this file is read before any command
+        from nerf_lightning.messages.console import (
+            label_lines,  # rich takes its time, and this file is read before any command
+        )
 
         _behave_as_one_of_many()
         label_lines(job_label(int(hydra.job.num), own, list(hydra.overrides.task)))

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import yaml
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.yaml_files import CURE, read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 
 JOB_NUMBER = "${hydra.job.num}"
 MADE = ("hydra.mode=", "hydra.sweep.dir=", "sweep.", f"hydra.sweep.subdir='{JOB_NUMBER}")

@@ -9,18 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.console import spoken
-from nerf_lightning.escaping import for_csv, for_markdown
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.escaping import for_csv, for_markdown
 
 Row = dict[str, Any]
 
 DECIMALS = {
     **{"PSNR": 2, "PSNR std": 2, "cc PSNR": 2, "cc PSNR std": 2, "seconds": 1, "minutes": 1},
-    **{"SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4},
+    **{"SSIM": 4, "SSIM std": 4, "LPIPS": 4, "LPIPS std": 4, "steps": 0, "parameters": 0, "runs": 0},
     **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
 }
-COUNTS = ("steps", "parameters", "runs")
+"""Columns of numbers, and the digits that are shown."""
 SECONDS = {"seconds": 1, "minutes": 60}
 """Columns of times, in seconds each."""
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -28,24 +28,18 @@ SPARKLINE = 12
 """Signs in which a curve is drawn."""
 
 
-def write_rows(rows: list[Row], folder: Path, name: str) -> None:
-    """Write `NAME.csv` with all digits, and `NAME.md`."""
-    write_csv(rows, folder / f"{name}.csv")
-    write_markdown(rows, folder / f"{name}.md")
-
-
 def write_csv(rows: list[Row], path: Path) -> None:
     """Write the rows with all digits; curves are left out."""
     columns = [column for column in rows[0] if column != "curve"]
     with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(map(for_csv, columns))
-        writer.writerows([for_csv(row[column]) for column in columns] for row in rows)
+        csv.writer(file).writerows(
+            map(for_csv, line) for line in (columns, *([row[c] for c in columns] for row in rows))
+        )
 
 
 def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> None:
     """Write the rows as a table of Markdown, with the notes below."""
-    head, *lines = ([*map(for_markdown, line)] for line in (list(rows[0]), *map(texts, rows)))
+    head, *lines = ([*map(for_markdown, line)] for line in (rows[0], *([shown(row, c) for c in row] for row in rows)))
     text = "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *lines))
     with whole_file(path) as part:
         part.write_text(text + "".join(f"\n{for_markdown(note)}\n" for note in notes), encoding="utf-8")
@@ -62,49 +56,39 @@ def sparkline(curve: Sequence[float]) -> str:
     return "".join(BLOCKS[min(int(value * len(BLOCKS)), len(BLOCKS) - 1)] for value in picked)
 
 
-def is_number(column: str) -> bool:
-    """Tell whether a column holds numbers."""
-    return column in (*DECIMALS, *COUNTS)
-
-
-def texts(row: Row) -> list[str]:
-    """Return what a person reads of a row."""
-    return [_text(key, value) for key, value in row.items()]
-
-
-def told_columns(rows: list[Row]) -> dict[str, list[str]]:
+def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
     """Return the texts of each column as a person reads them.
 
     Deviations stand beside their means, all times are in one column, and what others have published says so.
     """
-    lines = [dict(zip(row, texts(row), strict=True)) for row in rows]
     columns: dict[str, list[str]] = {}
     for name in rows[0]:
         if name in SECONDS or name == "time":
             columns["time"] = [_time(row) for row in rows]
         elif not name.endswith(" std"):
-            of = f"{name} std"
-            columns[name] = [f"{line[name]} ± {line[of]}" if line.get(of) else line[name] for line in lines]
+            deviations = [shown(row, f"{name} std") for row in rows]
+            columns[name] = [
+                shown(row, name) + (f" ± {of}" if of else "") for row, of in zip(rows, deviations, strict=True)
+            ]
     if "model" in columns:
-        told = zip(columns["model"], rows, strict=True)
-        columns["model"] = [f"{text} (published)" if row.get("source") else text for text, row in told]
+        columns["model"] = [f"{row['model']}{' (published)' if row.get('source') else ''}" for row in rows]
     return columns
 
 
-def _time(row: Row) -> str:
-    told = (spoken(value * SECONDS[key]) for key in SECONDS if (value := row.get(key)) is not None)
-    return next(told, row.get("time") or "")
-
-
-def _text(column: str, value: Any) -> str:
+def shown(row: Row, column: str) -> str:
+    """Return a value of a row as a person reads it."""
+    value = row.get(column)
     if value is None:
         return ""
     if column == "curve":
         return sparkline(value)
     if column in DECIMALS and not isinstance(value, str):
-        return f"{value:.{DECIMALS[column]}f}"
-    if column in COUNTS and not isinstance(value, str):
-        return f"{value:,.0f}"
+        return f"{value:,.{DECIMALS[column]}f}"
     # What a sampler proposes has digits that nobody reads.
     is_long_number = re.fullmatch(r"-?\d*\.\d{7,}(e-?\d+)?", str(value))
     return f"{float(value):.6g}" if is_long_number else str(value)
+
+
+def _time(row: Row) -> str:
+    times = (spoken(row[key] * seconds) for key, seconds in SECONDS.items() if row.get(key) is not None)
+    return next(times, row.get("time") or "")

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nerf_lightning.console import StageProgress
 from nerf_lightning.data.pixels.images import read_rgba
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
+from nerf_lightning.messages.console import StageProgress
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.sfm.image_pairs import chosen_matching
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.pixels.images import (
     DECODER_ERRORS,
     FORMATS,
@@ -19,8 +18,9 @@ from nerf_lightning.data.pixels.images import (
     open_picture,
     read_rgba,
 )
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import is_plain, listed
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import is_plain, listed
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")

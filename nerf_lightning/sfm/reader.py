@@ -12,9 +12,9 @@ from nerf_lightning.data.pixels.decoding import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.colmap.reader import ColmapReader
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.find_poses import from_photographs, from_video
 from nerf_lightning.sfm.photograph_folder import pictures_among, visible_files
 from nerf_lightning.sfm.reconstruction import require_pycolmap

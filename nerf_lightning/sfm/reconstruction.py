@@ -13,9 +13,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.sfm.image_pairs import image_pairs, tiles_of
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_one_camera
 from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.errors import require_positive
+from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.sfm.image_pairs import Matching, image_pairs
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph
 

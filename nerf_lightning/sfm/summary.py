@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from nerf_lightning.console import spoken
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.sfm.reconstruction import SparseModel
 
 # Of the photographs: where fewer were registered, there is advice.

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageFilter
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import explained, open_regular
+from nerf_lightning.messages.errors import InputError
 
 FRAMES_WANTED = 100
 SHARPNESS_SIDE = 480

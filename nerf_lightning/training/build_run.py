@@ -8,7 +8,6 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import make_record, read_checkpoint
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
@@ -17,7 +16,8 @@ from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.hashes import photograph_hashes
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.progress import Progress

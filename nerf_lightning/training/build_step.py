@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import hold_to_budgets, load_weights
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.tensorboard import shown_name
 
 LOG_IN = "Log in with wandb login, keep everything here with logger.wandb.offline=true"

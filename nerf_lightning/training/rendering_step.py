@@ -6,7 +6,7 @@ from typing import NoReturn
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.compute.settings import ComputeSettings
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay

@@ -17,8 +17,8 @@ from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import use_threads
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.nerf.rendering.blending import background_colors, blend

@@ -19,8 +19,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.errors import InputError
 
 # The picture is converted by the rule of BT.709 and says so: untagged, players guess the rule from the size.
 # Newer ffmpegs convert by the tag alone, those before 7 need the filter.

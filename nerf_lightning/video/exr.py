@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 

@@ -14,12 +14,12 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from nerf_lightning.console import tracked
 from nerf_lightning.data.pixels.images import read_rgba
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_folder, make_ours
+from nerf_lightning.messages.console import tracked
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.encoding import write_animation, write_video
 from nerf_lightning.video.exr import Channels, save_exr
 from nerf_lightning.video.settings import ENDINGS, Form

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from nerf_lightning.errors import InputError, require_one_of
+from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, told_length, unit_of

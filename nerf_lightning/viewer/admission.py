@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Sequence
 from urllib.parse import parse_qs
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 # A machine's name or address, and perhaps a port.
 PLACE = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+)*)(?::([0-9]{1,5}))?")

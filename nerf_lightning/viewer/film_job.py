@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import make_new_folder, remove_new_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.film import film_steps, films_of
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.settings import FilmSettings

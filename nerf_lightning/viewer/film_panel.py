@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import remove_new_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.client import ViewerClient

@@ -17,7 +17,7 @@ from websockets.asyncio import server as websockets_server
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.http11 import Request, Response
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.admission import Admission
 from nerf_lightning.viewer.complaints import Complaints

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.camera_state import fov_held_by

@@ -3,7 +3,7 @@
 import logging
 import socket
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 TRIED = 50
 

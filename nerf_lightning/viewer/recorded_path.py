@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve, keyframe_focal, keyframe_poses

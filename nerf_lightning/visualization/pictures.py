@@ -14,8 +14,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.files.atomic import whole_file
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.bands import bands
 
 ENOUGH_PIXELS = 1 << 18

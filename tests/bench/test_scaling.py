@@ -13,7 +13,7 @@ from nerf_lightning.bench.noise_capture import write_noise_capture
 from nerf_lightning.bench.scaling import AXES, Case, benchmark_scaling, exponent
 from nerf_lightning.bench.scaling_point import Point, _numbers, measure_point
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 TINY = (
     "model=nerf_tiny",

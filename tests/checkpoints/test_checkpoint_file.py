@@ -7,7 +7,7 @@ import torch
 from support.running import start_code
 
 from nerf_lightning.checkpoints.writing import sweep_leftovers, write_checkpoint
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 def steps(folder):
@@ -59,7 +59,7 @@ def test_a_full_disk_leaves_the_former_checkpoint(tmp_path):
     code = (
         "import resource, signal, torch, sys, pathlib\n"
         "from nerf_lightning.checkpoints.writing import write_checkpoint\n"
-        "from nerf_lightning.errors import InputError\n"
+        "from nerf_lightning.messages.errors import InputError\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
         "try:\n"

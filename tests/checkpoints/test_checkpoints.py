@@ -18,7 +18,7 @@ from nerf_lightning.checkpoints.reading import (
     read_content,
 )
 from nerf_lightning.config.scene_overrides import scene_overrides
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 FISHEYE = (0.1, -0.02, 0.01, 0.0, 0.0, 0.0)
 

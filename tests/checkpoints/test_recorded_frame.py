@@ -6,7 +6,7 @@ from support.posed_captures import Known, read, ring, wall, write_colmap, write_
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.checkpoints.recorded_frame import in_recorded_frame
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import unit_of
 

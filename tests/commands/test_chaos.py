@@ -21,7 +21,7 @@ from support.captures import picture, pose
 from support.running import FAST, said, start, start_code
 
 from nerf_lightning.config.messages import paragraph
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 QUIET = (
     "trainer.num_threads=1", "final.evaluate=false", "final.video=false", "logger=none",

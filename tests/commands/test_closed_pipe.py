@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support.running import FAST, start
 
-from nerf_lightning.cli.broken_pipe import READER_LEFT, ends_quietly
+from nerf_lightning.cli.process import READER_LEFT, ends_quietly
 
 
 def unread(*arguments, buffered=True, merged=False):

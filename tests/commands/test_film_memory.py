@@ -11,7 +11,7 @@ from torch import nn
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf import bands
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.models.radiance_model import RadianceModel

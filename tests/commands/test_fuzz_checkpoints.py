@@ -9,9 +9,9 @@ from support.fuzzing import fuzzed, harmless
 from support.resumed import Resumed
 from support.running import FAST_PATH
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.load_model import load_model
+from nerf_lightning.files.budgets import Budgets, allow
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.types.rays import PixelIndex
 

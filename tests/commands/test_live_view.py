@@ -15,7 +15,7 @@ from support.running import FAST, start
 from support.viser_client import ViserClient
 
 from nerf_lightning.commands.train_job.live_view import LiveView
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.viewer import training_switch

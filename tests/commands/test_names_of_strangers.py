@@ -24,17 +24,17 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
-from nerf_lightning.console import say
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.picture import _write_verdicts
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.kept_views import picture_name
 from nerf_lightning.evaluation.metrics_files import METRICS, summary, write_metrics
 from nerf_lightning.evaluation.protocol import split_hash
 from nerf_lightning.export.cameras import CamerasExport, colmap_files
 from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.page import Report, page
 from nerf_lightning.report.pages import address_from
 from nerf_lightning.sfm.photograph_folder import find_photographs

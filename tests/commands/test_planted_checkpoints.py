@@ -334,7 +334,7 @@ def test_bombs_stay_small(tmp_path):
     code = (
         "from nerf_lightning.checkpoints.reading import read_checkpoint\n"
         "from nerf_lightning.config.load_model import load_model\n"
-        "from nerf_lightning.errors import InputError\n"
+        "from nerf_lightning.messages.errors import InputError\n"
         "load_model(read_checkpoint(sys.argv[1]))\n"
         "# begin\n"
         "for path in sys.argv[2:]:\n"

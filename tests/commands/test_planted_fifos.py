@@ -16,10 +16,10 @@ from support.waiting import fifo, within
 from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.embedding import embedded_file, embedded_video
 from nerf_lightning.runs.log_file import log_file

@@ -8,7 +8,7 @@ import torch
 from support.resumed import Resumed
 from support.running import FAST_PATH
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 HUGE = 10**10
 

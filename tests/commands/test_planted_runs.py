@@ -9,8 +9,8 @@ from omegaconf import OmegaConf
 from support.budget import budget
 from support.running import FAST, said
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.links import require_no_way_out
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import RunFolder, _former_identity, _newest_unfinished, open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, to_give_again
 from nerf_lightning.runs.summary import read_note

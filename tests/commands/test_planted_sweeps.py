@@ -8,8 +8,8 @@ from support.running import FAST, said
 from test_planted_runs import FILES, HARMLESS, PLANTED
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.saved_overrides import former_sweep, to_give_again
 from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord, sweep_record
 

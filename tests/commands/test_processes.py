@@ -10,7 +10,7 @@ import torch
 from support.ports import unused_port
 from support.running import FAST, FAST_PATH, start, start_cold
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import processes
 from nerf_lightning.training.launch.processes import num_processes
 

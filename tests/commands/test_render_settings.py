@@ -15,7 +15,7 @@ from support.scenes import ball_scene, tiny_field
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.cli import main as cli
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import points_from_user, points_to_user, poses_from_user, similarity, unit_of
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel

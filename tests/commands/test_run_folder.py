@@ -13,8 +13,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.config.identity import settings_digest
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.protocol import config_hash
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import ResumePoint, open_run, write_config
 
 HYDRA = {"job": {}, "runtime": {}, "overrides": {"task": ["seed=0"]}}

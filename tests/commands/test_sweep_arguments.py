@@ -5,7 +5,7 @@ from support.configs import composed
 from support.running import start_code
 
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.sweep_record import JOB_NUMBER, SweepRecord
 
 

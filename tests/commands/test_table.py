@@ -295,16 +295,30 @@ def test_the_psnr_of_fitted_colours_has_a_column_where_it_was_measured(table, tm
 def test_a_table_fits_its_terminal_and_cuts_no_header(table, tmp_path, monkeypatch, width):
     for number in range(3):
         overrides = tuple(f"model.levels.fine.a{key}.some_long_setting={number}" for key in range(6))
-        leave_measured_run(tmp_path / "runs" / str(number), 20.0, overrides=overrides)
+        for seed in (0, 1):
+            leave_measured_run(tmp_path / "runs" / f"{number}_{seed}", 20.0 + seed, seed, overrides)
     monkeypatch.setenv("COLUMNS", str(width))
     result, _rows = table()
     lines = result.out.splitlines()
     end = next(number for number, line in enumerate(lines) if line.startswith("For "))
     assert max(map(len, lines[:end])) <= width
+    assert result.out.count("20.50 ± 0.71") == 3
     rule = next(number for number, line in enumerate(lines) if line.startswith("─"))
     head = " ".join(lines[2:rule]).split()
     assert {"model", "PSNR", "resolution", "some_long_setting"} <= set(head)
-    whole = ["scene", "model", "resolution", "PSNR", "curve", "time", "steps", "some_long_setting", "SSIM", "seeds"]
+    whole = [
+        "scene",
+        "model",
+        "resolution",
+        "PSNR",
+        "curve",
+        "time",
+        "steps",
+        "some_long_setting",
+        "SSIM",
+        "seeds",
+        "MB",
+    ]
     assert set(head) <= {*whole, *(f"a{key}." for key in range(6))}
     assert f"a{head.count('some_long_setting')}.some_long_setting" in f"{lines[end]} a6.some_long_setting"
 

@@ -5,7 +5,7 @@ import torch
 from support.scenes import tiny_model
 
 from nerf_lightning.compute import devices
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.products import Linear
 from nerf_lightning.training.launch import trainer
 from nerf_lightning.training.launch.trainer import TrainerSettings

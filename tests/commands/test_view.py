@@ -17,7 +17,7 @@ from support.viser_client import ViserClient
 
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands import view
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import page as page_module
 
 

@@ -13,7 +13,7 @@ from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import former_config
 
 IN_A_BOX = ball_scene()

@@ -4,7 +4,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
 

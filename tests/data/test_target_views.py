@@ -7,7 +7,7 @@ from support.scenes import ball_scene
 from nerf_lightning.compute import ranks
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
 RAYS, VIEWS = 24, 2

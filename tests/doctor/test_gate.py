@@ -5,7 +5,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.doctor import gate
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 @pytest.fixture

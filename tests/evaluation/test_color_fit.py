@@ -7,12 +7,12 @@ import torch
 from support.planted_exposures import with_stops
 from support.scenes import ball_scene, tiny_model
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation import evaluator
 from nerf_lightning.evaluation.color_fit import color_corrected, exposure_fitted
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.evaluation.protocol import differences
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.rendering.linear_light import scale_light

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.lpips import LPIPS, LPIPS_HINT, load_lpips
+from nerf_lightning.messages.errors import InputError
 
 # As published in torchvision's state dicts of alexnet and vgg16.
 ALEXNET = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}

@@ -24,8 +24,8 @@ from support.posed_captures import (
 )
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.cameras import CamerasExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 
 # Around an axis of no special place.

@@ -10,10 +10,10 @@ from support.known_fields import INSIDE, SOFT, ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export import fused_mesh
 from nerf_lightning.export.fused_mesh import depth_rays
 from nerf_lightning.export.mesh import MeshExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 
 RADIUS, TILE = 0.8, 1 << 15

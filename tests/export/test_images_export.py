@@ -11,8 +11,8 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.images import ImagesExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import similarity, upright_rotation
 
 TILE, SIZE, UNIT = 1 << 15, 33, 50.0

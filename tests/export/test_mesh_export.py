@@ -15,10 +15,10 @@ from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.density_grid import Lattice
 from nerf_lightning.export.density_mesh import marching_cubes, without_floaters
 from nerf_lightning.export.mesh import MeshExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import similarity, unit_of, upright_rotation
 
 RADIUS = 0.8

@@ -10,7 +10,6 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export import mesh_files
 from nerf_lightning.export.cameras import CamerasExport
 from nerf_lightning.export.images import ImagesExport
@@ -19,6 +18,7 @@ from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.points import PointsExport
 from nerf_lightning.export.volume import VolumeExport
 from nerf_lightning.export.voxel_kernels import layout
+from nerf_lightning.messages.errors import InputError
 
 TILE = 1 << 15
 

@@ -15,9 +15,9 @@ from support.rasterizer import in_texture
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import TEXTURED_FACES, MeshExport
 from nerf_lightning.export.voxel_kernels.texels import covered_texels
+from nerf_lightning.messages.errors import InputError
 
 TILE, CELL = 1 << 15, 0.5
 DARK, LIGHT = (0.2, 0.3, 0.7), (0.9, 0.8, 0.3)

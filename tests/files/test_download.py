@@ -10,8 +10,8 @@ import pytest
 from support.captures import write_npz
 
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.download import fetch
+from nerf_lightning.messages.errors import InputError
 
 CONTENT = bytes(range(256)) * 1200
 NUM_BYTES = len(CONTENT)

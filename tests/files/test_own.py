@@ -11,8 +11,8 @@ from support.malformed import WRITERS
 from support.posed_captures import read
 
 from nerf_lightning.data.bricks.reader import BricksReader
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels import backends
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="owners and modes are posix's")

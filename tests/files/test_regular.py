@@ -6,8 +6,8 @@ import socket
 import pytest
 from support.waiting import fifo, within
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.regular import open_regular, open_to_append, read_bytes, read_text
+from nerf_lightning.messages.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs, sockets and devices are posix's")
 

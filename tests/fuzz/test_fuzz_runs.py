@@ -15,7 +15,7 @@ from support.mutations import damaged, damaged_text, mutated
 
 from nerf_lightning.commands import report, table
 from nerf_lightning.config.identity import fingerprint, run_identity
-from nerf_lightning.escaping import FORMULAS
+from nerf_lightning.messages.escaping import FORMULAS
 from nerf_lightning.runs.folder import open_run
 from nerf_lightning.runs.saved_overrides import former_overrides, former_sweep
 from nerf_lightning.runs.sweep_record import SweepRecord

@@ -2,15 +2,14 @@
 
 import pytest
 import torch
-from support.self_tested import a_place
 from support.triton_perceptron import check_perceptron
 from support.triton_twin import check_against_the_reference
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.selftest import kernels
 from nerf_lightning.selftest.check import carried_out
-from nerf_lightning.selftest.checks import kernels
 
 pytestmark = pytest.mark.gpu
 PRODUCTS = ("float32", "tf32", "bfloat16")
@@ -18,7 +17,7 @@ PRODUCTS = ("float32", "tf32", "bfloat16")
 
 def checks(device):
     products = PRODUCTS if device == "cuda" else ("float32", "bfloat16")
-    return {check.name: check for check in kernels.checks(a_place(device=device, products=products))}
+    return {check.name: check for check in kernels.checks(torch.device(device), products)}
 
 
 @pytest.mark.parametrize("name", checks("cuda"))

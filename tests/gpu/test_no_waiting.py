@@ -13,16 +13,12 @@ import torch
 from lightning.pytorch import Callback
 from support.configs import options
 from support.gpu_training import default_callbacks, step_by_step
-from support.steps import rays_of
 
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
-from nerf_lightning.nerf.types.progress import Progress
-from nerf_lightning.selftest.models import METHODS
 from nerf_lightning.selftest.scene import ball_scene
+from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.launch.trainer import TrainerSettings
-from nerf_lightning.training.step import TrainStep
 from nerf_lightning.training.system import RadianceFieldSystem
 
 pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore:Synchronization debug mode")]
@@ -106,22 +102,18 @@ class Watch(Callback):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("resident", [True, False])
 def test_a_run_with_all_its_callbacks_waits_only_where_it_says_so(method, resident, device, tmp_path):
-    scene, progress, chosen = ball_scene(), Progress(), METHODS[method]
+    step = step_by_step(method, torch.device("cpu"), "32-true", 8192, *METHODS[method]).training
     settings = TrainerSettings(max_steps=48, accelerator="gpu" if device.type == "cuda" else "cpu", val_every_steps=48)
-    model = chosen.model()
-    model.fit_to(scene)
-    step = TrainStep(
-        model, rays_of(scene), chosen.loss(), chosen.optimizer, ExponentialDecay(), progress, 0, "random", 8192, 1.0
-    )
     system = RadianceFieldSystem(step, {})
-    settings.prepare(model)
+    settings.prepare(step.model)
     watch = Watch(device)
     quiet = [each for each in default_callbacks() if type(each).__name__ in ("CollapseGuard", "NanGuard", "Monitor")]
     trainer = settings.build(tmp_path, 48, [*quiet, watch], [])
     budget = "auto" if resident else 0
+    data = RayDataModule(ball_scene(), step.progress, 0, batch_rays=96, val_rays=96, device_budget=budget)
     with warnings.catch_warnings(record=True) as watch.caught:
         warnings.simplefilter("always")
-        trainer.fit(system, RayDataModule(scene, progress, 0, batch_rays=96, val_rays=96, device_budget=budget))
+        trainer.fit(system, data)
     assert len(watch.waits) == 48
     # A grid is updated at the beginning of the step that makes these counts one more.
     named = {1, 2, *(step + 1 for step in range(0, 48, 8)), *range(0, 49, 16), *range(0, 49, 25), 48}

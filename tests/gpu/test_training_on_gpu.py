@@ -4,12 +4,11 @@ import pytest
 import torch
 from support.configs import options
 from support.gpu_training import step_by_step
-from support.self_tested import a_place
 
-from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.kernels.backends import CPU_TWINS, without
+from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out
-from nerf_lightning.selftest.checks import training
-from nerf_lightning.selftest.models import METHODS
+from nerf_lightning.selftest.training import METHODS
 
 pytestmark = [pytest.mark.gpu, pytest.mark.slow]
 STEPS, TILE_POINTS = 50, 8192
@@ -31,7 +30,7 @@ def losses(model, device, tile_points=None):
 def test_every_model_follows_the_cpu(model, device):
     """For 50 steps, within ten times what another order of sums does to the CPU's own losses up to that step."""
     expected = losses(model, CPU)
-    with without(*training.TORCH_ALONE):
+    with without(*CPU_TWINS):
         otherwise = losses(model, CPU, TILE_POINTS)
     found = losses(model, device, TILE_POINTS)
     apart = ((otherwise - expected).abs() / expected).cummax(0).values
@@ -44,15 +43,13 @@ def test_every_model_follows_the_cpu(model, device):
 @pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_precision_learns_what_the_cpu_learns(method, products, device):
-    chosen = [check for check in training.checks(a_place(device=device.type, products=(products,)))]
+    chosen = training.checks(device, (products,), compiles=False)
     rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {products}: ")]
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
 
 
-@pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
-def test_compiled_fields_compute_the_same(products, cuda):
-    place = a_place(device="cuda", products=(products,), chosen=products, compiles=True)
-    (row,) = [carried_out(check) for check in training.checks(place) if "compiled" in check.name]
+def test_compiled_fields_compute_the_same(cuda):
+    row = carried_out(training.checks(cuda, (), compiles=True)[-1])
     assert row.outcome == "ok", row
 
 
@@ -75,11 +72,6 @@ def test_tf32_is_really_used_and_float32_is_not_lowered(cuda):
     errors = {p: float((linear(features, weight, None, p) - exact).norm() / exact.norm()) for p in ("float32", "tf32")}
     assert errors["float32"] < 1e-6
     assert 1e-5 < errors["tf32"] < 2e-3
-
-
-def test_batches_of_resident_pixels_are_those_of_the_host(cuda):
-    (row,) = [carried_out(check) for check in training.checks(a_place(device="cuda")) if "pixels" in check.name]
-    assert row.outcome == "ok", row
 
 
 def test_a_step_without_memory_is_repeated_in_smaller_tiles(cuda, caplog):

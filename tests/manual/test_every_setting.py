@@ -4,121 +4,78 @@ import inspect
 
 import pytest
 from hydra.utils import get_object
-from support.configs import composed, groups, yaml_files
+from support.configs import composed, groups
 
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.overrides import flatten
-from nerf_lightning.files.folders import conf_file, option_names
+from nerf_lightning.files.folders import option_names
 from nerf_lightning.manual.catalogue import command_named
-from nerf_lightning.manual.commented_yaml import read_commented
-from nerf_lightning.manual.constructors import constructor
-from nerf_lightning.manual.pages import command_page, page_of, said
+from nerf_lightning.manual.docstrings import constructor
+from nerf_lightning.manual.pages import brief, command_page, page_of
+from nerf_lightning.manual.yaml_comments import read_commented
 
-COMMANDS = sorted(find_commands())
-# How Hydra and its loggers are wired, in hydra/nerf.yaml and the hydra sections of commands: nobody changes them.
-WIRING = {"hydra"}
-# An argument of Lightning's Trainer, which its own documents explain.
-OF_LIGHTNING = {"trainer.lightning.profiler"}
+COMMANDS = {name: command_named(name) for name in sorted(find_commands())}
+every_command = pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@every_command
 def test_every_setting_of_every_yaml_has_its_sentence(command):
-    asked = command_named(command)
-    lacking = [
-        (option and f"{option.group}={option.name}", setting.key)
-        for option, setting in asked.settings
-        if len(setting.meaning) < 4 or not said(setting).endswith(".")
-    ]
-    assert lacking == []
+    own = [each for each in command.settings if each.is_own]
+    assert [each for each in own if len(each.meaning) < 5 or not each.meaning.endswith((".", "?"))] == []
+    of_others = {each.key for each in command.settings if each.text and not each.is_own}
+    assert of_others - {each.key for each in own} <= {"trainer.lightning.profiler"}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_key_of_the_composed_config_is_known(command):
-    asked = command_named(command)
-    known = {setting.key for _, setting in asked.settings if not setting.is_section}
-    keys = {key for key in flatten(composed(command)) if not any(word.startswith("_") for word in key.split("."))}
-    # A table that is one setting, such as scene.skip.
-    assert {key for key in keys if not {key, key.rpartition(".")[0]} & known} - {"viewer", "logger", "scene"} == set()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_default_that_is_told_is_that_of_the_composed_config(command):
-    asked = command_named(command)
-    values = flatten(composed(command))
-    told = {key: asked.default(key) for key in values if any(setting.key == key for _, setting in asked.settings)}
-    numbers = {key: value for key, value in values.items() if key in told and isinstance(value, int | float)}
-    assert {key: float(told[key]) for key, value in numbers.items() if not isinstance(value, bool)} == {
-        key: float(value) for key, value in numbers.items() if not isinstance(value, bool)
-    }
-    texts = {
+@every_command
+def test_every_key_of_the_composed_config_is_known_with_its_default(command):
+    known = {setting.key for setting in command.settings if setting.text}
+    values = {
         key: value
-        for key, value in values.items()
-        if key in told and isinstance(value, str) and value and "$" not in value
+        for key, value in flatten(composed(command.name)).items()
+        if not any(word.startswith("_") for word in key.split("."))
     }
-    assert {key: told[key] for key in texts} == texts
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_what_an_option_sets_of_other_groups_is_there(command):
-    asked = command_named(command)
-    known = {setting.key for _, setting in asked.settings}
-    for group in asked.groups:
-        for option in (each for each in group.options if each.file.is_global):
-            assert {
-                setting.key for setting in option.settings if not setting.is_section
-            } <= known | WIRING | OF_LIGHTNING, f"{group.typed}={option.name}"
+    # A table that is one setting, such as scene.skip.
+    assert {key for key in values if not {key, key.rpartition(".")[0]} & known} <= {"viewer", "logger", "scene"}
+    for key, value in values.items():
+        if key in known and isinstance(value, int | float) and not isinstance(value, bool):
+            assert float(command.default(key)) == value, key
+        elif key in known and isinstance(value, str) and value and "$" not in value:
+            assert command.default(key) == value, key
 
 
 @pytest.mark.parametrize("group", groups())
 def test_every_option_has_a_line_of_its_own(group):
-    asked = [found for name in COMMANDS for each in (command_named(name),) for found in (*each.groups, *each.brought)]
-    groups = [each for each in asked if each.name == group] or [None]
-    lines = [option.summary for option in groups[0].options] if groups[0] else ["of Hydra alone"]
+    named = [each for command in COMMANDS.values() for each in command.options.items() if each[0] == group]
+    lines = [brief(option.about[0]) for _, options in named[:1] for option in options]
     assert len(lines) == len(set(lines)), lines
     assert all(len(line) > 8 for line in lines), lines
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_command_lists_the_groups_that_it_has_and_no_others(command):
-    page = command_page(command_named(command), 100)
-    listed = {
-        line.split()[0]
-        for line in page.partition("Groups and their options:\n")[2].partition("\n\n")[0].splitlines()
-        if line[2:3].strip()
-    }
-    chosen = {name.partition("@")[0] for name, _ in read_commented(conf_file(command)).defaults}
-    assert {name.partition("@")[0] for name in listed} == {name for name in chosen if len(option_names(name)) > 1}
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_short_help_is_filled_in_and_fits_its_width(command):
-    page = command_page(command_named(command), 120)
+@every_command
+def test_the_short_help_lists_its_groups_and_fits_its_width(command):
+    page = command_page(command, 120)
     assert "$" not in page
-    assert [line for line in page.splitlines() if len(line) > 120] == []
     assert "Examples:" in page
     assert len(page.splitlines()) < 110
+    assert [line for line in page.splitlines() if len(line) > 120] == []
+    lines = page.partition("Groups and their options:\n")[2].partition("\n\n")[0].splitlines()
+    listed = {line.split()[0] for line in lines if line[2:3].strip()}
+    assert listed == {group for group in command.groups if len(option_names(group)) > 1}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@every_command
 def test_every_setting_and_every_option_has_a_page(command):
-    asked = command_named(command)
-    for key in {setting.key for _, setting in asked.settings}:
-        assert key in (page_of(asked, key, 100) or ""), key
-    for group in asked.groups:
-        for option in group.options:
-            assert f"{group.typed}={option.name}" in page_of(asked, f"{group.typed}={option.name}", 100)
+    for key in {setting.key for setting in command.settings}:
+        assert key in (page_of(command, key, 100) or ""), key
+    for option in (each for group in command.groups for each in command.options[group]):
+        assert option.typed in page_of(command, option.typed, 100)
 
 
 def targets():
     """Return what yamls of ours build, by its dotted name."""
-    files = [read_commented(file).root for file in yaml_files()]
-    found = set()
-    while files:
-        entry = files.pop()
-        files += entry.below.values()
-        if "_target_" in entry.below:
-            found.add(entry.below["_target_"].value)
-    return sorted(target for target in found if target.startswith("nerf_lightning."))
+    entries = [entry for file in conf_folder().rglob("*.yaml") for entry in read_commented(file).entries.items()]
+    named = {entry.text for key, entry in entries if key.endswith("_target_")}
+    return sorted(target for target in named if target.startswith("nerf_lightning."))
 
 
 @pytest.mark.parametrize("target", targets())
@@ -128,9 +85,7 @@ def test_what_is_read_from_the_source_is_what_python_sees(target):
     assert set(made.arguments) == set(seen) - {"args", "kwargs"}
     for name, argument in made.arguments.items():
         default = seen[name].default
-        if isinstance(default, bool):
-            assert {"true", "false"} <= set(argument.kind.choices), name
-        elif isinstance(default, str) and argument.kind.choices and "text" not in argument.kind.words:
-            assert default in argument.kind.choices, name
-        elif default is None:
-            assert "null" in argument.kind.choices, name
+        if isinstance(default, str) and "str" not in argument.takes:
+            assert f"'{default}'" in argument.takes, name
+        elif isinstance(default, bool) or default is None:
+            assert ("null" if default is None else "bool") in argument.takes, name

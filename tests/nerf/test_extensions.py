@@ -17,8 +17,8 @@ from support.steps import rays_of
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.images import ImagesExport
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.render_image import render_picture

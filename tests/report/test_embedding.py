@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.embedding import LONGEST_SIDE, embedded, embedded_file, embedded_video
 
 

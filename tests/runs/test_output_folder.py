@@ -5,7 +5,7 @@ import errno
 import pytest
 from support.running import refused
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import output_folder
 from nerf_lightning.runs.output_folder import filled_folder
 

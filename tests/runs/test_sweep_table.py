@@ -8,7 +8,7 @@ import yaml
 from nerf_lightning.runs.summary import read_run
 from nerf_lightning.runs.sweep_job import JobRecord, read_records
 from nerf_lightning.runs.sweep_table import job_rows
-from nerf_lightning.runs.table_files import write_rows
+from nerf_lightning.runs.table_files import write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 
 
@@ -71,7 +71,8 @@ def test_files_are_whole_and_the_text_is_short(tmp_path, capsys):
         {"job": 0, "lr": "0.00012520653814999472", "PSNR": 20.123456789, "SSIM": None, "folder": "a|b"},
         {"job": 1, "lr": "1e-3", "PSNR": None, "SSIM": None, "folder": "c"},
     ]
-    write_rows(rows, tmp_path, "sweep")
+    write_csv(rows, tmp_path / "sweep.csv")
+    write_markdown(rows, tmp_path / "sweep.md")
     header, first, *_ = csv.reader((tmp_path / "sweep.csv").read_text().splitlines())
     assert dict(zip(header, first, strict=True))["PSNR"] == "20.123456789"
     assert (tmp_path / "sweep.md").read_text().splitlines() == [

@@ -1,6 +1,5 @@
 """What is said of machines that say little of themselves."""
 
-import subprocess
 from types import SimpleNamespace
 
 import pytest
@@ -10,12 +9,6 @@ from nerf_lightning.selftest import machine as module
 from nerf_lightning.selftest.machine import machine
 
 CPU = torch.device("cpu")
-
-
-def test_this_machine_is_known():
-    known = machine(CPU)
-    assert known["threads"]["torch"] == torch.get_num_threads()
-    assert "gpu" not in known
 
 
 @pytest.mark.parametrize(
@@ -36,18 +29,17 @@ def test_what_cannot_be_known_is_unknown(monkeypatch):
         raise FileNotFoundError("not on this system")
 
     monkeypatch.setattr(module.Path, "read_text", missing)
-    monkeypatch.setattr(subprocess, "run", missing)
     known = machine(CPU)
     assert known["cpu_flags"] == "unknown"
-    assert "numba" not in known["threads"]
-    assert module._driver() == "unknown"
+    assert "gpu" not in known
 
 
 def test_a_gpu_is_described_with_its_driver(monkeypatch):
     properties = SimpleNamespace(name="Some GPU", major=9, minor=0, multi_processor_count=132)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1_000_000_000, 2_000_000_000))
-    monkeypatch.setattr(module.Path, "read_text", lambda *given, **options: "NVRM version: Kernel Module  570.1.2  x")
+    monkeypatch.setattr(module.collect_env, "get_nvidia_driver_version", lambda run: "570.1.2")
     known = machine(torch.device("cuda"))
-    assert (known["gpu"], known["gpu_capability"], known["driver"]) == ("Some GPU", "9.0", "570.1.2")
+    assert "Some GPU" in known["gpu"]
+    assert known["driver"] == "570.1.2"
     assert known["gpu_memory_gigabytes"] == {"total": 2.0, "free": 1.0}

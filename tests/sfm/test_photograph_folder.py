@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.photograph_folder import check_one_camera, find_photographs, put_upright
 
 MODEL, FOCAL_LENGTH, ORIENTATION, EXIF = 0x0110, 0x920A, 0x0112, 0x8769

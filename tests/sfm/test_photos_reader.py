@@ -8,7 +8,7 @@ from PIL import Image
 from support.captures import real_capture
 from support.posed_captures import Known, write_colmap
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm import reader
 from nerf_lightning.sfm.reader import PhotosReader
 from nerf_lightning.sfm.reconstruction import SparseModel

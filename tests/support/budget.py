@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from nerf_lightning.budgets import Budgets, allow, allowed
+from nerf_lightning.files.budgets import Budgets, allow, allowed
 
 
 @contextmanager

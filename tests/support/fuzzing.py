@@ -12,7 +12,7 @@ from typing import Any
 
 from hypothesis import HealthCheck, settings
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 TIMES = int(os.environ.get("FUZZ_TIMES", "0"))
 """How many times as many cases are tried as in `make test`, with seeds of their own; 0: those of `make test`."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.posed_captures import Known, read, write_colmap, write_llff, write_transforms
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 MODEL = Path("sparse/0")
 WRITERS: dict[str, Callable[[Path], Path]] = {

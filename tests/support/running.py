@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from support.fork_server import Forked, fits_a_fork
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 REPOSITORY = Path(__file__).parents[2]
 

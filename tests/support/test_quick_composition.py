@@ -10,7 +10,7 @@ from support import quick_composition
 from support.running import REPOSITORY
 
 from nerf_lightning.config.compose import compose_config
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 LOADED = quick_composition.loaded
 PICKED = ("model=fast_small", "scene=npz", "encoder.num_levels=3", "+callbacks.more.a=[1, 2]", "~callbacks.monitor")

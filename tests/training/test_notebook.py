@@ -23,8 +23,8 @@ from nerf_lightning import RadianceFieldSystem, RayDataModule, build_run
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.nan_guard import NanGuard

@@ -8,7 +8,7 @@ import torch
 from support.gpu_training import step_by_step
 from support.tape import tape
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.losses.robust import RobustLoss

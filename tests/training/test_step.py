@@ -6,7 +6,7 @@ from support.scenes import ball_scene, tiny_model
 from support.steps import gradients, make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.render_image import render_picture

@@ -5,7 +5,7 @@ from support.scenes import ball_scene
 from support.steps import make_step
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.system import RadianceFieldSystem
 
 

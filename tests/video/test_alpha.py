@@ -10,7 +10,7 @@ from support.scenes import ball_scene
 from support.videos import read_video
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video import encoding
 from nerf_lightning.video.encoding import write_video
 from nerf_lightning.video.film import film

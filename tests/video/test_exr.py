@@ -10,7 +10,7 @@ from support.scenes import ball_scene
 from test_alpha import PLAIN
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.video import exr
 from nerf_lightning.video.film import film

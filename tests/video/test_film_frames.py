@@ -10,8 +10,8 @@ import torch
 from filelock import FileLock
 from support.running import refused
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.made_folders import MARK
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video import frames as film_frames
 from nerf_lightning.video.frames import FilmFrames
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from support.videos import read_video
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.encoding import pad_to_even, write_animation, write_video
 
 COLORS = [(220, 40, 40), (40, 180, 60), (30, 60, 200), (250, 250, 250)]

@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="viser is not installed: pip install 'nerf-l
 
 from support.served_page import served
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import guarded_server
 from nerf_lightning.viewer.page_headers import marked
 

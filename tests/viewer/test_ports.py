@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import ports
 from nerf_lightning.viewer.page import address_of
 from nerf_lightning.viewer.ports import free_port

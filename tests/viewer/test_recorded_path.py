@@ -8,7 +8,7 @@ import torch
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.geometry.frames import points_from_user, similarity, upright_rotation
 from nerf_lightning.video.paths.base import frame_of

@@ -4,7 +4,7 @@ import pytest
 from support.served_page import served
 from websockets.exceptions import InvalidStatus
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.tree import print_tree
-from nerf_lightning.console import StdoutConsole
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding, require_sound
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.console import StdoutConsole
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import former_config, job_folder
 from nerf_lightning.training.build_run import Run, assemble

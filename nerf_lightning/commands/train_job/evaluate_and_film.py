@@ -11,13 +11,13 @@ from omegaconf import DictConfig
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.console import say
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.data.pixels.images import read_rgba
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.protocol import COLORS, measured_of
 from nerf_lightning.export.page import QUALITIES, PageExport
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
 from nerf_lightning.nerf.refinements.carry import motions, moved_far

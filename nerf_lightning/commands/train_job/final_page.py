@@ -11,9 +11,9 @@ from nerf_lightning.commands.export import beside
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.console import say
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.page import PageExport
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 
 # The path of the film, in ten seconds.
 PATH = {"num_frames": 120, "fps": 12}

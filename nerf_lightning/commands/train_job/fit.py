@@ -14,7 +14,7 @@ from nerf_lightning.commands.train_job.memory_plan import announce_memory
 from nerf_lightning.commands.train_job.run_folder import HeldFolder
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.console import spoken
+from nerf_lightning.messages.console import spoken
 from nerf_lightning.runs.saved_overrides import to_give_again
 from nerf_lightning.training.callbacks.hparams import describe_run
 from nerf_lightning.training.tile_size import SHORT_RUN, measured_tile

@@ -11,9 +11,9 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.compute import ranks
-from nerf_lightning.console import spoken
 from nerf_lightning.data.captures.joined import one_capture
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.console import spoken
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
 from nerf_lightning.viewer.admission import named_places

@@ -11,9 +11,9 @@ from omegaconf import DictConfig
 
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.compute import ranks
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.run_marker import require_run
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.summary import read_note

@@ -9,7 +9,7 @@ from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.commands.train_job.final_page import write_final_page
 from nerf_lightning.commands.train_job.profile_table import profile_lines
 from nerf_lightning.compute import ranks
-from nerf_lightning.console import say
+from nerf_lightning.messages.console import say
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.results import FILES

@@ -15,9 +15,9 @@ from filelock import FileLock
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.numpy_files import archive_headers, read_member
 from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.messages.errors import InputError
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.console import tracked
 from nerf_lightning.data.bricks.cache import Rendered, cache_file, cached
 from nerf_lightning.data.bricks.light import DAY, Model
 from nerf_lightning.data.bricks.parts import fire_engine
@@ -20,8 +19,9 @@ from nerf_lightning.data.bricks.solids import Solids
 from nerf_lightning.data.bricks.tracer import Pinhole, Tracer
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
+from nerf_lightning.messages.console import tracked
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Scene, Truth

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, impossible_lens, require_different
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import downscaled_size
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed, require_printable
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Cameras, LensModel, PixelStore
 

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.links import is_there
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Background

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import FARTHEST
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import (

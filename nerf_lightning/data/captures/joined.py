@@ -10,8 +10,8 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import common_lens_model
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene, SceneRecord
 
 SPLITS = ("train", "val", "test", "sources")

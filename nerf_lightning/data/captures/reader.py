@@ -23,10 +23,10 @@ from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.errors import InputError, require_one_of
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.links import is_there, require_inside
 from nerf_lightning.files.walk import walk
+from nerf_lightning.messages.errors import InputError, require_one_of
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Scene

@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional
 
 from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import FORWARD_FACING, least_agreement
 from nerf_lightning.nerf.types.scene import Cameras, Scene, Space

@@ -4,8 +4,8 @@ import logging
 from collections.abc import Callable, Hashable, Sequence
 from typing import TypeVar
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 MEMORISED = {"test_views": "learnt from"}
 """Stands in the protocol of numbers that say how well photographs are remembered, and nothing of new views."""

@@ -23,9 +23,9 @@ from nerf_lightning.data.pixels.images import (
 )
 from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
 
 # Megapixels that take a few seconds: from here on there is a progress bar.

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from nerf_lightning.budgets import allowed
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.bands import bands
 
 # A closed list: some of PIL's other decoders start outside programs.

@@ -23,8 +23,8 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from nerf_lightning.data.pixels.store import layout
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.private import make_own_folder, open_own
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import PixelStore
 
 FORMAT = 2

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
 from torch import Tensor
 
 from nerf_lightning.compute.machine import free_memory
-from nerf_lightning.console import progress_bar
+from nerf_lightning.messages.console import progress_bar
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
 GIGABYTE = 1e9

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, MappedPixelStore, check_room, stored
 from nerf_lightning.data.pixels.store import NOTICEABLE, in_threads
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.types.scene import UNSURE, Background, PixelStore
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.compute.machine import free_memory
-from nerf_lightning.console import progress_bar
 from nerf_lightning.data.pixels.images import area_downscale, read_rgba
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.messages.console import progress_bar
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import PixelStore
 
 # Decoding runs outside Python's lock. Each thread holds one picture: this bounds the memory beside the store.

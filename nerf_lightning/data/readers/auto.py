@@ -15,8 +15,8 @@ from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap.reader import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
 # The file that tells a format, how scene= names it, and who reads it. Where several are there, the first says more:

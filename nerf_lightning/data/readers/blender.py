@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import (
     WIDEST,
     box_around_origin,
@@ -31,10 +30,11 @@ from nerf_lightning.data.pixels.images import ENDINGS, image_size
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed, require_printable
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import require_inside
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 

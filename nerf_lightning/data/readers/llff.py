@@ -9,15 +9,15 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 COLUMNS = 17
 MOST_BYTES = 1 << 28

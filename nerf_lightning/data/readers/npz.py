@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.checks import (
     FARTHEST,
     LEAST_FOCAL,
@@ -28,12 +27,13 @@ from nerf_lightning.data.pixels.images import area_downscale
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.pixels.store import empty_store
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.download import fetch
 from nerf_lightning.files.links import is_there
 from nerf_lightning.files.numpy_files import ArrayHeader, archive_headers, check_unpacked, read_member
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, resized
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 

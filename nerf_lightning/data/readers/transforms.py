@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.checks import contents, pose_from_matrix
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
@@ -22,10 +21,11 @@ from nerf_lightning.data.readers.transforms_intrinsics import (
     panorama_focal_of,
     size_of,
 )
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed, require_printable
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import LensModel

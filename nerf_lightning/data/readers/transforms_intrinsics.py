@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
 from nerf_lightning.nerf.types.scene import LensModel
 

@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
 from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, density_grid, dilated
 from nerf_lightning.export.baking.marcher import STEP
@@ -27,6 +25,8 @@ from nerf_lightning.export.baking.seen_colors import (
 )
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks, kernels
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 from numpy import ndarray
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE
+from nerf_lightning.messages.errors import InputError
 
 LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
 """Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""

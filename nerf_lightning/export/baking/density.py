@@ -10,11 +10,11 @@ from scipy.ndimage import binary_dilation
 from torch import Tensor
 
 from nerf_lightning.compute.machine import require_memory
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import for_terminal
 from nerf_lightning.export.baking.contraction import Contraction, is_place, num_values
 from nerf_lightning.export.density_grid import CHUNK, Lattice, Report, sample_density
 from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord

@@ -13,10 +13,10 @@ from nerf_lightning.data.bricks.light import DAY, Light, Model
 from nerf_lightning.data.bricks.parts import SCALE, Part
 from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.data.bricks.solids import Solids
-from nerf_lightning.errors import InputError
 from nerf_lightning.extensions.many_scenes.draws import Draws
 from nerf_lightning.extensions.many_scenes.towers import tower
 from nerf_lightning.extensions.many_scenes.vehicles import vehicle
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
 FAMILY_VERSION = 1

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.models.base import Model

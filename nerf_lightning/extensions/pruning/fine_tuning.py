@@ -6,15 +6,15 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from nerf_lightning.budgets import Budgets, allow
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.commands.train import run as train
 from nerf_lightning.config.auto_settings import AUTO
 from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import Budgets, allow
 from nerf_lightning.files.folders import option_names
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.output_folder import beside_checkpoint
 from nerf_lightning.runs.saved_overrides import former_overrides
 

@@ -9,8 +9,8 @@ import yaml
 
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.config.load_model import build_model
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.yaml_files import plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerf_lightning.checkpoints.packing import NumberType, pack_rows, pack_switches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from nerf_lightning.errors import InputError, require_positive
 from nerf_lightning.extensions.pruning.activity import mean_activity
 from nerf_lightning.extensions.pruning.selection import By, Side, choose, narrowed, neurons_of
+from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.nerf.fields.base import Field
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.randomness import fold

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.extensions.view_transformer.block import Block
 from nerf_lightning.extensions.view_transformer.experts import imbalance, roughness
 from nerf_lightning.extensions.view_transformer.image_network import ImageNetwork, ImageNorm
@@ -17,6 +16,7 @@ from nerf_lightning.extensions.view_transformer.projection import Projected, pro
 from nerf_lightning.extensions.view_transformer.source_views import SourceViews, choose_sources
 from nerf_lightning.extensions.view_transformer.view_tables import ViewTables
 from nerf_lightning.extensions.view_transformer.views import BlendedColor, Largest, PooledColor, Spread, Views
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.randomness import RayRandom

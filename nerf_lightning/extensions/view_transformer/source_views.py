@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.rays import RayBundle

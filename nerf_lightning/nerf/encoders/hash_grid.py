@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout, hash_grid_layout

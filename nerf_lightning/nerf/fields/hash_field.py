@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.activations import LEAST_SLOPE, color_from, density_from
 from nerf_lightning.nerf.encoders.base import ConeEncoder, Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field, HiddenLayer

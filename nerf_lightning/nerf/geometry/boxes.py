@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.types.rays import RayBundle
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import image_plane
 from nerf_lightning.nerf.geometry.lenses import at_angle, off_axis, project_plane, stretches, unproject
 from nerf_lightning.nerf.types.scene import Cameras

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.messages.errors import ANOTHER, InputError
 
 # So many samples per ray at most can have been counted.
 MOST_SAMPLES = 1 << 12

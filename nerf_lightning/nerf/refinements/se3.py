@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import which_camera
 from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector

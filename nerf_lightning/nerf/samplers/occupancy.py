@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, distances_in_box
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerf_lightning.errors import ANOTHER, InputError
+from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over
 

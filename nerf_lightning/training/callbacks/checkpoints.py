@@ -10,8 +10,8 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import BEST, LAST
-from nerf_lightning.errors import InputError, require_positive
 from nerf_lightning.files.schema import Maybe, Number, Record
+from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
 

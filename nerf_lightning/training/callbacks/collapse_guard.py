@@ -8,8 +8,8 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.errors import require_positive
 from nerf_lightning.files.schema import Record, Whole
+from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.training.step_output import StepOutput
 

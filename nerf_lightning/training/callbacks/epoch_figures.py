@@ -6,9 +6,9 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.errors import require_positive
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.files.schema import Many, Number, Record, Whole
+from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.training.callbacks.watcher import render_validation_view
 from nerf_lightning.visualization.figures import epoch_figure, loss_curve
 from nerf_lightning.visualization.pictures import save_png

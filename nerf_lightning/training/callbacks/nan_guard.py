@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import last_good_checkpoint
 from nerf_lightning.compute import ranks
-from nerf_lightning.errors import InputError, require_positive
+from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints, writer
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from nerf_lightning.console import DAY, spoken
+from nerf_lightning.messages.console import DAY, spoken
 from nerf_lightning.nerf.psnr import psnr
 from nerf_lightning.training.step_output import StepOutput
 

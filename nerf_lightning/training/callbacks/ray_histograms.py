@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from nerf_lightning.errors import require_positive
+from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.models.tiles import weighted_renderings
 from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import effective_samples, weight_along

@@ -9,8 +9,8 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.schema import Number, Record
+from nerf_lightning.messages.errors import InputError
 
 
 class TimeBudget(Callback):

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from torch.utils.tensorboard import SummaryWriter
 
-from nerf_lightning.errors import require_positive
+from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS

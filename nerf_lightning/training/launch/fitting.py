@@ -6,7 +6,7 @@ from lightning.pytorch import Trainer
 
 from nerf_lightning.checkpoints.format import PRECISIONS
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.launch.strategy import OneSumPerStep
 

@@ -19,7 +19,7 @@ from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, Simpl
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from nerf_lightning.config.instantiate import require_fitting
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 DEFAULTS: dict[str, Any] = {"num_sanity_val_steps": 0, "enable_model_summary": False, "log_every_n_steps": 1}
 """Ours, where they differ from Lightning's."""

@@ -29,7 +29,7 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.compute.settings import Launcher, cluster_environment
 from nerf_lightning.config.instantiate import require_fitting_values
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 # What of Hydra's own config a worker may ask for.
 HYDRA_PARTS = ["mode", "run", "sweep", "job", "runtime", "overrides", "job_logging"]

@@ -12,7 +12,7 @@ from torch import distributed
 from nerf_lightning.compute.devices import LIGHTNING_NAMES, Accelerator, Precision
 from nerf_lightning.compute.ranks import processes_here
 from nerf_lightning.compute.settings import ComputeSettings, Launcher, cluster_environment
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.lightning_flags import passed_through, written_to

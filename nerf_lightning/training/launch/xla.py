@@ -12,7 +12,7 @@ from lightning.pytorch.strategies import SingleDeviceXLAStrategy
 from torch import Tensor
 
 from nerf_lightning.compute import xla_device
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 

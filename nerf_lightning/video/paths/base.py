@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.budgets import allowed
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid

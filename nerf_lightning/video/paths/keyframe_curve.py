@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.video.paths.base import PathFrame

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from nerf_lightning.budgets import allowed
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import allowed
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve

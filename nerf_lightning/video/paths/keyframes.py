@@ -19,9 +19,9 @@ from typing import Any
 
 import yaml
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.yaml_files import read_plain_yaml
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.paths.base import is_number, is_point
 
 Point = tuple[float, float, float]

@@ -16,8 +16,8 @@ from nerf_lightning.data.bricks.reader import DISTANCE, BricksReader, bricks_cam
 from nerf_lightning.data.bricks.shapes import BALL, BOX, CYLINDER, WEDGE
 from nerf_lightning.data.bricks.solids import NOTHING, Solids
 from nerf_lightning.data.bricks.tracer import SIDES, Pinhole, Tracer
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.folders import default_folder
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, project, rays_through_pixels
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Scene

@@ -16,8 +16,8 @@ from nerf_lightning.data.captures import reader as capture_reader
 from nerf_lightning.data.pixels.images import image_size, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
 from nerf_lightning.files.json_files import read_json
+from nerf_lightning.messages.errors import InputError
 
 cases = Cases()
 REACH = "the content .* would reach .* the cameras' distance from the middle.* remove"

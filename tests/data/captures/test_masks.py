@@ -9,10 +9,10 @@ from support.scenes import ball_scene, tiny_model
 from support.steps import gradients, make_step
 
 from nerf_lightning.data.ray_batches import FixedRays, PixelDomain, RayBatches, gather_batch
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import RayErrors, image_metrics, masked_out
 from nerf_lightning.evaluation.protocol import split_hash
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.samplers.space_carving import possible_cells
 from nerf_lightning.nerf.types.progress import Progress

@@ -18,7 +18,7 @@ from support.posed_captures import read
 from nerf_lightning.data.bricks.cache import Rendered, cached
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.sfm.video_frames import count_frames
 
@@ -284,7 +284,7 @@ from pathlib import Path
 sys.path.insert(0, "tests")
 from support.posed_captures import read
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 kinds, good = json.load(open(sys.argv[1])), sys.argv[2]
 read("colmap", Path(good))
 # begin

@@ -10,7 +10,7 @@ from support.posed_captures import Known, read, write_colmap, write_transforms
 
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 NAMES = [f"images/p_{view}.png" for view in range(9)]
 

@@ -10,7 +10,7 @@ from PIL import Image
 from support.posed_captures import Known, read, ring, user_rays, wall, write_colmap, write_llff, write_transforms
 
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import unit_of
 
 AHEAD = np.array([0.0, 5.0, 0.0])

@@ -16,7 +16,7 @@ from nerf_lightning.data.pixels import decoding as module
 from nerf_lightning.data.pixels import mapped_store as pixel_file
 from nerf_lightning.data.pixels.decoding import Photograph, read_photographs
 from nerf_lightning.data.pixels.images import area_downscale, crop_to_multiple, read_rgba
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 SIZES = [(9, 7), (8, 8), (6, 10)]
 

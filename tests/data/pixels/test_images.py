@@ -18,7 +18,7 @@ from nerf_lightning.data.pixels.images import (
     read_rgba,
     whole_blocks,
 )
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 def slow_downscale(rgba, factor):

@@ -15,7 +15,7 @@ from nerf_lightning.data.pixels import placement
 from nerf_lightning.data.pixels.mapped_store import Header, stored
 from nerf_lightning.data.pixels.placement import budget_bytes, on_device
 from nerf_lightning.data.ray_batches import RayBatches, made_ahead
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.progress import Progress
 
 CPU = torch.device("cpu")

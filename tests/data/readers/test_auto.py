@@ -6,7 +6,7 @@ from support.captures import write_blender, write_npz
 from support.posed_captures import Known, read, write_colmap, write_llff, write_transforms
 
 from nerf_lightning.data.readers.auto import AutoReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 WRITERS = {
     "colmap": lambda root: write_colmap(root, Known()),

@@ -6,7 +6,7 @@ from PIL import Image
 from support.captures import picture, pose, write_blender
 
 from nerf_lightning.data.readers.blender import BlenderReader
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from support.malformed import MODEL, Cases, edit_bytes, edit_text, one_picture, refused, refused_when_damaged
 from support.posed_captures import Known, read, ring, write_colmap
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 case = Cases()
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.part import StepContext

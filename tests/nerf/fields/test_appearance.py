@@ -10,7 +10,7 @@ from support.steps import make_step
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.types.points import Points
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.photographs import photographs_of
 
 

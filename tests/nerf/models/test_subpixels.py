@@ -8,7 +8,7 @@ from support.scenes import ball_scene, tiny_model
 from support.steps import gradients, make_step, rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.losses.proposal import ProposalLoss
 from nerf_lightning.nerf.models.radiance_model import RadianceModel

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.adam.step import adam_step_torch
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 

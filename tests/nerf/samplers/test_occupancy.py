@@ -5,7 +5,7 @@ import pytest
 import torch
 from support.scenes import ball_scene, some_rays
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler

@@ -11,7 +11,7 @@ from support.steps import rays_of
 
 from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.types.progress import Progress

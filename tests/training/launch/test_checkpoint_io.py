@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import checkpoint_io
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 

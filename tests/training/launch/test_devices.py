@@ -8,8 +8,8 @@ import torch
 
 from nerf_lightning.compute.devices import working_device
 from nerf_lightning.config.messages import paragraph
-from nerf_lightning.errors import InputError
 from nerf_lightning.evaluation import protocol as environment
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 
 CHOSEN = ("cuda", "Old GPU, found")

@@ -7,7 +7,7 @@ from support.configs import composed
 from support.static_models import MODELS, fast_model
 
 from nerf_lightning.compute.devices import choose_precision
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.processes import num_processes

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, similarity
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at, rotation_from_quaternion

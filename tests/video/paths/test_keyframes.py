@@ -9,7 +9,7 @@ import torch
 from support.scenes import ball_scene
 from test_chosen_paths import MIDDLE, UP, frame, keyframe_file, keys
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project
 from nerf_lightning.nerf.geometry.poses import is_rigid, quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.video.paths.base import frame_of

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from support.budget import budget
 from support.configs import loaded, options
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, project
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
 from nerf_lightning.video.paths.auto import AutoPath, widest_gap

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.budgets import require_within
 from nerf_lightning.data.readers.colmap.records import CURE, CURE_MODEL, MODELS, MOST_BYTES, ColmapCamera, ColmapImage
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
 
 
 class BinaryFiles:

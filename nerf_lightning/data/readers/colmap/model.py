@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.budgets import allowed
 from nerf_lightning.data.readers.colmap.binary import BinaryFiles
 from nerf_lightning.data.readers.colmap.records import CURE, ColmapCamera, ColmapImage, ModelFiles
 from nerf_lightning.data.readers.colmap.text import TextFiles
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
+from nerf_lightning.files.budgets import allowed
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 Record = TypeVar("Record")
 FILES = ("cameras", "images", "points3D")

@@ -13,9 +13,9 @@ from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.colmap.model import find_model, model_files, read_model
 from nerf_lightning.data.readers.colmap.records import ColmapCamera, ColmapImage
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import listed
 from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import LensModel
 

@@ -11,9 +11,9 @@ from support.posed_captures import Known, ring, write_transforms
 from support.running import FAST, said, start
 
 from nerf_lightning.data.bricks.solids import Solids
-from nerf_lightning.errors import InputError
 from nerf_lightning.extensions.many_scenes.brick_models import HALF, REACH, BrickModelReader, model
 from nerf_lightning.extensions.many_scenes.many import ManyReader, numbers_in
+from nerf_lightning.messages.errors import InputError
 
 SMALL = {"resolution": 8, "num_train": 3, "num_val": 1, "num_test": 2}
 PICTURES = ("scene.resolution=16", "scene.num_train=5", "scene.num_val=1", "scene.num_test=1")

@@ -15,13 +15,13 @@ from nerf_lightning.config.instantiate import require_fitting
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.config.open_checkpoint import open_checkpoint, trusted_modules
 from nerf_lightning.config.overrides import to_type
-from nerf_lightning.console import say
-from nerf_lightning.errors import InputError
 from nerf_lightning.extensions.pruning.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.extensions.pruning.narrower_model import shapes_of, widths_of, with_widths
 from nerf_lightning.extensions.pruning.packed_weights import packed_weights
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
 from nerf_lightning.files.made_folders import below, make_folder
+from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 
 KEPT = ("format", "choices", "scene", "refined", "precision", "tile_points")

@@ -7,7 +7,7 @@ runs for hours. A person who knows better raises it on the command line (`budget
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn, track
 
-from nerf_lightning.escaping import for_terminal
+from nerf_lightning.messages.escaping import for_terminal
 
 DAY = 86_400
 LINE_SECONDS = 30.0
@@ -134,7 +134,7 @@ def say(*lines: str) -> None:
 
 
 class StdoutConsole(Console):
-    """A console on stdout. Where that is a closed pipe, rich would exit with 1; closed_pipe.py decides here."""
+    """A console on stdout. Where that is a closed pipe, rich would exit with 1; cli.process.ends_quietly decides."""
 
     def on_broken_pipe(self) -> None:
         """Pass on the error that is being handled."""

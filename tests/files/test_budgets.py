@@ -6,9 +6,9 @@ import pytest
 from omegaconf import OmegaConf
 from support.configs import composed, loaded
 
-from nerf_lightning.budgets import Budgets, allow, allow_as_typed, allowed, require_within
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.errors import InputError
+from nerf_lightning.files.budgets import Budgets, allow, allow_as_typed, allowed, require_within
+from nerf_lightning.messages.errors import InputError
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,7 @@
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from nerf_lightning.cli.bare_paths import quoted_paths
+from nerf_lightning.cli.arguments import quoted_paths
 
 
 def test_the_folder_of_a_sweeps_job_is_read_as_it_was_printed(tmp_path):

@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Iterable
 from typing import Any
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.messages.errors import InputError
 
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # the wide ones count in some languages
 """What a spreadsheet takes for the beginning of a formula."""

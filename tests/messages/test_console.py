@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from nerf_lightning import console
+from nerf_lightning.messages import console
 
 
 @pytest.fixture

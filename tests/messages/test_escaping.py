@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.escaping import (
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import (
     JOINERS,
     EscapingFormatter,
     for_csv,

@@ -1,0 +1,151 @@
+"""A small training of each kind of model, in every precision of the device, against the same on the CPU in float32."""
+
+from collections.abc import Sequence
+from functools import cache, partial
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.data.pixels.placement import on_device
+from nerf_lightning.data.ray_batches import FixedRays, RayBatches
+from nerf_lightning.evaluation.metrics import RayErrors
+from nerf_lightning.nerf.encoders.base import tables_of
+from nerf_lightning.nerf.kernels.backends import CPU_TWINS, can_compile, without
+from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart
+from nerf_lightning.selftest.scene import ball_scene
+from nerf_lightning.training.build_step import build_step
+from nerf_lightning.training.launch.trainer import TrainerSettings
+
+SEED, STEPS, BATCH_RAYS, TILE_POINTS = 7, 60, 192, 4096
+ENCODER = (
+    *("encoder.num_levels=4", "encoder.features_per_level=4", "encoder.log2_table_size=11"),
+    *("encoder.min_resolution=4", "encoder.max_resolution=48", "field.width=32"),
+)
+# Opaque matter is cut off where nothing can be seen of it any more, so that cutting changes no comparison.
+GRID = tuple(
+    f"model.levels.fine.sampler.{each}"
+    for each in ("resolution=16", "num_steps=48", "update_every=8", "warmup_steps=16", "opaque_below=1e-6")
+)
+METHODS = {
+    "nerf_tiny": ("optimizer.lr=5e-3",),
+    "fast_small": (*ENCODER, *GRID),
+    "fast_dense": (*ENCODER, *GRID),
+    "fast_proposal": ENCODER,
+}
+"""The settings that make models of conf/model small."""
+LAYERS = 6
+"""Products of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
+# Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
+# 0.5 to 0.75 dB. What rounding does to a run must be less than that: all of 0.5 dB where products have 8 bits, half
+# where they have 11, and a tenth where only the order of sums differs.
+PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 0.5}
+LEARNT = 1e4
+"""Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
+CPU = torch.device("cpu")
+
+
+class Training:
+    """A training in the making."""
+
+    def __init__(self, method: str, device: torch.device, products: Products, tile_points: int | None):
+        scene, progress = ball_scene(), Progress()
+        config, _ = compose_config("train", [f"model={method}", f"seed={SEED}", *METHODS[method]])
+        settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
+        self.step = build_step(config, settings, scene, progress).to(device)
+        self.step.num_steps = STEPS
+        self.step.model.multiply_in(products)
+        self.loader = RayBatches(on_device(scene, device), progress, SEED, BATCH_RAYS)
+        self.held_out = FixedRays(scene, "val", 10**6, 400)
+        self.optimizer = self.step.new_optimizer()
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Return the gradients of the first batch, with tables as large as trained ones are."""
+        # Fresh ones are all but zero: whatever is done with them would hardly matter.
+        with torch.no_grad():
+            for table in tables_of(self.step.model):
+                table.mul_(LEARNT)
+        self.optimizer.zero_grad()
+        self.step.gradients(self.loader.at(0, 0).to(self.step.device))
+        named = self.step.model.named_parameters()
+        return {name: value.grad.clone() for name, value in named if value.grad is not None}
+
+    def psnr(self) -> float:
+        """Train, and return the PSNR of the held-out views."""
+        step, errors = self.step, RayErrors()
+        for _ in range(STEPS):
+            step(self.loader.at(0, step.progress.rays_seen).to(step.device), self.optimizer)
+        with torch.no_grad():
+            for batch in self.held_out:
+                step.validate(batch.to(step.device), errors)
+        if step.guard.skipped:
+            raise ValueError(f"{step.guard.skipped} of {STEPS} steps had gradients that are not finite")
+        return errors.summary()["val/psnr"]
+
+
+def checks(device: torch.device, precisions: Sequence[Products], compiles: bool) -> list[Check]:
+    """Return the checks of gradients and of whole trainings; `compiles`: torch.compile is tried, too."""
+    found = []
+    for method in METHODS:
+        for products in precisions:
+            name = f"{method}, {products}"
+            found += [
+                Check(
+                    f"{name}: gradients of a batch",
+                    gradient_bound(products, LAYERS),
+                    f"{LAYERS} layers of {products} products, and ReLUs within rounding of zero, which switch",
+                    partial(_gradients, method, device, products),
+                ),
+                Check(
+                    f"{name}: PSNR after {STEPS} steps, dB",
+                    PSNR_APART[products],
+                    "rounding moves a training less than another seed does, whose standard deviation is 0.5 dB",
+                    partial(_psnr, method, device, products),
+                ),
+            ]
+    bound = gradient_bound("float32", LAYERS)
+    name = "nerf_tiny, compiled: gradients of a batch"
+    return [*found, Check(name, bound, "as without torch.compile", partial(_compiled, device, compiles))]
+
+
+@cache
+def reference_gradients(method: str) -> dict[str, Tensor]:
+    """Return the gradients of the first batch, by plain torch on the CPU, in float32, without tiles."""
+    with without(*CPU_TWINS):
+        return Training(method, CPU, "float32", None).gradients()
+
+
+@cache
+def reference_psnr(method: str) -> float:
+    """Return the PSNR of a training by the same."""
+    with without(*CPU_TWINS):
+        return Training(method, CPU, "float32", None).psnr()
+
+
+def gradients_apart(found: dict[str, Tensor], expected: dict[str, Tensor]) -> float:
+    """Return how far the gradients of a model are apart, all in one, over the norm of what is expected."""
+    if found.keys() != expected.keys():
+        raise ValueError(f"gradients of {sorted(found.keys() ^ expected.keys())} are there in one and not in the other")
+    ours, theirs = (torch.cat([each[name].cpu().flatten() for name in expected]) for each in (found, expected))
+    return norm_apart(ours, theirs)
+
+
+def _gradients(method: str, device: torch.device, products: Products) -> float:
+    return gradients_apart(Training(method, device, products, TILE_POINTS).gradients(), reference_gradients(method))
+
+
+def _psnr(method: str, device: torch.device, products: Products) -> float:
+    return abs(Training(method, device, products, TILE_POINTS).psnr() - reference_psnr(method))
+
+
+def _compiled(device: torch.device, compiles: bool) -> float:
+    if not compiles:
+        raise CannotRun("torch.compile is tried on GPUs, and on the CPU with trainer.compile=true")
+    if not can_compile(device):
+        raise CannotRun("there is no C++ compiler, which torch.compile needs on the CPU")
+    training = Training("nerf_tiny", device, "float32", None)
+    if not training.step.model.compile_fields():
+        raise ValueError("no level was compiled")
+    return gradients_apart(training.gradients(), reference_gradients("nerf_tiny"))
