@@ -18,7 +18,7 @@ from support.planted_poses import FAULTS, Found, plant
 
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.data.readers.transforms import TransformsReader

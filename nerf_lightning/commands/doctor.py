@@ -14,11 +14,9 @@ from rich.text import Text
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.key_meanings import PLACES
 from nerf_lightning.data.readers.auto import AutoReader
-from nerf_lightning.doctor.about_capture import about_capture
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.examine import examine
-from nerf_lightning.doctor.picture import doctor_picture
-from nerf_lightning.doctor.proof_picture import proof_picture
+from nerf_lightning.doctor.picture import about_capture, doctor_picture, proof_picture
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StdoutConsole, say, spoken
 from nerf_lightning.messages.escaping import for_terminal, listed

@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
-from nerf_lightning.data.captures.space import model_for
+from nerf_lightning.data.captures.extent import model_for
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure

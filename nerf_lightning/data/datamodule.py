@@ -70,7 +70,7 @@ class RayDataModule(LightningDataModule):
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
             if value < 1:
                 raise InputError(f"data.{name}={value}: at least one ray is needed. Give a positive number.")
-            _require_room(name, value)
+            require_memory(f"data.{name}={value}", value, lambda n: RAY_BYTES * n, f"data.{name}={{}}".format)
         least = batch_rays if sample_budget is None else max(1, batch_rays >> (BATCH_SIZES - 1))
         least = max(1, least // patch**2)
         if min(least, val_rays) < ranks.world_size():
@@ -162,10 +162,6 @@ def _check_views_per_step(views: int | None, batch_rays: int, sample_budget: int
             "rays, nor with losses that look at squares of pixels (loss.patch). Give data.sample_budget=null and "
             "another loss, or data.views_per_step=null."
         )
-
-
-def _require_room(name: str, rays: int) -> None:
-    require_memory(f"data.{name}={rays}", rays, lambda count: RAY_BYTES * count, lambda count: f"data.{name}={count}")
 
 
 def _check_background(scene: Scene) -> None:

@@ -1,18 +1,28 @@
-"""Checks of the cameras by themselves, before any pixel is asked."""
+"""Checks of the cameras by themselves, and of the set of views: how many, from where, which are held out or missing."""
 
 import math
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
 
-from nerf_lightning.doctor.check import Check, Given
+from nerf_lightning.doctor.check import Check, Evidence, Given, look, ok, rows_at_once, wrong
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import image_plane
-from nerf_lightning.nerf.geometry.frames import focus_point
+from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
+from nerf_lightning.nerf.geometry.frames import focus_point, gaps_around
 from nerf_lightning.nerf.geometry.lenses import stretches, unproject
 from nerf_lightning.nerf.geometry.poses import is_rigid
+from nerf_lightning.nerf.types.scene import Scene
 
 # Fields of view (degrees across the longer side) that photographers use.
 NARROW, WIDE, WIDEST = 12.0, 100.0, 140.0
 OFF_CENTER, FAR_OFF_CENTER = 0.06, 0.2
+FEW, TOO_FEW = 15, 5
+FEW_MATCHES = 30
+# Degrees between a held-out view and the nearest one that is learnt from.
+FAR_HELD_OUT = 40.0
 
 
 def rigid(evidence: Given) -> Check:
@@ -21,60 +31,60 @@ def rigid(evidence: Given) -> Check:
     bad = (~is_rigid(c2w)).nonzero()[:, 0].tolist()
     if bad:
         cure = "Take scale and mirror out of the rotations; the centres keep them."
-        return Check("rotations", "wrong", f"{evidence.named(bad)} have poses that are no rotations", cure)
+        return wrong(f"{evidence.named(bad)} have poses that are no rotations", cure)
     size = float((c2w[:, :, 3].amax(dim=0) - c2w[:, :, 3].amin(dim=0)).norm())
     if len(c2w) > 1 and size < 1e-6:
         cure = "Walk around: depth is seen only from different places. Or the centres were lost in the conversion."
-        return Check("rotations", "wrong", "all cameras stand at one place", cure)
+        return wrong("all cameras stand at one place", cure)
     same = (torch.pdist(c2w.flatten(1)) < 1e-6 * size).sum() if len(c2w) <= 2000 else torch.tensor(0)
     if int(same):
         cure = "Look for photographs that are listed twice, or poses that were copied."
-        return Check("rotations", "look", f"{int(same)} pairs of views have one and the same pose", cure)
-    return Check("rotations", "ok", f"all {len(c2w)} poses are right-handed rotations with different centres")
+        return look(f"{int(same)} pairs of views have one and the same pose", cure)
+    return ok(f"all {len(c2w)} poses are right-handed rotations with different centres")
 
 
 def common_middle(evidence: Given) -> Check:
     """Judge whether the cameras look at, or away from, the place where their axes meet."""
-    c2w, name = evidence.scene.cameras.c2w.double(), "common middle"
+    c2w = evidence.scene.cameras.c2w.double()
     if evidence.scene.cameras.lens_model == "equirectangular":
-        return Check(name, "ok", "not judged: panoramas look everywhere")
+        return ok("not judged: panoramas look everywhere")
     if evidence.scene.space == "ndc" or bool((c2w[:, :, 2].mean(dim=0).norm() > 0.95).item()):
-        return Check(name, "ok", "the cameras all look the same way")
+        return ok("the cameras all look the same way")
     to_middle = focus_point(c2w) - c2w[:, :, 3]
     ahead = float(((to_middle * -c2w[:, :, 2]).sum(dim=-1) > 0).double().mean())
     if ahead >= 0.8:
-        return Check(name, "ok", f"{100 * ahead:.0f} % of the cameras have the place where their axes meet in front")
+        return ok(f"{100 * ahead:.0f} % of the cameras have the place where their axes meet in front")
     if ahead <= 0.2:
         cure = (
             "If the photographs show one thing from around, negate the second and third column of every rotation; if "
             "they were taken outwards from one place, all is well."
         )
         message = f"{100 * (1 - ahead):.0f} % of the cameras look away from the place where their axes meet"
-        return Check(name, "wrong", message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
+        return wrong(message + ": OpenCV's axes rather than OpenGL's, it seems", cure)
     cure = "Look at doctor.png: do the cameras face what was photographed? If not, see the check of axes."
-    return Check(name, "look", f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
+    return look(f"only {100 * ahead:.0f} % of the cameras look at a common middle", cure)
 
 
 def upright(evidence: Given) -> Check:
     """Judge whether the photographs lie on their side or stand on their head in the working frame."""
-    scene, name = evidence.scene, "upright"
+    scene = evidence.scene
     up = torch.tensor([0.0, 1.0, 0.0] if scene.space == "ndc" else [0.0, 0.0, 1.0])
     right_up, up_up = (up @ scene.cameras.c2w[:, :, column].T for column in (0, 1))
     sideways = float((right_up.abs() > 0.7).float().mean())
     if sideways > 0.5:
         cure = "Training does not mind. For upright pictures turn the photographs and estimate the poses anew."
-        return Check(name, "look", f"{100 * sideways:.0f} % of the photographs lie on their side", cure)
+        return look(f"{100 * sideways:.0f} % of the photographs lie on their side", cure)
     if float(up_up.median()) < -0.1:
         cure = "Turn the world so that up is +z (or check the axes); else videos and orbits are upside down."
-        return Check(name, "look", "most photographs stand on their head: up is not +z", cure)
-    return Check(name, "ok", "the photographs are upright")
+        return look("most photographs stand on their head: up is not +z", cure)
+    return ok("the photographs are upright")
 
 
 def field_of_view(evidence: Given) -> Check:
     """Judge the focal lengths by the field of view, and by how much they vary."""
-    cameras, name = evidence.scene.cameras, "field of view"
+    cameras = evidence.scene.cameras
     if cameras.lens_model == "equirectangular":
-        return Check(name, "ok", "panoramas: all directions")
+        return ok("panoramas: all directions")
     side = torch.maximum(cameras.width, cameras.height)
     degrees = (2 * (0.5 * side / cameras.focal.mean(dim=-1)).atan()).rad2deg()
     low, high = float(degrees.min()), float(degrees.max())
@@ -83,38 +93,38 @@ def field_of_view(evidence: Given) -> Check:
     limit = math.inf if cameras.lens_model == "fisheye" else WIDEST
     if low < NARROW / 3 or high > limit:
         cure = "Check the focal length: it must be in pixels, of photographs of this size."
-        return Check(name, "wrong", message + ", which no usual lens has", cure)
+        return wrong(message + ", which no usual lens has", cure)
     uneven = bool((cameras.focal[:, 0] / cameras.focal[:, 1] - 1).abs().max() > 0.1)
     if low < NARROW or (high > WIDE and limit < math.inf) or uneven:
         message += "; pixels are not square" if uneven else ", which is unusual"
-        return Check(name, "look", message, "Check the focal length (pixels, for photographs of this size).")
-    return Check(name, "ok", message)
+        return look(message, "Check the focal length (pixels, for photographs of this size).")
+    return ok(message)
 
 
 def principal_point(evidence: Given) -> Check:
     """Judge how far the principal point lies from the photograph's centre; a halved one is named."""
-    cameras, name = evidence.scene.cameras, "principal point"
+    cameras = evidence.scene.cameras
     size = torch.stack([cameras.width, cameras.height], dim=-1)
     share = cameras.center / size
     off = float((share - 0.5).abs().max())
     message = f"at most {100 * off:.1f} % of the size from the centre"
     if off < OFF_CENTER:
-        return Check(name, "ok", message)
+        return ok(message)
     usual = share.median(dim=0).values
     factor = float((usual / 0.5).mean())
     # Photographs that were cropped, each elsewhere, have it anywhere; numbers for another size have it so in all.
-    wrong = float((usual - 0.5).abs().max()) >= FAR_OFF_CENTER
-    if wrong and float((usual[0] - usual[1]).abs()) < 0.03:
+    is_other_size = float((usual - 0.5).abs().max()) >= FAR_OFF_CENTER
+    if is_other_size and float((usual[0] - usual[1]).abs()) < 0.03:
         message += f": it belongs to photographs of {factor:.2g} times the size, it seems"
     cure = "Give cx, cy (and the focal length) in pixels of the width and height beside them; cropped is fine."
-    return Check(name, "wrong" if wrong else "look", message, cure)
+    return (wrong if is_other_size else look)(message, cure)
 
 
 def lens(evidence: Given) -> Check:
     """Judge how strongly the lens bends towards the corners; one that folds is refused when the capture is read."""
-    cameras, name = evidence.scene.cameras, "lens"
+    cameras = evidence.scene.cameras
     if cameras.lens_model == "pinhole" or not bool(cameras.lens.any()):
-        return Check(name, "ok", "no distortion")
+        return ok("no distortion")
     view = int(cameras.lens.abs().sum(dim=-1).argmax())
     plane = image_plane(cameras, view)
     rays = unproject(plane, cameras.lens[view], cameras.lens_model)
@@ -124,8 +134,101 @@ def lens(evidence: Given) -> Check:
     message = f"{cameras.lens_model}, moves the corners by up to {moved:.0f} pixels"
     if cameras.lens_model == "radial_tangential" and least < 0.25:
         cure = "Undistort the photographs, crop them, or calibrate with a fisheye model."
-        return Check(name, "look", message + f"; it is near to folding back (stretch {least:.2f} at the border)", cure)
-    return Check(name, "ok", message)
+        return look(message + f"; it is near to folding back (stretch {least:.2f} at the border)", cure)
+    return ok(message)
 
 
-CHECKS = (rigid, common_middle, upright, field_of_view, principal_point, lens)
+def number_of_views(evidence: Given) -> Check:
+    """Judge whether there are enough views to learn from."""
+    splits = evidence.scene.splits
+    count = len(splits["train"])
+    held = len(set(splits["val"]) | set(splits["test"]))
+    message = f"{count} to learn from, {held} held out"
+    if count >= FEW:
+        return ok(message)
+    cure = "Take more photographs: 15 or more of a scene seen from the front, 50 to 100 all around."
+    return (wrong if count < TOO_FEW else look)(message, cure)
+
+
+def splits(evidence: Evidence) -> Check:
+    """Judge whether views are held out, and not learnt from as well."""
+    parts = {split: set(views) for split, views in evidence.scene.splits.items()}
+    both = sorted(parts["train"] & (parts["val"] | parts["test"]))
+    if both:
+        cure = "Take them out of one of the two lists; else the scores say nothing of new views."
+        return wrong(f"{evidence.named(both)} are learnt from and held out at once", cure)
+    held = sorted(parts["val"] | parts["test"])
+    angles = _degrees_to_nearest(evidence.scene, held, sorted(parts["train"]))
+    lonely = [view for view, angle in zip(held, angles.tolist(), strict=True) if angle > FAR_HELD_OUT]
+    if lonely:
+        message = f"{evidence.named(lonely)} are seen from over {FAR_HELD_OUT:.0f} degrees away from any training view"
+        return look(message, "Expect low scores there; hold out other views, or add photographs.")
+    far = f"; the farthest lies {float(angles.max()):.0f} degrees from a training view" if len(held) else ""
+    return ok(f"no view is in training and held out at once{far}")
+
+
+def left_out(evidence: Evidence) -> Check:
+    """Report photographs without a pose."""
+    missing = evidence.scene.left_out
+    if not missing:
+        return ok("none")
+    total = len(missing) + len(evidence.scene.view_names)
+    message = f"{len(missing)} of {total} photographs have no pose: {listed(missing, cap=5)}"
+    cure = "Were they needed, take photographs between them and the others and estimate the poses anew (nerf poses)."
+    return (look if len(missing) < 0.5 * total else wrong)(message, cure)
+
+
+def overlap(evidence: Evidence) -> Check:
+    """Look for views that share next to nothing with others."""
+    matches = evidence.matches
+    total = len(evidence.scene.view_names)
+    counts = torch.bincount(matches.view.flatten(), minlength=total)[list(matches.views)]
+    if not len(matches.view) or int(counts.median()) < 2 * FEW_MATCHES:
+        return ok("not judged: too few details could be found again")
+    lonely = [matches.views[place] for place in (counts < FEW_MATCHES).nonzero()[:, 0].tolist()]
+    if not lonely:
+        return ok(f"every view shares at least {int(counts.min())} details with others")
+    message = f"{evidence.named(lonely)} share next to nothing with other views"
+    return look(message, "Add photographs between these and the others, or leave these out.")
+
+
+def coverage(evidence: Evidence) -> Check:
+    """Report from where around the middle photographs were taken; a hole in a ring of views is noted."""
+    scene = evidence.scene
+    if scene.space == "ndc":
+        return ok("forward-facing: new views are good between the cameras, not beside them")
+    azimuth, elevation = directions_seen(scene)
+    around, gaps = gaps_around(azimuth)
+    widest = float(gaps.max())
+    up = f"heights of {float(elevation.min()):.0f} to {float(elevation.max()):.0f} degrees"
+    message = f"seen from {360 - widest:.0f} degrees around, from {up}"
+    if len(gaps) > 8 and 50 < widest < 140:
+        at = float(around[int(gaps.argmax())] + widest / 2)
+        cure = f"Photographs are missing around {(at + 180) % 360 - 180:.0f} degrees (see doctor.png); take some there."
+        return look(f"{message}, with a gap of {widest:.0f} degrees", cure)
+    return ok(message)
+
+
+def _degrees_to_nearest(scene: Scene, held: list[int], train: list[int]) -> Float[Tensor, "held"]:
+    towards = functional.normalize(scene.cameras.c2w[:, :, 3] - middle_of(scene), dim=-1)
+    if not train or not held:
+        return torch.zeros(len(held))
+    parts = towards[held].split(rows_at_once(len(train)))
+    return torch.cat([(part @ towards[train].T).clamp(-1, 1).amax(dim=1) for part in parts]).acos().rad2deg()
+
+
+CHECKS = {
+    "rotations": rigid,
+    "common middle": common_middle,
+    "upright": upright,
+    "field of view": field_of_view,
+    "principal point": principal_point,
+    "lens": lens,
+}
+OF_VIEWS = {
+    "number of views": number_of_views,
+    "split": splits,
+    "photographs without pose": left_out,
+    "overlap": overlap,
+    "coverage": coverage,
+}

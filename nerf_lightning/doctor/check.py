@@ -2,15 +2,14 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.doctor.features import Corners
-from nerf_lightning.doctor.matches import Matches
-from nerf_lightning.doctor.proofs import Proof
-from nerf_lightning.doctor.view_statistics import Looks
+from nerf_lightning.doctor.features import Corners, Looks
+from nerf_lightning.doctor.matches import Matches, Proof
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -21,7 +20,7 @@ Verdict = Literal["ok", "look", "wrong"]
 
 @dataclass(frozen=True)
 class Check:
-    """The outcome of one check."""
+    """The outcome of one check; its name is given by the table of checks."""
 
     name: str
     verdict: Verdict
@@ -64,6 +63,8 @@ class Evidence(Given):
 
 
 CheckFn = Callable[[Evidence], Check]
+ok, look, wrong = partial(Check, "", "ok"), partial(Check, "", "look"), partial(Check, "", "wrong")
+"""What checks return: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`."""
 
 
 def rows_at_once(columns: int) -> int:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.nerf.geometry.frames import points_to_user, unit_of
 from nerf_lightning.nerf.types.scene import Cameras, Scene
 
 FLIP_YZ = (1.0, -1.0, -1.0)
@@ -26,11 +27,9 @@ class Reading:
 
 def user_poses(scene: Scene) -> Float[Tensor, "views 3 4"]:
     """Return the poses in the user's own frame (float64): what an inversion must be done in."""
-    to_user = scene.to_user.double()
-    unit = torch.linalg.det(to_user[:3, :3]) ** (1 / 3)
-    c2w = scene.cameras.c2w.double()
-    centers = c2w[:, :, 3] @ to_user[:3, :3].T + to_user[:3, 3]
-    return torch.cat([to_user[:3, :3] / unit @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
+    to_user, c2w = scene.to_user.double(), scene.cameras.c2w.double()
+    centers = points_to_user(c2w[:, :, 3], to_user)
+    return torch.cat([to_user[:3, :3] / unit_of(to_user) @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
 
 
 def inverted(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "views 3 4"]:
@@ -76,21 +75,13 @@ def _pictures(x: float, y: float) -> Callable[[Scene, Matches], tuple[Tensor, Ma
     )
 
 
-def _in_numeric_order(scene: Scene, matches: Matches) -> tuple[Tensor, Matches]:
-    return user_poses(scene)[numeric_order(scene.cameras, scene.view_names)], matches
-
-
 AXES = (
     Reading(
         "like OpenCV's or COLMAP's (right, down, forward) rather than OpenGL's (right, up, back)",
         "Negate the second and third column of every rotation.",
         _poses(lambda c2w: axes(c2w, FLIP_YZ)),
     ),
-    Reading(
-        "like world-to-camera rather than camera-to-world",
-        "Invert every pose matrix.",
-        _poses(inverted),
-    ),
+    Reading("like world-to-camera rather than camera-to-world", "Invert every pose matrix.", _poses(inverted)),
     Reading(
         "like world-to-camera with OpenCV's axes (as COLMAP writes them)",
         "Invert every pose matrix, then negate the second and third column of its rotation.",
@@ -134,18 +125,10 @@ ORDERS = (
     Reading(
         "as if they followed the numbers in the photographs' names, and not the names sorted as text",
         "Pair photographs and poses in numeric order (rename 1.jpg to 0001.jpg and so on).",
-        _in_numeric_order,
+        lambda scene, matches: (user_poses(scene)[numeric_order(scene.cameras, scene.view_names)], matches),
     ),
-    Reading(
-        "as if each photograph had the pose of the next one",
-        SHIFT,
-        _poses(lambda c2w: c2w.roll(-1, 0)),
-    ),
-    Reading(
-        "as if each photograph had the pose of the previous one",
-        SHIFT,
-        _poses(lambda c2w: c2w.roll(1, 0)),
-    ),
+    Reading("as if each photograph had the pose of the next one", SHIFT, _poses(lambda c2w: c2w.roll(-1, 0))),
+    Reading("as if each photograph had the pose of the previous one", SHIFT, _poses(lambda c2w: c2w.roll(1, 0))),
     Reading(
         "as if the photographs' order were reversed",
         "Reverse the list of photographs.",

@@ -2,27 +2,27 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.doctor import cameras, extent, image_quality, memory, poses, views
+from nerf_lightning.doctor import cameras, extent, image_quality, memory, poses
 from nerf_lightning.doctor.check import Check, CheckFn, Evidence
 from nerf_lightning.doctor.epipolar import agreeing
-from nerf_lightning.doctor.features import Corners, find_corners, shrunk_cameras, small_picture
-from nerf_lightning.doctor.matches import find_matches
-from nerf_lightning.doctor.view_statistics import look_at_view, stacked
+from nerf_lightning.doctor.features import Corners, Looks, find_corners, look_at_view, shrunk_cameras, small_picture
+from nerf_lightning.doctor.matches import likely_pairs, matched_pairs
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Scene
 
-CHECKS: tuple[CheckFn, ...] = (
-    *cameras.CHECKS,
-    *poses.CHECKS,
-    *extent.CHECKS,
-    *views.CHECKS,
-    *image_quality.CHECKS,
-    *memory.CHECKS,
-)
+CHECKS: dict[str, CheckFn] = {
+    **cameras.CHECKS,
+    **poses.CHECKS,
+    **extent.CHECKS,
+    **cameras.OF_VIEWS,
+    **image_quality.CHECKS,
+    **memory.CHECKS,
+}
 
 
 def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
@@ -38,7 +38,7 @@ def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
         )
     with _one_thread_each():
         evidence = gather_evidence(scene)
-        return evidence, [check(evidence) for check in CHECKS]
+        return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
 
 
 @contextmanager
@@ -71,5 +71,6 @@ def gather_evidence(scene: Scene) -> Evidence:
         return look_at_view(scene.pixels, view, picture)
 
     rows = in_threads(look, total, "Looking at photographs", shown=total > NOTICEABLE)
-    matches = find_matches(cameras, corners, shown=total > NOTICEABLE)
-    return Evidence(scene, stacked(rows), matches, agreeing(matches, scene.cameras.c2w), corners)
+    matches = matched_pairs(cameras, corners, likely_pairs(corners), shown=total > NOTICEABLE)
+    looks = Looks(*(torch.stack(column) for column in zip(*rows, strict=True)))
+    return Evidence(scene, looks, matches, agreeing(matches, scene.cameras.c2w), corners)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
+from nerf_lightning.doctor.check import Check, Evidence, look, ok, rows_at_once, wrong
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
@@ -24,19 +24,17 @@ INCHES, FEET, CENTIMETRES = 39.37, 3.281, 100.0
 
 def near_and_far(evidence: Evidence) -> Check:
     """Judge whether content lies between near and far."""
-    name, scene = "near and far", evidence.scene
+    scene = evidence.scene
     found = content_distances(evidence)
     if found is None:
-        return Check(name, "ok", "not judged: no sparse points, and too few details were found again")
+        return ok("not judged: no sparse points, and too few details were found again")
     view, distance = found
     unit = unit_of(scene.to_user.double())
     if scene.space == "ndc":
         before = float((distance < 1.0).float().mean())
         if before <= FEW:
-            return Check(name, "ok", f"{100 * (1 - before):.0f} % of the content lies beyond the near plane (NDC)")
-        return Check(
-            name,
-            "wrong" if before > MANY else "look",
+            return ok(f"{100 * (1 - before):.0f} % of the content lies beyond the near plane (NDC)")
+        return (wrong if before > MANY else look)(
             f"{100 * before:.0f} % of the content lies before the near plane of the normalised device coordinates",
             f"Set scene.near to about {0.9 * float(distance.quantile(0.01)) * unit:.3g} (it is {unit:.3g}).",
         )
@@ -46,10 +44,10 @@ def near_and_far(evidence: Evidence) -> Check:
     near, far = unit * float(scene.near.median()), unit * float(scene.far.median())
     message = f"content lies {low:.3g} to {high:.3g} from the cameras; near is {near:.3g} and far {far:.3g}"
     if max(before, beyond) <= FEW:
-        return Check(name, "ok", message)
+        return ok(message)
     cut = f"{100 * before:.0f} % of it in front of near and {100 * beyond:.0f} % behind far"
     cure = f"Set scene.near={0.8 * low:.2g} scene.far={1.3 * high:.3g}.{_units(low, high, near, far)}"
-    return Check(name, "wrong" if max(before, beyond) > MANY else "look", f"{message}: {cut}", cure)
+    return (wrong if max(before, beyond) > MANY else look)(f"{message}: {cut}", cure)
 
 
 def content_distances(evidence: Evidence) -> tuple[Tensor, Float[Tensor, "content"]] | None:
@@ -79,46 +77,39 @@ def clear_matches(evidence: Evidence) -> Bool[Tensor, "matches"]:
 
 def box_in_view(evidence: Evidence) -> Check:
     """Judge whether every view's rays meet the box that is modelled, between near and far."""
-    scene, name = evidence.scene, "box in view"
+    scene = evidence.scene
     if scene.space != "bounded":
-        return Check(name, "ok", f"space is {scene.space}: no box bounds the content")
+        return ok(f"space is {scene.space}: no box bounds the content")
     shares = torch.stack([_share_in_box(scene, view) for view in range(len(scene.view_names))])
     blind = (shares < 0.02).nonzero()[:, 0].tolist()
     message = f"{100 * float(shares.median()):.0f} % of a view's rays pass the box (median)"
     if not blind:
-        return Check(name, "ok", message)
+        return ok(message)
     cure = (
         "The cameras do not look at the box, or near and far miss it: check the axes of the poses, centre the capture "
         "on its content, or set near, far and the box (scene.aabb_half)."
     )
-    many = len(blind) > 0.3 * len(shares)
-    return Check(
-        name,
-        "wrong" if many else "look",
-        f"{message}; {len(blind)} views miss it, such as {evidence.named(blind[:3])}",
-        cure,
-    )
+    message += f"; {len(blind)} views miss it, such as {evidence.named(blind[:3])}"
+    return (wrong if len(blind) > 0.3 * len(shares) else look)(message, cure)
 
 
 def scale(evidence: Evidence) -> Check:
     """Judge the size of the capture against what is modelled."""
-    scene, name = evidence.scene, "scale"
+    scene = evidence.scene
     centers = scene.cameras.c2w[:, :, 3]
     middle = scene.aabb.mean(dim=0)
     away = float((centers - middle).norm(dim=-1).median())
     half = float((scene.aabb[1] - scene.aabb[0]).max()) / 2
     if scene.space != "bounded":
-        return Check(
-            name, "ok", f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours"
-        )
+        return ok(f"brought to a working frame: one unit is {unit_of(scene.to_user.double()):.3g} of yours")
     inside = ((centers > scene.aabb[0]) & (centers < scene.aabb[1])).all(dim=-1)
     message = f"cameras stand {away:.3g} from the middle of a box that reaches {half:.3g}"
     if bool(inside.float().mean() > 0.3):
         cure = "Make the scene larger than the box or the box smaller (scene.aabb_half), or use scene.space=contracted."
-        return Check(name, "wrong", message + ": they stand within it", cure)
+        return wrong(message + ": they stand within it", cure)
     if away > 30 * half:
         cure = "Scale the camera centres down, or make the box larger (scene.aabb_half), with near and far to match."
-        return Check(name, "wrong", message + ": the content would be a dot in their pictures", cure)
+        return wrong(message + ": the content would be a dot in their pictures", cure)
     return _content_in_box(evidence, message)
 
 
@@ -126,15 +117,15 @@ def _content_in_box(evidence: Evidence, message: str) -> Check:
     scene = evidence.scene
     good = clear_matches(evidence)
     if int(good.sum()) < FEWEST:
-        return Check("scale", "ok", message)
+        return ok(message)
     found = places(evidence.matches, scene.cameras.c2w)[good]
     inside = float(((found > scene.aabb[0]) & (found < scene.aabb[1])).all(dim=-1).float().mean())
     message += f"; {100 * inside:.0f} % of the matched details lie in it"
     if inside > 1 - MANY:
-        return Check("scale", "ok", message)
+        return ok(message)
     reach = float(found.abs().quantile(0.98))
     cure = f"Content reaches {reach:.2g} from the origin: enlarge the box (scene.aabb_half), or scene.space=contracted."
-    return Check("scale", "wrong" if inside < 0.5 else "look", message, cure)
+    return (wrong if inside < 0.5 else look)(message, cure)
 
 
 def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
@@ -159,4 +150,8 @@ def _units(low: float, high: float, near: float, far: float) -> str:
     return ""
 
 
-CHECKS = (near_and_far, box_in_view, scale)
+CHECKS = {
+    "near and far": near_and_far,
+    "box in view": box_in_view,
+    "scale": scale,
+}

@@ -4,20 +4,20 @@ import logging
 from collections.abc import Callable
 
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.doctor import cameras, views
+from nerf_lightning.doctor import cameras
 from nerf_lightning.doctor.check import Check, Given
 from nerf_lightning.doctor.examine import examine
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import PixelStore, Scene
 
-QUICK: tuple[Callable[[Given], Check], ...] = (
-    cameras.rigid,
-    cameras.common_middle,
-    cameras.field_of_view,
-    cameras.principal_point,
-    views.number_of_views,
-)
+QUICK: dict[str, Callable[[Given], Check]] = {
+    "rotations": cameras.rigid,
+    "common middle": cameras.common_middle,
+    "field of view": cameras.field_of_view,
+    "principal point": cameras.principal_point,
+    "number of views": cameras.number_of_views,
+}
 """Checks that cost nothing, and find what is wrong."""
 ROWS = 8
 """Of a photograph, that are looked at first: nearly all show something there."""
@@ -39,7 +39,12 @@ def require_sound(scene: Scene) -> list[Check]:
             log.warning("doctor: %s: %s. %s", check.name, check.message, check.cure)
     wrong = [check for check in checks if check.verdict == "wrong"]
     if wrong:
-        raise InputError(_stopped(scene.name, wrong))
+        first, others = wrong[0], ", ".join(check.name for check in wrong[1:])
+        raise InputError(
+            f"The capture {scene.name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}"
+            f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all that it sees, in a picture; "
+            "doctor=off trains all the same."
+        )
     log.info("doctor: %d checks find nothing wrong (doctor=off leaves them out)", len(checks))
     return checks
 
@@ -62,9 +67,10 @@ def warn_of_faults(scene: Scene) -> None:
             "%d of %d training photographs of %s show nothing: %s. Look whether the files do%s%s.",
             *(len(blank), len(train), scene.name, listed(blank, cap=5), alpha, masks),
         )
-    for check in [check(Given(scene)) for check in QUICK] if scene.capture_of is None else []:
+    for name, judge in QUICK.items() if scene.capture_of is None else ():
+        check = judge(Given(scene))
         if check.verdict == "wrong":
-            log.warning("%s: %s. %s", check.name, check.message, check.cure)
+            log.warning("%s: %s. %s", name, check.message, check.cure)
 
 
 def _nothing(pixels: PixelStore, view: int) -> str | None:
@@ -76,12 +82,3 @@ def _nothing(pixels: PixelStore, view: int) -> str | None:
         if len(seen) and int((seen.amax(dim=0) - seen.amin(dim=0)).max()) > SPREAD:
             return None
     return f"all {', '.join(map(str, seen[0].tolist()))}" if len(seen) else "transparent"
-
-
-def _stopped(name: str, wrong: list[Check]) -> str:
-    first, others = wrong[0], [check.name for check in wrong[1:]]
-    also = f" Wrong, too: {', '.join(others)}." if others else ""
-    return (
-        f"The capture {name} is not fit to be trained on. {first.name}: {first.message}. {first.cure}{also} nerf "
-        "doctor shows all that it sees, in a picture; doctor=off trains all the same."
-    )

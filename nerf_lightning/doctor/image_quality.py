@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence, rows_at_once
+from nerf_lightning.doctor.check import Check, Evidence, look, ok, rows_at_once, wrong
+from nerf_lightning.doctor.features import THUMBNAIL
 from nerf_lightning.doctor.matches import Matches
-from nerf_lightning.doctor.view_statistics import THUMBNAIL
 from nerf_lightning.nerf.rendering.blending import at_evaluation
 
 # Mean difference of thumbnails, in units of their contrast.
@@ -29,7 +29,7 @@ def duplicates(evidence: Evidence) -> Check:
     parts = torch.arange(len(flat)).split(rows_at_once(len(flat)))
     same = torch.cat([_pairs_alike(flat, contrast, part) for part in parts])
     if not len(same):
-        return Check("duplicates", "ok", "no photograph is there twice")
+        return ok("no photograph is there twice")
     scene = evidence.scene
     held = set(scene.splits["test"]) | set(scene.splits["val"])
     leak = [pair for pair in same.tolist() if (pair[0] in held) != (pair[1] in held)]
@@ -37,7 +37,7 @@ def duplicates(evidence: Evidence) -> Check:
     message = f"{len(same)} pairs of photographs are all but identical, such as {pairs}"
     if leak:
         message += f"; {len(leak)} of them are in training and held out at once, so scores will be too good"
-    return Check("duplicates", "look", message, "Remove one of each (scene.frames, or from the file).")
+    return look(message, "Remove one of each (scene.frames, or from the file).")
 
 
 def _pairs_alike(
@@ -56,10 +56,10 @@ def blur(evidence: Evidence) -> Check:
     relative = sharpness / sharpness.median().clamp(min=1e-9)
     bad = (relative < BLURRED).nonzero()[:, 0]
     if not len(bad):
-        return Check("sharpness", "ok", f"the softest photograph has {100 * float(relative.min()):.0f} % of the usual")
+        return ok(f"the softest photograph has {100 * float(relative.min()):.0f} % of the usual")
     worst = bad[relative[bad].argsort()].tolist()
     message = f"{len(bad)} of {len(relative)} are blurred: {evidence.named(worst)}"
-    return Check("sharpness", "look", message, "Remove them (scene.frames, or from the file), or photograph again.")
+    return look(message, "Remove them (scene.frames, or from the file), or photograph again.")
 
 
 def exposure(evidence: Evidence) -> Check:
@@ -69,20 +69,20 @@ def exposure(evidence: Evidence) -> Check:
         matches = matches.where(evidence.agrees)
     gains = gains_of(matches, len(evidence.scene.view_names))
     if gains is None:
-        return Check("exposure", "ok", "not judged: too few details could be found again")
+        return ok("not judged: too few details could be found again")
     bright = gains.mean(dim=1).exp()
     tint = (gains - gains[:, 1:2])[:, [0, 2]].abs().amax(dim=1).exp()
     dark, odd = _jumps(bright, EXPOSURE), _jumps(tint, TINT)
     if not dark and not odd:
         spread = float(torch.maximum(bright, 1 / bright).max())
-        return Check("exposure", "ok", f"brightness of the same details differs by {spread:.2f} times at most")
+        return ok(f"brightness of the same details differs by {spread:.2f} times at most")
     words = []
     if dark:
         words.append(f"{evidence.named(dark)} differ in brightness ({float(bright[dark[0]]):.2f} times the usual)")
     if odd:
         words.append(f"{evidence.named(odd)} differ in white balance")
     cure = "Photograph with fixed exposure and white balance; or even them out, or leave these photographs out."
-    return Check("exposure", "look", "; ".join(words), cure)
+    return look("; ".join(words), cure)
 
 
 def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | None:
@@ -108,59 +108,58 @@ def gains_of(matches: Matches, num_views: int) -> Float[Tensor, "views 3"] | Non
 
 def transparency(evidence: Evidence) -> Check:
     """Judge alpha, and whether colours were multiplied by it already."""
-    scene, looks, name = evidence.scene, evidence.looks, "transparency"
+    scene, looks = evidence.scene, evidence.looks
     if not scene.pixels.has_transparency:
-        return Check(name, "ok", "the photographs are opaque")
+        return ok("the photographs are opaque")
     covered = float(looks.covered.mean())
     empty = (looks.covered < 0.003).nonzero()[:, 0].tolist()
     if empty:
         message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
-        return Check(name, "look", message, "See that alpha was exported, or remove these views.")
+        return look(message, "See that alpha was exported, or remove these views.")
     known = looks.premultiplied
     if float(known.min()) > 0.995 and at_evaluation(scene.background) not in ("black", "none"):
         message = "no half-transparent pixel is brighter than its alpha: colours are multiplied by alpha, it seems"
-        return Check(name, "look", message, "Export straight alpha, or edges get dark seams.")
-    return Check(name, "ok", f"{100 * covered:.0f} % of the pixels show the content, the rest is transparent")
+        return look(message, "Export straight alpha, or edges get dark seams.")
+    return ok(f"{100 * covered:.0f} % of the pixels show the content, the rest is transparent")
 
 
 def baked_background(evidence: Evidence) -> Check:
     """Look for a background of one colour that opaque photographs have, or had, baked in."""
-    scene, looks, name = evidence.scene, evidence.looks, "background"
+    scene, looks = evidence.scene, evidence.looks
     if color := scene.protocol.get("cut_out"):
         message = f"plain {color}, which was made transparent (scene.cut_out)"
         if color in COLOURS and at_evaluation(scene.background) != color:
             cure = (
                 f"Outlines keep the colour that they were photographed before: set scene.background={color}_or_random."
             )
-            return Check(name, "look", f"{message}; scene.background is {scene.background}", cure)
-        return Check(name, "ok", message)
+            return look(f"{message}; scene.background is {scene.background}", cure)
+        return ok(message)
     even = looks.border_even > EVEN
     if scene.pixels.has_transparency or float(even.float().mean()) < 0.8:
-        return Check(name, "ok", f"{scene.background}, behind what the photographs show")
+        return ok(f"{scene.background}, behind what the photographs show")
     colour = looks.border[even].median(dim=0).values
     usual = [known for known, level in COLOURS.items() if float((colour - level).abs().max()) < 0.03]
     words = usual[0] if usual else "of the colour " + ", ".join(f"{255 * float(level):.0f}" for level in colour)
     if usual == [scene.background]:
-        return Check(name, "ok", f"the photographs are opaque on {words}, and so is the scene's background")
+        return ok(f"the photographs are opaque on {words}, and so is the scene's background")
     cure = (
         f"Set scene.background={usual[0]}." if usual else "Cut the content out (alpha), or set scene.background=none."
     )
     message = f"the photographs are opaque on a background that is {words}, but scene.background is {scene.background}"
-    closed = scene.space == "bounded" and scene.background != "none"
-    return Check(name, "wrong" if closed else "look", message, cure)
+    return (wrong if scene.space == "bounded" and scene.background != "none" else look)(message, cure)
 
 
 def masks(evidence: Evidence) -> Check:
     """Judge how much the masks keep."""
     if evidence.scene.pixels.mask is None:
-        return Check("masks", "ok", "none")
+        return ok("none")
     kept = evidence.looks.kept
     message = f"{100 * float(kept.mean()):.0f} % of the pixels are kept"
     empty = (kept < 0.02).nonzero()[:, 0].tolist()
     if float(kept.mean()) < 0.1 or float(kept.min()) < 0.02:
         message += f"; next to nothing is left of {evidence.named(empty)}" if empty else ""
-        return Check("masks", "look", message, "White is kept: if the masks mean the opposite, invert them.")
-    return Check("masks", "ok", message)
+        return look(message, "White is kept: if the masks mean the opposite, invert them.")
+    return ok(message)
 
 
 def _jumps(factor: Tensor, limit: float) -> list[int]:
@@ -169,4 +168,11 @@ def _jumps(factor: Tensor, limit: float) -> list[int]:
     return order[off[order] > limit].tolist()
 
 
-CHECKS = (duplicates, blur, exposure, transparency, baked_background, masks)
+CHECKS = {
+    "duplicates": duplicates,
+    "sharpness": blur,
+    "exposure": exposure,
+    "transparency": transparency,
+    "background": baked_background,
+    "masks": masks,
+}

@@ -1,4 +1,4 @@
-"""Which places of different photographs show the same thing, found from the pixels alone, without any pose."""
+"""Which places of different photographs show the same thing, found from the pixels alone, and what that proves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,21 +52,45 @@ class Matches:
         return Matches(view_, plane, focal, rgb, self.views)
 
 
-def find_matches(cameras: Cameras, corners: Mapping[int, Corners], shown: bool) -> Matches:
-    """Return places that are matched between each view and those that look most like it.
+@dataclass(frozen=True)
+class Proof:
+    """Two photographs with details that a person can find in both, and that the cameras contradict."""
+
+    matches: Matches
+    """Details of the two, all of which speak against the cameras."""
+    fits: Cameras | None
+    """All cameras as the details say that they are, where that is known."""
+
+
+def strongest_proof(
+    matches: Matches, against: Bool[Tensor, "matches"], fits: Cameras | None, view: int | None = None
+) -> tuple[Proof, ...]:
+    """Return the pair of photographs with most matches that speak against the cameras; none where none does.
 
     Args:
-        cameras: of all views, at the size of the shrunk pictures.
-        corners: of the views to look at.
-        shown: whether to show a progress bar.
+        matches: all of them.
+        against: those that speak against the cameras.
+        fits: the cameras that they speak for.
+        view: which view must be the first of the two; by default, any.
     """
-    return matched_pairs(cameras, corners, likely_pairs(corners), shown)
+    matches = matches.where(against) if view is None else matches.where(against).with_first(view)
+    if not len(matches.view):
+        return ()
+    _, pair, count = matches.view.unique(dim=0, return_inverse=True, return_counts=True)
+    return (Proof(matches.where(pair == count.argmax()), fits),)
 
 
 def matched_pairs(
     cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], shown: bool = False
 ) -> Matches:
-    """Return places that are matched between the two views of each pair; for the arguments see `find_matches`."""
+    """Return places that are matched between the two views of each pair.
+
+    Args:
+        cameras: of all views, at the size of the shrunk pictures.
+        corners: of the views to look at.
+        pairs: of them, such as `likely_pairs`.
+        shown: whether to show a progress bar.
+    """
 
     def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         both = list(pairs[number])

@@ -1,8 +1,8 @@
 """What training will take."""
 
 from nerf_lightning.compute.machine import free_memory
-from nerf_lightning.data.captures.space import IN_A_BOX, PHOTOGRAPHS, model_for
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, model_for
+from nerf_lightning.doctor.check import Check, Evidence, look, ok
 
 # Bytes that training takes beside the pixels, the program itself included: the most of a process on a CPU, measured.
 BESIDE_PIXELS = {IN_A_BOX: 1.1e9, PHOTOGRAPHS: 1.0e9}
@@ -23,13 +23,15 @@ def memory(evidence: Evidence) -> Check:
     )
     sides = f"{int(pixels.width.max())} x {int(pixels.height.max())}"
     if needed > free:
-        return Check("memory", "look", message, "Set scene.downscale=2 (or 4): a quarter (a sixteenth) of the pixels.")
+        return look(message, "Set scene.downscale=2 (or 4): a quarter (a sixteenth) of the pixels.")
     if count > MANY_PIXELS:
         cure = "On a CPU begin with scene.downscale=2 or 4."
-        return Check("memory", "look", f"{message}; photographs of {sides} need many steps", cure)
+        return look(f"{message}; photographs of {sides} need many steps", cure)
     if int(pixels.width.min()) < SMALL or int(pixels.height.min()) < SMALL:
-        return Check("memory", "look", f"{message}; photographs of {sides} show little", "Use larger photographs.")
-    return Check("memory", "ok", message)
+        return look(f"{message}; photographs of {sides} show little", "Use larger photographs.")
+    return ok(message)
 
 
-CHECKS = (memory,)
+CHECKS = {
+    "memory": memory,
+}

@@ -6,14 +6,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence
-from nerf_lightning.doctor.clear_pairs import clear_pairs
+from nerf_lightning.doctor.check import Check, Evidence, look, ok, wrong
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
-from nerf_lightning.doctor.matches import Matches
-from nerf_lightning.doctor.proofs import Proof, strongest_proof
-from nerf_lightning.doctor.refit import with_pose
-from nerf_lightning.doctor.second_opinion import CONVINCING, BetterPose, better_pose, is_vouched_for
+from nerf_lightning.doctor.matches import Matches, Proof, strongest_proof
+from nerf_lightning.doctor.second_opinion import (
+    CONVINCING,
+    BetterPose,
+    better_pose,
+    clear_pairs,
+    is_vouched_for,
+    with_pose,
+)
 
 FEWEST = 200
 """Matches below which nothing is said of the whole capture."""
@@ -40,63 +44,60 @@ NOT_JUDGED = "not judged: too few details could be found again from one photogra
 
 def axes_convention(evidence: Evidence) -> Check:
     """Judge whether another convention of axes, or the inverse, explains the pixels better."""
-    return _best_reading("axes", evidence, AXES, "the cameras' axes are right, up, back, camera to world")
+    return _best_reading(evidence, AXES, "the cameras' axes are right, up, back, camera to world")
 
 
 def mirrored(evidence: Evidence) -> Check:
     """Judge whether the photographs are mirrored."""
-    return _best_reading("mirrored photographs", evidence, PHOTOGRAPHS, "the photographs are not mirrored")
+    return _best_reading(evidence, PHOTOGRAPHS, "the photographs are not mirrored")
 
 
 def order_of_photographs(evidence: Evidence) -> Check:
     """Judge whether photographs and poses were paired in another order."""
-    return _best_reading("order of photographs", evidence, ORDERS, "each photograph has its own pose")
+    return _best_reading(evidence, ORDERS, "each photograph has its own pose")
 
 
 def poses_and_pixels(evidence: Evidence) -> Check:
     """Judge whether the poses explain what photographs have in common."""
-    name, matches = "poses and pixels", evidence.matches
+    matches = evidence.matches
     share, count = evidence.agreement, len(matches.view)
     if count < FEWEST:
-        return Check(name, "look", NOT_JUDGED, "Look at the poses in doctor.png; larger or sharper photographs help.")
+        return look(NOT_JUDGED, "Look at the poses in doctor.png; larger or sharper photographs help.")
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
     if share >= SOUND:
-        return Check(name, "ok", message)
+        return ok(message)
     return _by_clear_pairs(evidence, message)
 
 
 def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     """Judge all poses by pairs of photographs whose details are no mistakes, since most matches do not agree."""
-    name, pairs = "poses and pixels", clear_pairs(evidence.matches, evidence.scene.cameras)
+    pairs = clear_pairs(evidence.matches, evidence.scene.cameras)
     against = [pair for pair in pairs if pair.contradicts]
     if len(pairs) < FEWEST_CLEAR:
-        return Check(name, "look", f"{message}; too few photographs share enough details to tell", DOUBTFUL)
+        return look(f"{message}; too few photographs share enough details to tell", DOUBTFUL)
     share = len(against) / len(pairs)
     message += f"; {len(against)} of {len(pairs)} pairs whose details fit each other contradict the poses"
     if share <= 1 - MOST_AGAINST:
-        return Check(name, "ok", message)
+        return ok(message)
     cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
     if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
-        return Check(name, "look", message, cure)
-    return Check(name, "wrong", message, cure, (against[0].proof,))
+        return look(message, cure)
+    return wrong(message, cure, (against[0].proof,))
 
 
 def focal_length(evidence: Evidence) -> Check:
     """Judge whether another focal length explains the pixels better."""
-    name, matches, cameras = "focal length", thinned(evidence.matches, ENOUGH), evidence.scene.cameras
-    c2w = cameras.c2w
+    matches, cameras, c2w = thinned(evidence.matches, ENOUGH), evidence.scene.cameras, evidence.scene.cameras.c2w
     shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
     if len(matches.view) < FEWEST or max(shares.values()) < HOPELESS:
-        return Check(name, "ok", NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
+        return ok(NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
     best = max(shares, key=lambda zoom: shares[zoom])
     off = max(best, 1 / best)
     focal = float(cameras.focal.median())
     if off < OFF or shares[best] < shares[1.0] + CLEARER:
-        return Check(name, "ok", f"{focal:.0f} pixels (median) fits the poses and the pixels best")
+        return ok(f"{focal:.0f} pixels (median) fits the poses and the pixels best")
     against = agreeing(evidence.matches, c2w, best) & ~evidence.agrees
-    return Check(
-        name,
-        "wrong" if off >= FAR_OFF else "look",
+    return (wrong if off >= FAR_OFF else look)(
         f"the pixels fit the poses better with {best:g} times the focal length: {100 * shares[best]:.0f} % of matched "
         f"details agree instead of {100 * shares[1.0]:.0f} %",
         f"Set the focal length to about {best * focal:.0f} pixels (it is {focal:.0f}); often it belongs to photographs "
@@ -107,25 +108,25 @@ def focal_length(evidence: Evidence) -> Check:
 
 def single_poses(evidence: Evidence) -> Check:
     """Judge each view's pose by the views that share most with it."""
-    name, matches, c2w = "single poses", evidence.matches, evidence.scene.cameras.c2w
+    matches, c2w = evidence.matches, evidence.scene.cameras.c2w
     if len(matches.view) < FEWEST or evidence.agreement < SOUND:
         reason = "too few details" if len(matches.view) < FEWEST else "the poses as a whole do not fit"
-        return Check(name, "ok", f"not judged: {reason}")
+        return ok(f"not judged: {reason}")
     bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
     found = f"{judged} views could be judged"
     if not bad:
-        return Check(name, "ok", f"{found}, and agree with their neighbours (least {least:.0%})")
+        return ok(f"{found}, and agree with their neighbours (least {least:.0%})")
     others = [view for view in range(len(c2w)) if view not in bad]
     doubted = [view for view in bad if not is_vouched_for(evidence, view, others)]
     if not doubted:
-        return Check(name, "ok", f"{found}; {evidence.named(bad)} agree with the views that stand nearest")
+        return ok(f"{found}; {evidence.named(bad)} agree with the views that stand nearest")
     better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(evidence, view, bad))]
     if not better:
         message = f"few details that {evidence.named(doubted)} share with others lie where the cameras say"
         cure = (
             "No other pose fits better, so it may be details that repeat or shine. See whether they come out blurred."
         )
-        return Check(name, "look", message, cure)
+        return look(message, cure)
     return _wrong_poses(evidence, better, bad)
 
 
@@ -142,9 +143,7 @@ def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[in
         for pose in better
         if fits[pose.view] is None
     ]
-    return Check(
-        "single poses",
-        "wrong",
+    return wrong(
         f"the pose of {evidence.named(views)} contradicts what its photograph shares with others; "
         + "; ".join([*swapped, *turned][:MOST_TOLD]),
         "Give each photograph its own pose (swap them back), or remove these views (scene.frames, or from the file)."
@@ -157,24 +156,16 @@ def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[in
 def _proof_of(evidence: Evidence, pose: BetterPose) -> tuple[Proof, ...]:
     matches, cameras = evidence.matches, evidence.scene.cameras
     c2w = with_pose(cameras.c2w, pose.view, pose.pose)
-    against = (
-        agreeing(matches, c2w) & ~evidence.agrees & torch.isin(matches.view, torch.tensor(pose.neighbors)).any(dim=1)
-    )
-    return strongest_proof(
-        matches, against & (matches.view == pose.view).any(dim=1), replace(cameras, c2w=c2w), pose.view
-    )
+    shared = (matches.view == pose.view).any(dim=1) & torch.isin(matches.view, torch.tensor(pose.neighbors)).any(dim=1)
+    against = agreeing(matches, c2w) & ~evidence.agrees & shared
+    return strongest_proof(matches, against, replace(cameras, c2w=c2w), pose.view)
 
 
 def odd_views(matches: Matches, good: Bool[Tensor, "matches"], num_views: int) -> tuple[list[int], int, float]:
     """Return views that contradict the rest, the worst first; how many could be judged; and the least share of these.
 
     They are found one at a time; the matches of each are left out from then on, so that its neighbours do not suffer
-    for it.
-
-    Args:
-        matches: details that pairs of photographs share.
-        good: the matches that lie where the cameras say.
-        num_views: of the scene.
+    for it. `good` are the matches that lie where the cameras say.
     """
     shares, largest = shares_of_views(matches, good, num_views)
     # From photographs that share little, most matches are mistakes: they accuse nobody.
@@ -224,17 +215,14 @@ def fitting_pose(
     matches: Matches, c2w: Float[Tensor, "views 3 4"], view: int, suspects: list[int], least: float
 ) -> int | None:
     """Return the suspect whose camera fits this view's photograph, if one does: the two were mixed up."""
-    rows = (matches.view == view).any(dim=1)
-    own = matches.where(rows)
+    own = matches.where((matches.view == view).any(dim=1))
     best, best_share = None, least
     for other in suspects:
-        if other == view:
-            continue
-        tried = c2w.clone()
-        tried[view] = c2w[other]
         # A match with the view whose camera is tried says nothing: the centres would coincide.
-        free = ~(own.view == other).any(dim=1)
-        share = float(agreeing(own, tried)[free].float().mean()) if int(free.sum()) >= 20 else 0.0
+        free = own.where(~(own.view == other).any(dim=1))
+        if other == view or len(free.view) < 20:
+            continue
+        share = _share(free, with_pose(c2w, view, c2w[other]))
         if share > best_share:
             best, best_share = other, share
     return best
@@ -244,23 +232,20 @@ def _share(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0)
     return float(agreeing(matches, c2w, zoom).float().mean()) if len(matches.view) else 0.0
 
 
-def _best_reading(name: str, evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
+def _best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
     scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
     if len(matches.view) < FEWEST:
-        return Check(name, "ok", NOT_JUDGED)
+        return ok(NOT_JUDGED)
     given = _share(matches, scene.cameras.c2w)
     shares = [_share(changed, poses) for poses, changed in (reading.change(scene, matches) for reading in readings)]
     best = max(range(len(readings)), key=shares.__getitem__)
     if shares[best] < max(given + BETTER, HOPELESS):
         # Where nothing fits, poses_and_pixels says so.
-        return Check(name, "ok", f"{fine}: no other reading fits the pixels better")
+        return ok(f"{fine}: no other reading fits the pixels better")
     poses, changed = readings[best].change(scene, evidence.matches)
-    same_pictures = changed is evidence.matches
-    fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if same_pictures else None
+    fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None
     against = agreeing(changed, poses) & ~evidence.agrees
-    return Check(
-        name,
-        "wrong",
+    return wrong(
         f"the poses look {readings[best].says}: {100 * shares[best]:.0f} % of matched details then agree, instead of "
         f"{100 * given:.0f} %",
         readings[best].cure,
@@ -268,4 +253,11 @@ def _best_reading(name: str, evidence: Evidence, readings: tuple[Reading, ...], 
     )
 
 
-CHECKS = (axes_convention, mirrored, order_of_photographs, poses_and_pixels, single_poses, focal_length)
+CHECKS = {
+    "axes": axes_convention,
+    "mirrored photographs": mirrored,
+    "order of photographs": order_of_photographs,
+    "poses and pixels": poses_and_pixels,
+    "single poses": single_poses,
+    "focal length": focal_length,
+}

@@ -4,17 +4,18 @@ Details that repeat, stripes around a can and outlines that slide over a smooth 
 right poses, too. They give themselves away: no other pose explains them, or the views that stand nearest agree.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.doctor.check import Evidence
-from nerf_lightning.doctor.epipolar import agreeing
+from nerf_lightning.doctor.epipolar import agreeing, parallax, rays_of
 from nerf_lightning.doctor.features import shrunk_cameras
-from nerf_lightning.doctor.matches import Matches, matched_pairs
-from nerf_lightning.doctor.refit import refitted, with_pose
+from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs
+from nerf_lightning.nerf.types.scene import Cameras
 
 # The other pose must explain so many details that the given one does not, of so many from each of two other views.
 FEWEST, FEWEST_OF_A_PAIR = 24, 8
@@ -25,6 +26,13 @@ CONVINCING, MOST = 0.6, 0.55
 NEAREST, FEWEST_FOR, SPEAKS_FOR = 4, 20, 0.7
 # From where the search begins: the poses of the view and of so many suspects, and of so many views that share most.
 MOST_MIXED, STARTS = 8, 4
+# So many of the largest pairs are looked at, with so many matches each.
+MOST_PAIRS, FEWEST_IN_PAIR = 16, 30
+# The share of a pair's matches that two free cameras explain, from which on they are no mistakes; the share of these
+# that the poses must explain; and radians between most rays, without which any place of the camera would do.
+CLEAR, AGREES, LEAST_PARALLAX = 0.65, 0.5, 0.03
+# Rounds of a fit, and pixels beyond which a match counts less and less, at the first round and at the last.
+ROUNDS, WIDE, NARROW = 20, 16.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -44,13 +52,7 @@ class BetterPose:
 
 
 def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
-    """Tell whether the views that stand nearest, by the given poses, agree with a view.
-
-    Args:
-        evidence: all that was found.
-        view: the one that is contradicted.
-        others: the views that nothing is said against.
-    """
+    """Tell whether the views that stand nearest, of `others` that nothing is said against, agree with a view."""
     c2w = evidence.scene.cameras.c2w
     known = [other for other in others if other != view and other in evidence.corners]
     away = (c2w[known, :, 3] - c2w[view, :, 3]).norm(dim=-1)
@@ -66,10 +68,7 @@ def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
 def better_pose(evidence: Evidence, view: int, suspects: list[int]) -> BetterPose | None:
     """Return the pose that explains what a view shares with others, if one does and the given one does not.
 
-    Args:
-        evidence: all that was found.
-        view: the one that is contradicted.
-        suspects: all views that are contradicted; what they share proves nothing.
+    What the view shares with `suspects`, all views that are contradicted, proves nothing.
     """
     c2w, own = evidence.scene.cameras.c2w, _of_view(evidence.matches, view, suspects)
     partner = own.view[:, 1]
@@ -94,11 +93,9 @@ def _of_view(matches: Matches, view: int, suspects: list[int]) -> Matches:
     """Return a view's matches with its larger partners that are no suspects, the view itself first."""
     matches = matches.with_first(view)
     partner = matches.view[:, 1]
-    allowed = ~torch.isin(partner, torch.tensor(suspects))
-    size = torch.bincount(partner)[partner]
-    return (
-        matches.where(allowed & (size >= 0.5 * size[allowed].max())) if bool(allowed.any()) else matches.where(allowed)
-    )
+    allowed, size = ~torch.isin(partner, torch.tensor(suspects)), torch.bincount(partner)[partner]
+    least = 0.5 * size[allowed].max() if bool(allowed.any()) else 0
+    return matches.where(allowed & (size >= least))
 
 
 def _starts(own: Matches, c2w: Float[Tensor, "views 3 4"], suspects: list[int]) -> Float[Tensor, "starts 3 4"]:
@@ -111,3 +108,102 @@ def _starts(own: Matches, c2w: Float[Tensor, "views 3 4"], suspects: list[int]) 
     # Poses that were mixed up are those of other suspects; the view itself is one.
     mixed = [view, *(suspect for suspect in suspects[:MOST_MIXED] if suspect != view)]
     return torch.cat([c2w[mixed], beside])
+
+
+@dataclass(frozen=True)
+class ClearPair:
+    """Two photographs whose details fit each other."""
+
+    contradicts: bool
+    """The poses do not explain most of what fits."""
+    proof: Proof
+    """What fits, and how the two cameras stand to each other."""
+
+
+def clear_pairs(matches: Matches, cameras: Cameras) -> list[ClearPair]:
+    """Return the clear ones among the largest pairs, the largest first; `cameras` are those that are judged."""
+    _, pair, count = matches.view.unique(dim=0, return_inverse=True, return_counts=True)
+    largest = [
+        number for number in count.argsort(descending=True)[:MOST_PAIRS].tolist() if count[number] >= FEWEST_IN_PAIR
+    ]
+    found = (_judged(matches.where(pair == number), cameras) for number in largest)
+    return [each for each in found if each is not None]
+
+
+def _judged(matches: Matches, cameras: Cameras) -> ClearPair | None:
+    view, other = matches.view[0].tolist()
+    # The other camera where it is; this one turned alike and a step beside it, to any of six sides.
+    there = cameras.c2w[other].double()
+    steps = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    centers = cameras.c2w[:, :, 3]
+    step = (centers - centers.mean(dim=0)).norm(dim=-1).mean().clamp(min=1e-6)
+    eyes = there[:, 3] + steps @ there[:, :3].T * float(step)
+    starts = torch.cat([there[:, :3].expand(6, 3, 3), eyes[:, :, None]], dim=-1)
+    poses = refitted(matches, cameras.c2w, starts.to(cameras.c2w))
+    tried = [replace(cameras, c2w=with_pose(cameras.c2w, view, pose)) for pose in poses]
+    explained = torch.stack([agreeing(matches, each.c2w) for each in tried])
+    best = int(explained.sum(dim=1).argmax())
+    fits = explained[best]
+    if float(fits.float().mean()) < CLEAR:
+        return None
+    fitting = matches.where(fits)
+    if float(parallax(fitting, tried[best].c2w).median()) < LEAST_PARALLAX:
+        return None
+    agrees = agreeing(fitting, cameras.c2w)
+    against = fitting.where(~agrees) if bool((~agrees).any()) else fitting
+    return ClearPair(float(agrees.float().mean()) < AGREES, Proof(against, tried[best]))
+
+
+def refitted(
+    own: Matches, c2w: Float[Tensor, "views 3 4"], starts: Float[Tensor, "starts 3 4"]
+) -> Float[Tensor, "starts 3 4"]:
+    """Return each start after Gauss-Newton steps on how far matches lie from the planes of their partners' rays.
+
+    Large distances count less and less (Cauchy's weights, ever narrower), since a part of the matches is mistaken.
+
+    Args:
+        own: matches of one view, that view first in each.
+        c2w: the poses, of which those of the other views are taken for right.
+        starts: poses of the view to begin with.
+    """
+    rays, _ = rays_of(own, c2w)
+    there, focal = rays[:, 1], own.focal[:, 0].double()
+    eyes = c2w[own.view[:, 1], :, 3].double()
+    local = torch.cat([own.plane[:, 0] * own.plane.new_tensor([1.0, -1.0]), -torch.ones(len(eyes), 1)], dim=-1).double()
+    local = functional.normalize(local, dim=-1)
+    rotation, center = starts[:, :, :3].double(), starts[:, :, 3].double()
+    unit = float((center - eyes.mean(dim=0)).norm(dim=-1).mean().clamp(min=1e-9))
+
+    def off(step: Float[Tensor, "*tried starts 6"]) -> Float[Tensor, "*tried starts matches"]:
+        turned = (torch.eye(3) + _cross(step[..., :3])) @ rotation
+        between = eyes - (center + unit * step[..., 3:])[..., None, :]
+        normal = functional.normalize(torch.linalg.cross(between, there.expand_as(between)), dim=-1)
+        return focal * (normal * (local @ turned.mT)).sum(dim=-1)
+
+    tiny = 1e-5
+    tried = torch.cat([torch.zeros(1, 6), tiny * torch.eye(6)]).double()[:, None].expand(7, len(starts), 6)
+    for number in range(ROUNDS):
+        width = WIDE * (NARROW / WIDE) ** (number / (ROUNDS - 1))
+        here, *beside = off(tried)
+        slopes = (torch.stack(beside, dim=-1) - here[..., None]) / tiny
+        weighted = slopes / (1 + (here / width).square())[..., None]
+        system = weighted.mT @ slopes
+        system = system + (1e-3 * system.diagonal(dim1=1, dim2=2).mean(dim=1) + 1e-9)[:, None, None] * torch.eye(6)
+        step = -torch.linalg.solve(system, (weighted.mT @ here[..., None])[..., 0])
+        step = step * (0.3 / step.norm(dim=1, keepdim=True).clamp(min=0.3))
+        rotation = torch.matrix_exp(_cross(step[:, :3])) @ rotation
+        center = center + unit * step[:, 3:]
+    return torch.cat([rotation, center[:, :, None]], dim=-1).to(starts)
+
+
+def _cross(turn: Float[Tensor, "*starts 3"]) -> Float[Tensor, "*starts 3 3"]:
+    x, y, z = turn.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def with_pose(c2w: Float[Tensor, "views 3 4"], view: int, pose: Float[Tensor, "3 4"]) -> Float[Tensor, "views 3 4"]:
+    """Return the poses with one of them changed."""
+    changed = c2w.clone()
+    changed[view] = pose
+    return changed

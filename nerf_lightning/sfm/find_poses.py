@@ -11,10 +11,9 @@ from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.sfm.image_pairs import chosen_matching
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.sfm.reconstruction import NothingFoundError, SparseModel, reconstruct
-from nerf_lightning.sfm.settings import SfmSettings, stage_costs
+from nerf_lightning.sfm.settings import SfmSettings, chosen_matching, stage_costs
 from nerf_lightning.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 
 READING, FRAMES = "reading photographs", "choosing frames"
@@ -110,7 +109,13 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
         images = make_folder(work, "images")
         with StageProgress({FRAMES: FRAME_COST * num_frames}) as report:
             write_sharp_frames(video, images, stride, lambda count: report(FRAMES, count / num_frames))
-        photographs = _frames(video, images, stride, num_frames)
+        try:
+            photographs = find_photographs(images)
+        except InputError as error:
+            raise InputError(
+                f"video={video}: one of every {stride} of its {num_frames} frames is not enough, or they are tiny. "
+                "Give a longer or larger video, or a smaller every=."
+            ) from error
         try:
             with StageProgress(stage_costs(photographs, settings)) as report:
                 model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
@@ -133,16 +138,6 @@ def _nothing_in_video(video: Path, frames: list[FoundPhotograph]) -> str:
         f"video={video}: no camera could be placed for the {len(frames)} frames that were chosen; {cause}. {cure}, "
         "with one zoom. A smaller every= takes more frames of this video, num_features=8192 finds more details in them."
     )
-
-
-def _frames(video: Path, images: Path, stride: int, num_frames: int) -> list[FoundPhotograph]:
-    try:
-        return find_photographs(images)
-    except InputError as error:
-        raise InputError(
-            f"video={video}: one of every {stride} of its {num_frames} frames is not enough, or they are tiny. Give a "
-            "longer or larger video, or a smaller every=."
-        ) from error
 
 
 def _publish(work: Path, folder: Path) -> None:

@@ -3,7 +3,6 @@
 import logging
 import os
 import shutil
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,13 +66,12 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             that cannot be read or is tiny.
     """
     try:
-        files = visible_files(folder)
+        files, pictures = files_in(folder)
     except OSError as error:
         raise InputError(
             f"images={folder} is not a folder that can be read ({error.strerror or error}). "
             "Give the folder in which the photographs lie."
         ) from error
-    pictures = pictures_among(files)
     odd = [path.name for path in pictures if not is_plain(path.name)]
     if odd:
         log.warning(
@@ -82,7 +80,11 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             *(len(odd), len(pictures), listed(odd, 5)),
         )
         pictures = [path for path in pictures if is_plain(path.name)]
-    _require_no_heic(folder, pictures, files)
+    # A HEIC beside its JPEG of the same name is the original of it.
+    known = {path.stem.lower() for path in pictures}
+    heic = [path.name for path in files if path.suffix.lower() in HEIC_SUFFIXES and path.stem.lower() not in known]
+    if heic:
+        raise InputError(f"images={folder} holds {listed(heic, 4)}. {HEIC_CURE}")
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
     require_within("views", len(pictures), f"images={folder}", "photographs")
@@ -93,18 +95,21 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
             "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
         )
     photographs = [_photograph(path) for path in pictures]
-    _require_no_panoramas(folder, photographs)
+    around = [photograph.path.name for photograph in photographs if photograph.is_panorama]
+    if around:
+        mixed = " among other photographs" if len(around) < len(photographs) else ""
+        raise InputError(
+            f"images={folder} holds panoramas of all directions{mixed} ({listed(around, 4)}), and cameras are found of "
+            "plain photographs only. Move them away, or find their cameras with a program for panoramas that writes a "
+            "transforms.json with camera_model EQUIRECTANGULAR, which scene=transforms reads."
+        )
     return photographs
 
 
-def visible_files(folder: Path) -> list[Path]:
-    """Return the files that lie in a folder, sorted by name."""
-    return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
-
-
-def pictures_among(files: list[Path]) -> list[Path]:
-    """Return those whose names say that they are photographs."""
-    return [path for path in files if path.suffix.lower() in SUFFIXES]
+def files_in(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files that lie in a folder, sorted by name, and those that are photographs by their names."""
+    files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
+    return files, [path for path in files if path.suffix.lower() in SUFFIXES]
 
 
 def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
@@ -133,21 +138,6 @@ def check_pixels(photograph: FoundPhotograph) -> None:
         read_rgba(photograph.path)
 
 
-def check_one_camera(photographs: list[FoundPhotograph]) -> None:
-    """Refuse to describe photographs of different sizes by one camera.
-
-    Raises:
-        InputError: the sizes differ.
-    """
-    sizes = Counter((p.width, p.height) for p in photographs).most_common()
-    if len(sizes) > 1:
-        shown = listed((f"{count} of {width} x {height}" for (width, height), count in sizes), cap=4)
-        raise InputError(
-            f"camera_mode=single, but the photographs have several sizes ({shown} pixels). Give camera_mode=auto (one "
-            "camera per size and zoom) or per_image, or leave out the odd ones."
-        )
-
-
 def _photograph(path: Path) -> FoundPhotograph:
     width, height = image_size(path)
     if min(width, height) < SMALLEST_SIDE:
@@ -159,25 +149,6 @@ def _photograph(path: Path) -> FoundPhotograph:
     # Orientations 5 to 8 are quarter turns.
     size = (height, width) if turned in (5, 6, 7, 8) else (width, height)
     return FoundPhotograph(path, *size, turned == 1, is_panorama, lens)
-
-
-def _require_no_heic(folder: Path, pictures: list[Path], files: list[Path]) -> None:
-    # Beside its JPEG of the same name it is the original of it.
-    known = {path.stem.lower() for path in pictures}
-    left = [path.name for path in files if path.suffix.lower() in HEIC_SUFFIXES and path.stem.lower() not in known]
-    if left:
-        raise InputError(f"images={folder} holds {listed(left, 4)}. {HEIC_CURE}")
-
-
-def _require_no_panoramas(folder: Path, photographs: list[FoundPhotograph]) -> None:
-    found = [photograph.path.name for photograph in photographs if photograph.is_panorama]
-    if found:
-        mixed = " among other photographs" if len(found) < len(photographs) else ""
-        raise InputError(
-            f"images={folder} holds panoramas of all directions{mixed} ({listed(found, 4)}), and cameras are found of "
-            "plain photographs only. Move them away, or find their cameras with a program for panoramas that writes a "
-            "transforms.json with camera_model EQUIRECTANGULAR, which scene=transforms reads."
-        )
 
 
 def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...]]:

@@ -11,12 +11,12 @@ from nerf_lightning.compute import ranks
 from nerf_lightning.data.pixels.decoding import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.find_poses import from_photographs, from_video
-from nerf_lightning.sfm.photograph_folder import pictures_among, visible_files
+from nerf_lightning.sfm.photograph_folder import files_in
 from nerf_lightning.sfm.reconstruction import require_pycolmap
 from nerf_lightning.sfm.settings import SfmSettings
 from nerf_lightning.sfm.summary import remarks
@@ -80,17 +80,13 @@ class PhotosReader(AutoReader):
             return Path(self.video).expanduser()
         folder = self.folder()
         within = folder / "images"
-        return within if within.is_dir() and not _pictures(folder) else folder
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return pictures_among(visible_files(folder))
+        return within if within.is_dir() and not files_in(folder)[1] else folder
 
 
 def _key(source: Path, settings: SfmSettings) -> str:
     """Return what found cameras are kept under: the photographs' names, sizes and times of change, and the settings."""
     try:
-        files = _pictures(source) if source.is_dir() else [source]
+        files = files_in(source)[1] if source.is_dir() else [source]
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror}. Check scene.root or scene.video.") from error
     content = [[identity_of(path) for path in files], asdict(settings)]

@@ -16,9 +16,8 @@ from typing import Any
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.sfm.image_pairs import image_pairs, tiles_of
-from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_one_camera
-from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings
+from nerf_lightning.sfm.photograph_folder import FoundPhotograph
+from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings, image_pairs, tiles_of
 
 Report = Callable[[str, float], None]
 
@@ -97,7 +96,12 @@ def reconstruct(
         _match(colmap, database, names, work / "pairs.txt", settings, report)
         models = _models(colmap, database, folder, work / "models", settings, report)
         if not models:
-            raise NothingFoundError(_nothing_found(len(names)))
+            raise NothingFoundError(
+                f"No camera could be placed: the {len(names)} pictures share too few details. Take more photographs "
+                "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
+                "zoom and without mirrors or bare walls filling the picture; then try again. More features may help: "
+                "num_features=8192."
+            )
         models[0].write_binary(make_folder(sparse))
     return _in_short(models, names)
 
@@ -141,7 +145,13 @@ def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tupl
     if mode == "per_image":
         return [], [p.path.name for p in photographs]
     if mode == "single":
-        check_one_camera(photographs)
+        sizes = Counter((p.width, p.height) for p in photographs).most_common()
+        if len(sizes) > 1:
+            shown = listed((f"{count} of {width} x {height}" for (width, height), count in sizes), cap=4)
+            raise InputError(
+                f"camera_mode=single, but the photographs have several sizes ({shown} pixels). Give camera_mode=auto "
+                "(one camera per size and zoom) or per_image, or leave out the odd ones."
+            )
         return [[p.path.name for p in photographs]], []
     sharing = Counter(p.camera for p in photographs)
     groups = [[p.path.name for p in photographs if p.camera == camera] for camera, n in sharing.items() if n > 1]
@@ -246,11 +256,3 @@ def _models(
         database, folder, models, options, initial_image_pair_callback=advance, next_image_callback=advance
     )
     return sorted(found.values(), key=lambda model: model.num_reg_images(), reverse=True)
-
-
-def _nothing_found(count: int) -> str:
-    return (
-        f"No camera could be placed: the {count} pictures share too few details. Take more photographs that "
-        "overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one zoom and "
-        "without mirrors or bare walls filling the picture; then try again. More features may help: num_features=8192."
-    )

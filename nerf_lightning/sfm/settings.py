@@ -1,17 +1,22 @@
-"""Settings of structure from motion, and what its stages cost."""
+"""Settings of structure from motion, which photographs are compared with each other, and what its stages cost."""
 
 from dataclasses import dataclass
+from itertools import combinations, groupby
 from typing import Literal
 
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.messages.errors import require_positive
-from nerf_lightning.sfm.image_pairs import Matching, image_pairs
 from nerf_lightning.sfm.photograph_folder import FoundPhotograph
 
+Matching = Literal["exhaustive", "sequential", "auto"]
 CameraMode = Literal["single", "per_image", "auto"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 FEATURES, MATCHING, MAPPING = "finding features", "comparing photographs", "placing cameras"
+MOST_EXHAUSTIVE = 80
+NEIGHBOURS = 10
+LANDMARKS = 40
+TILE = 12
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,41 @@ class SfmSettings:
     def threads(self) -> int:
         """Return the number of threads to use."""
         return self.num_threads or num_cores()
+
+
+def chosen_matching(matching: Matching, count: int) -> Matching:
+    """Return how `count` photographs are compared: `auto` means all pairs while these are few (3160 for 80)."""
+    if matching != "auto":
+        return matching
+    return "exhaustive" if count <= MOST_EXHAUSTIVE else "sequential"
+
+
+def image_pairs(matching: Matching, count: int) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of photographs 0 to count - 1 in the order in which they were taken.
+
+    Sequential: the ten that follow, those at a distance of a power of two, and all pairs among some forty spread over
+    the whole, so that a path that comes back to where it was is closed. The number grows with count log count.
+
+    >>> image_pairs("exhaustive", 3)
+    [(0, 1), (0, 2), (1, 2)]
+    >>> (0, 10) in image_pairs("sequential", 100), (0, 11) in image_pairs("sequential", 100)
+    (True, False)
+    """
+    if chosen_matching(matching, count) == "exhaustive":
+        return list(combinations(range(count), 2))
+    steps = {*range(1, NEIGHBOURS + 1), *(2**power for power in range(count.bit_length()))}
+    near = {(i, i + step) for i in range(count) for step in steps if i + step < count}
+    landmarks = range(0, count, -(-count // LANDMARKS))
+    return sorted(near | set(combinations(landmarks, 2)))
+
+
+def tiles_of(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
+    """Return the pairs in groups among few photographs: comparing a group loads and indexes each of these once."""
+
+    def tile(pair: tuple[int, int]) -> tuple[int, int]:
+        return pair[0] // TILE, pair[1] // TILE
+
+    return [list(group) for _, group in groupby(sorted(pairs, key=tile), key=tile)]
 
 
 def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings) -> dict[str, float]:

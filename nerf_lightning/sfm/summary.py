@@ -44,17 +44,12 @@ def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
             "capture of their own; if not, photographs between the two are missing."
         )
     if len(model.registered) < ENOUGH * (len(model.registered) + len(model.left_out)):
-        lines.append(_advice(matching, is_video))
+        more = (
+            "film slowly, walking rather than turning; a smaller every= takes more frames of this video."
+            if is_video
+            else "take more photographs between those left out and the others (overlapping by two thirds), sharp ones, "
+            "with one zoom and from places some steps apart."
+        )
+        pairs = " matching=exhaustive compares every photograph with every other." if matching == "sequential" else ""
+        lines.append(f"few were registered: {more}{pairs} num_features=8192 finds more details.")
     return lines
-
-
-def _advice(matching: str, is_video: bool) -> str:
-    words = ["few were registered:"]
-    if is_video:
-        words.append("film slowly, walking rather than turning; a smaller every= takes more frames of this video.")
-    else:
-        words.append("take more photographs between those left out and the others (overlapping by two thirds),")
-        words.append("sharp ones, with one zoom and from places some steps apart.")
-    if matching == "sequential":
-        words.append("matching=exhaustive compares every photograph with every other.")
-    return " ".join([*words, "num_features=8192 finds more details."])

@@ -93,24 +93,24 @@ def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[in
     Raises:
         InputError: not a video, or one without frames.
     """
-    written, group = 0, list[tuple[float, int, np.ndarray]]()
+    written, sharpest = 0, -1.0
     for index, frame in enumerate(_frames(video)):
         # Only the best so far is kept: a group of large frames would be gigabytes.
-        group = [max([*group, (sharpness(frame), -index, frame)], key=lambda entry: entry[:2])]
+        if (here := sharpness(frame)) > sharpest:
+            sharpest, best, number = here, frame, index
         seen(index + 1)
         if (index + 1) % every == 0:
-            written += _write(folder, group)
-            group = []
-    written += _write(folder, group)
+            written, sharpest = written + _write(folder, best, number), -1.0
+    if sharpest >= 0:
+        written += _write(folder, best, number)
     if not written:
         raise InputError(_not_a_video(video))
     return written
 
 
-def _write(folder: Path, group: list[tuple[float, int, np.ndarray]]) -> int:
-    for _, index, frame in group:
-        Image.fromarray(frame).save(folder / f"frame_{-index:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
-    return len(group)
+def _write(folder: Path, frame: UInt8[np.ndarray, "height width 3"], number: int) -> int:
+    Image.fromarray(frame).save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+    return 1
 
 
 def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
@@ -127,16 +127,11 @@ def _not_a_video(path: Path) -> str:
     )
 
 
-STARTS = {
-    "Matroska, WebM": b"\x1a\x45\xdf\xa3",
-    "MPEG program stream": b"\x00\x00\x01\xba",
-    "MPEG video": b"\x00\x00\x01\xb3",
-    "Flash": b"FLV\x01",
-    "Ogg": b"OggS",
-    "Windows Media": b"\x30\x26\xb2\x75\x8e\x66\xcf\x11",
-    "GIF 87": b"GIF87a",
-    "GIF 89": b"GIF89a",
-}
+# Matroska and WebM, MPEG program stream and video, Flash, Ogg, Windows Media, GIF.
+STARTS = (
+    *(b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba", b"\x00\x00\x01\xb3", b"FLV\x01", b"OggS"),
+    *(b"\x30\x26\xb2\x75\x8e\x66\xcf\x11", b"GIF87a", b"GIF89a"),
+)
 BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
 """What an mp4 or QuickTime file begins with, after four bytes of length."""
 PACKETS = ((0, 188), (4, 192))
@@ -153,7 +148,7 @@ def require_video(path: Path) -> None:
     # However large: a few frames of it are in memory at a time.
     with explained(path), open_regular(path, None) as file:
         start = file.read(600)
-    known = start.startswith(tuple(STARTS.values())) or start[4:8] in BOXES
+    known = start.startswith(STARTS) or start[4:8] in BOXES
     riff = start[:4] == b"RIFF" and start[8:12] == b"AVI "
     stream = any(start[first::length][:3] == bytes([SYNC]) * 3 for first, length in PACKETS)
     if not (known or riff or stream):

@@ -15,7 +15,7 @@ from nerf_lightning.config.compose import chosen, compose_config
 from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.data.pixels.hashes import photograph_hashes
+from nerf_lightning.data.pixels.decoding import photograph_hashes
 from nerf_lightning.files.budgets import Budgets, allow
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.base import Loss

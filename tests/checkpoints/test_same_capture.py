@@ -8,8 +8,8 @@ from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import make_record
 from nerf_lightning.checkpoints.same_capture import changes, require_same_capture
-from nerf_lightning.data.pixels import hashes
-from nerf_lightning.data.pixels.hashes import photograph_hashes
+from nerf_lightning.data.pixels import decoding as hashes
+from nerf_lightning.data.pixels.decoding import photograph_hashes
 from nerf_lightning.nerf.geometry.frames import poses_from_user
 
 SCENE = ball_scene()

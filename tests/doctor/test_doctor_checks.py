@@ -6,12 +6,12 @@ from support.captures import real_capture
 from support.doctor_scene import VIEWS, but_poses, corner_evidence, corner_scene, with_pictures, with_poses, with_scene
 from support.scenes import ball_scene
 
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.doctor import check
 from nerf_lightning.doctor.examine import examine, gather_evidence
-from nerf_lightning.doctor.view_statistics import sharpness_of
+from nerf_lightning.doctor.features import sharpness_of
 
 
 def judged(evidence, name, verdict, *fragments):
@@ -27,43 +27,33 @@ def smeared(picture, radius=4):
     picture[..., :3] = soft.permute(1, 2, 0).to(torch.uint8)
 
 
-def test_a_blurred_photograph_is_named():
-    def blur(rgba):
-        smeared(rgba[7])
-        return rgba
-
-    judged(with_pictures(blur), "sharpness", "look", "view 7.png", "1 of 12")
-
-
 def test_sharpness_does_not_depend_on_contrast():
     pixels = corner_scene().pixels
     flat = replace(pixels, rgba=torch.cat([pixels.rgba[:, :3] // 2 + 50, pixels.rgba[:, 3:]], dim=1))
     assert float(sharpness_of(flat, 0)) == pytest.approx(float(sharpness_of(pixels, 0)), rel=0.1)
 
 
-def test_a_dark_photograph_is_named():
-    def darken(rgba):
-        rgba[4, ..., :3] = (rgba[4, ..., :3].float() * 0.55).to(torch.uint8)
+def scaled(picture, *factors):
+    picture[..., :3] = (picture[..., :3].float() * torch.tensor(factors)).to(torch.uint8)
+
+
+PICTURES = {
+    "blurred": (lambda rgba: smeared(rgba[7]), "sharpness", "view 7.png", "1 of 12"),
+    "dark": (lambda rgba: scaled(rgba[4], 0.55, 0.55, 0.55), "exposure", "view 4.png differ in brightness (0.5"),
+    "tinted": (lambda rgba: scaled(rgba[4], 0.7, 1.0, 1.0), "exposure", "view 4.png differ in white balance"),
+    "copied": (lambda rgba: rgba[1].copy_(rgba[0]), "duplicates", "view 0.png and view 1.png", "scores will be too"),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_an_odd_photograph_is_named(name):
+    change, check, *fragments = PICTURES[name]
+
+    def changed(rgba):
+        change(rgba)
         return rgba
 
-    check = judged(with_pictures(darken), "exposure", "look", "view 4.png differ in brightness")
-    assert float(check.message.split("(")[1].split()[0]) == pytest.approx(0.55, abs=0.04)
-
-
-def test_another_white_balance_is_named():
-    def tint(rgba):
-        rgba[4, ..., 0] = (rgba[4, ..., 0].float() * 0.7).to(torch.uint8)
-        return rgba
-
-    judged(with_pictures(tint), "exposure", "look", "view 4.png differ in white balance")
-
-
-def test_a_duplicate_is_named_and_its_leak_into_the_held_out_views():
-    def copy(rgba):
-        rgba[1] = rgba[0]
-        return rgba
-
-    judged(with_pictures(copy), "duplicates", "look", "view 0.png and view 1.png", "scores will be too good")
+    judged(with_pictures(changed), check, "look", *fragments)
 
 
 def test_views_are_compared_a_few_at_a_time(monkeypatch):
@@ -87,10 +77,6 @@ def test_a_near_plane_behind_the_content_is_wrong_and_the_cure_fits():
     judged(with_scene(near=torch.full((VIEWS,), near)), "near and far", "ok")
 
 
-def test_a_far_plane_before_the_content_is_wrong():
-    judged(with_scene(far=torch.full((VIEWS,), 0.9)), "near and far", "wrong", "behind far")
-
-
 def test_near_and_far_in_inches_are_named():
     scene = corner_scene()
     found = but_poses(corner_evidence())["near and far"].message
@@ -100,17 +86,17 @@ def test_near_and_far_in_inches_are_named():
     assert scene.near[0] < low
 
 
-def test_photographs_without_a_pose_are_reported():
-    judged(with_scene(left_out=("a.jpg", "b.jpg")), "photographs without pose", "look", "2 of 14", "a.jpg, b.jpg")
-
-
-def test_views_in_both_splits_are_wrong():
-    splits = {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}
-    judged(with_scene(splits=splits), "split", "wrong", "view 2.png")
-
-
-def test_too_few_views_are_wrong():
-    judged(with_scene(splits={"train": (1, 2), "val": (0,), "test": (0,)}), "number of views", "wrong", "2 to learn")
+@pytest.mark.parametrize(
+    ("changes", "name", "verdict", "fragments"),
+    [
+        ({"far": torch.full((VIEWS,), 0.9)}, "near and far", "wrong", ("behind far",)),
+        ({"left_out": ("a.jpg", "b.jpg")}, "photographs without pose", "look", ("2 of 14", "a.jpg, b.jpg")),
+        ({"splits": {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}}, "split", "wrong", ("view 2.png",)),
+        ({"splits": {"train": (1, 2), "val": (0,), "test": (0,)}}, "number of views", "wrong", ("2 to learn",)),
+    ],
+)
+def test_what_the_scene_says_of_itself(changes, name, verdict, fragments):
+    judged(with_scene(**changes), name, verdict, *fragments)
 
 
 def test_a_background_that_is_baked_in_is_named():

@@ -12,22 +12,10 @@ from nerf_lightning.doctor.examine import gather_evidence
 from nerf_lightning.doctor.matches import Matches
 from nerf_lightning.nerf.geometry.cameras import project
 
-POSES = ("axes", "mirrored photographs", "order of photographs", "poses and pixels", "single poses", "focal length")
-
 
 def judged(name, evidence):
     """What the check of this name says: one of them takes longer than all others."""
-    by_name = {
-        "axes": poses.axes_convention,
-        "focal length": poses.focal_length,
-        "mirrored photographs": poses.mirrored,
-        "order of photographs": poses.order_of_photographs,
-        "poses and pixels": poses.poses_and_pixels,
-        "single poses": poses.single_poses,
-    }
-    check = by_name[name](evidence)
-    assert check.name == name
-    return check
+    return poses.CHECKS[name](evidence)
 
 
 def c2w():
@@ -49,7 +37,7 @@ def swapped(first, second):
 def test_a_sound_capture_has_nothing_wrong():
     checks = outcome(corner_evidence())
     assert {check.name: check.message for check in checks.values() if check.verdict == "wrong"} == {}
-    assert all(checks[name].verdict == "ok" and not checks[name].cure for name in POSES)
+    assert all(checks[name].verdict == "ok" and not checks[name].cure for name in poses.CHECKS)
     assert corner_evidence().agreement > 0.7
 
 

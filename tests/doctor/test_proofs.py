@@ -10,8 +10,8 @@ from support.planted_poses import rotation_about
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
 from nerf_lightning.doctor.features import Corners
+from nerf_lightning.doctor.picture import MOST_DETAILS, proof_picture, spread_out
 from nerf_lightning.doctor.poses import axes_convention, poses_and_pixels, single_poses
-from nerf_lightning.doctor.proof_picture import MOST_DETAILS, proof_picture, spread_out
 from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 
 VIEW = 5

@@ -8,9 +8,8 @@ import pytest
 import torch
 from support.captures import real_capture
 
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
-from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.nerf.geometry.cameras import project, rays_through_pixels
 from nerf_lightning.nerf.types.rays import PixelIndex
 
@@ -109,61 +108,3 @@ def test_the_rows_of_cups_poses_bounds_belong_to_names_sorted_as_text(cache):
     # In numeric order they would belong to others.
     numeric = sorted(range(len(llff.view_names)), key=lambda view: int(llff.view_names[view].split(".")[0]))
     assert float((centers[0][numeric] - centers[1]).norm(dim=-1).median()) > 0.1
-
-
-def test_fault_a_flipped_axis_is_found_by_this_measure(cache):
-    root = real_capture("cup_colmap")
-    scene = read(ColmapReader, root, cache)
-    matches = dict(list(cup_matches(root).items())[:10])
-    c2w = scene.cameras.c2w.clone()
-    c2w[:, :, 1:3] *= -1.0  # OpenCV's axes
-    assert median_over_pairs(replace(scene, cameras=replace(scene.cameras, c2w=c2w)), matches) > 20.0
-
-
-def found_matches(folder, names, pairs, tmp_path):
-    """Match photographs with COLMAP's features, verified by a geometry of its own and not by the poses."""
-    colmap = pytest.importorskip("pycolmap")
-    features, matching, pairing = (
-        colmap.FeatureExtractionOptions(),
-        colmap.FeatureMatchingOptions(),
-        colmap.ImportedPairingOptions(),
-    )
-    features.use_gpu = matching.use_gpu = False
-    features.num_threads = matching.num_threads = 1
-    features.sift.max_num_features = 2000
-    database, pair_list = tmp_path / "matches.db", tmp_path / "pairs.txt"
-    pair_list.write_text("".join(f"{a} {b}\n" for a, b in pairs))
-    pairing.match_list_path = str(pair_list)
-    before = colmap.logging.minloglevel
-    colmap.logging.minloglevel = int(colmap.logging.FATAL)
-    try:
-        colmap.extract_features(database, folder, names, extraction_options=features, device=colmap.Device.cpu)
-        colmap.match_image_pairs(database, matching, pairing, device=colmap.Device.cpu)
-    finally:
-        colmap.logging.minloglevel = before
-    with colmap.Database.open(database) as content:
-        number = {image.name: image.image_id for image in content.read_all_images()}
-        points = {name: np.asarray(content.read_keypoints(number[name]))[:, :2].astype(np.float64) for name in names}
-        matches = {}
-        for a, b in pairs:
-            rows = np.asarray(content.read_two_view_geometry(number[a], number[b]).inlier_matches)
-            matches[a, b] = points[a][rows[:, 0]], points[b][rows[:, 1]]
-    return matches
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "reader", "folder", "step"),
-    [
-        ("fern", LlffReader, "images_8", 4),
-        pytest.param("fox", TransformsReader, "images", 16, marks=pytest.mark.exhaustive),
-    ],
-)
-def test_matched_features_of_neighbours(cache, tmp_path, name, reader, folder, step):
-    root = real_capture(name)
-    files = sorted(path.name for path in (root / folder).iterdir())
-    pairs = [(files[i], files[i + 1]) for i in range(0, len(files) - 1, step)]
-    matches = found_matches(root / folder, sorted({n for pair in pairs for n in pair}), pairs, tmp_path)
-    scene = read(reader, root, cache)
-    names = {n.split("/")[-1]: n for n in scene.view_names}
-    assert median_over_pairs(scene, {(names[a], names[b]): m for (a, b), m in matches.items()}) < LARGEST_MEDIAN

@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.photograph_folder import check_one_camera, find_photographs, put_upright
+from nerf_lightning.sfm.photograph_folder import find_photographs, put_upright
+from nerf_lightning.sfm.reconstruction import _camera_groups
 
 MODEL, FOCAL_LENGTH, ORIENTATION, EXIF = 0x0110, 0x920A, 0x0112, 0x8769
 
@@ -40,7 +41,7 @@ def test_cameras_are_told_apart_by_size_and_focal_length(tmp_path):
     assert cameras[3] == cameras[4]
     assert len(set(cameras)) == 4
     with pytest.raises(InputError, match=r"camera_mode=single.*5 of 96 x 64, 1 of 104 x 64.*camera_mode=auto"):
-        check_one_camera(find_photographs(tmp_path))
+        _camera_groups(find_photographs(tmp_path), "single")
 
 
 @pytest.mark.parametrize("orientation", range(2, 9))

@@ -1,5 +1,6 @@
 """A sound capture of the noisy corner as a scene, and what its checks say."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
 
@@ -70,11 +71,11 @@ def with_pictures(change) -> Evidence:
     return gather_evidence(replace(scene, pixels=pixels))
 
 
-def outcome(evidence: Evidence, checks=CHECKS) -> dict[str, Check]:
+def outcome(evidence: Evidence, but: Collection[str] = ()) -> dict[str, Check]:
     """Every check by its name."""
-    return {check.name: check for check in (fn(evidence) for fn in checks)}
+    return {name: replace(check(evidence), name=name) for name, check in CHECKS.items() if name not in but}
 
 
 def but_poses(evidence: Evidence) -> dict[str, Check]:
     """All but those that try many readings of the poses, which take longer."""
-    return outcome(evidence, [fn for fn in CHECKS if fn not in poses.CHECKS])
+    return outcome(evidence, poses.CHECKS)

@@ -20,22 +20,6 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 }
 
 
-class Cases:
-    """The malformed captures of one test file."""
-
-    def __init__(self) -> None:
-        self.params: list[Any] = []
-
-    def __call__(self, kind: str, message: str, **settings: object) -> Callable:
-        """Register a way to break a good capture of some kind, and the key words of its message."""
-
-        def register(damage: Callable[[Path], None]) -> Callable[[Path], None]:
-            self.params.append(pytest.param(kind, damage, message, settings, id=f"{kind}-{damage.__name__}"))
-            return damage
-
-        return register
-
-
 def refused(kind: str, root: Path, message: str, **settings: object) -> None:
     """Read, and expect one paragraph and no other exception."""
     with pytest.raises(InputError, match=message) as caught:
@@ -43,15 +27,6 @@ def refused(kind: str, root: Path, message: str, **settings: object) -> None:
     text = str(caught.value)
     assert "\n" not in text
     assert text.endswith((".", ")")), text
-
-
-def refused_when_damaged(
-    tmp_path: Path, kind: str, damage: Callable[[Path], None], message: str, settings: dict
-) -> None:
-    """Write a good capture, break it, and expect the message."""
-    root = WRITERS[kind](tmp_path / "capture")
-    damage(root)
-    refused(kind, root, message, **settings)
 
 
 def edit_rows(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from nerf_lightning.doctor.check import Check, Evidence
+from nerf_lightning.doctor.check import Evidence
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes, inverted
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.poses import CHECKS
@@ -110,7 +110,7 @@ FAULTS: dict[str, Fault] = {
 def plant(evidence: Evidence, fault: str, seed: int) -> Found:
     """Plant a fault in a sound capture and examine it again."""
     spoilt, bad = FAULTS[fault](evidence, torch.Generator().manual_seed(seed))
-    checks: list[Check] = [check(spoilt) for check in CHECKS]
+    checks = [replace(check(spoilt), name=name) for name, check in CHECKS.items()]
     wrong = [check for check in checks if check.verdict == "wrong"]
     single = next((check.message for check in checks if check.name == "single poses" and check.verdict == "wrong"), "")
     accused = single.split("the pose of ")[-1].split(" contradict")[0]

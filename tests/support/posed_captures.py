@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels

@@ -1,8 +1,8 @@
-"""Checks that readers share; each failure is one paragraph with the place and the cure."""
+"""What is judged: the numbers of a capture, whatever format they were read from, and the settings of scenes."""
 
+import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.files.links import is_there
+from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed
+from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
 from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.types.scene import Background
@@ -23,16 +24,36 @@ have not lost every digit that a picture could show."""
 WIDEST = 170.0
 """Degrees across a picture, beyond which nothing was photographed through a perspective lens."""
 
+log = logging.getLogger(__name__)
 
-def require_different(names: Iterable[str], where: str) -> None:
-    """Refuse views that bear one name: files and tables are written by it.
+
+def usable(capture: Capture) -> Capture:
+    """Return the capture without the views that cannot be used, and say which they are.
+
+    Left out are views whose focal length no perspective picture of their size has.
 
     Raises:
-        InputError: with the names, and where they stand.
+        InputError: no view is left, two have one name, or a number cannot be a camera's: a pose that is no rotation,
+            a principal point outside the picture, sparse points beyond `FARTHEST`, anything that is not finite.
     """
-    twice = sorted(name for name, count in Counter(names).items() if count > 1)
-    if twice:
-        raise InputError(f"{where} lists {listed(twice)} more than once. Remove all but one of each.")
+    _check_names(capture)
+    for view in capture.views:
+        if fault := _fault_of(view):
+            raise InputError(f"{capture.source}: the view {view.name} {fault}")
+    _check_depths(capture)
+    if capture.lens_model not in ("pinhole", "radial_tangential"):
+        return capture
+    reasons = {number: impossible_lens(view.size, view.focal) for number, view in enumerate(capture.views)}
+    odd = [number for number, reason in reasons.items() if reason]
+    if not odd:
+        return capture
+    first, reason = capture.views[odd[0]].name, reasons[odd[0]]
+    cure = "The focal length must be in pixels of the width and height beside it, not a share of them."
+    if len(odd) == len(reasons):
+        raise InputError(f"{capture.source}: the view {first} has {reason}; so has every other. {cure}")
+    names = listed((capture.views[number].name for number in odd), cap=5)
+    log.warning("%d of %d views are left out (%s): %s. %s", len(odd), len(reasons), names, reason, cure)
+    return capture.some([number for number, reason in reasons.items() if reason is None])
 
 
 def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | float, int | float]) -> str | None:
@@ -51,6 +72,67 @@ def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | fl
     )
 
 
+def _check_names(capture: Capture) -> None:
+    source = str(capture.source)
+    require_within("views", len(capture.views), source, "views")
+    if not capture.views:
+        raise InputError(f"{source} lists no views, so there is nothing to learn from. Export it again.")
+    names = Counter(view.name for view in capture.views)
+    require_within("name_characters", max(map(len, names)), source, "characters in a name")
+    for name in names:  # those that are left out are shown, and nothing is called by them
+        require_printable(name, f"A photograph of {source}")
+    twice = sorted(name for name, count in names.items() if count > 1)
+    if twice:  # files and tables are written by name
+        raise InputError(f"{source} lists {listed(twice)} more than once. Remove all but one of each.")
+
+
+def _fault_of(view: View) -> str | None:
+    """Return why the numbers of a view make no camera, with the cure."""
+    (width, height), (x, y), center = view.size, view.focal, view.center
+    numbers = torch.tensor([*view.focal, *center, *view.size, *view.lens], dtype=torch.float64)
+    if not bool(torch.isfinite(numbers).all() and torch.isfinite(view.c2w).all()):
+        return "has a pose or intrinsics with NaN or infinity. Remove it, or estimate the poses anew."
+    if max(x, y) > FARTHEST or float(view.c2w[:, 3].abs().max()) > FARTHEST:
+        return (
+            f"has a focal length or a centre beyond {FARTHEST:g}, where no digit is left that a picture could show. "
+            "Export the cameras again, in units of about the scene's size."
+        )
+    if not min(x, y) >= LEAST_FOCAL or min(width, height) < 1:
+        return (
+            f"has the focal length {x:g}, {y:g} for {width:g} x {height:g} pixels; all must be above 0, and a focal "
+            f"length at least {LEAST_FOCAL:g}. Export the intrinsics again."
+        )
+    if not (0 < center[0] < width and 0 < center[1] < height):
+        return (
+            f"has its principal point at {center[0]:g}, {center[1]:g}, outside of its {width:g} x {height:g} pixels. "
+            "The intrinsics belong to pictures of another size, or are in other units; they must be in pixels of the "
+            "width and height beside them."
+        )
+    if not bool(is_rigid(view.c2w)):
+        return (
+            "has a pose that is not a rotation and a centre, camera to world with axes right, up, back (it scales, "
+            "mirrors or shears). Apply the scale to the centres alone, and export it again."
+        )
+    return None
+
+
+def _check_depths(capture: Capture) -> None:
+    far = int((~(capture.points.abs() <= FARTHEST)).any(dim=-1).sum())  # NaN, too
+    if far:
+        raise InputError(
+            f"{capture.source}: {far} of the {len(capture.points)} sparse points are NaN or not within {FARTHEST:g} of "
+            "the origin, where no digit is left that a picture could show. Remove them, or estimate the poses anew."
+        )
+    if capture.bounds is not None:
+        near, far_ = capture.bounds.unbind(dim=-1)
+        bad = (~((near > 0) & (near < far_) & (far_ < math.inf))).nonzero()[:, 0].tolist()
+        if bad:
+            names = listed((capture.views[number].name for number in bad), cap=5)
+            raise InputError(
+                f"{capture.source}: the depths of {names} are not 0 < near < far. Estimate the poses anew."
+            )
+
+
 def contents(folder: Path) -> str:
     """Return what a folder holds, in a few words."""
     try:
@@ -60,53 +142,18 @@ def contents(folder: Path) -> str:
 
 
 def check_step(name: str, value: object) -> None:
-    """Refuse a factor or stride below 1.
-
-    Raises:
-        InputError: `value` is no whole number of at least 1; `name` is the setting's in the scene's configuration.
-    """
+    """Refuse a factor or stride below 1, or one that is no whole number; `name` is that of the setting."""
     if type(value) is not int or value < 1:
         raise InputError(f"scene.{name} is {value}, but it must be 1 (take everything as it is) or more.")
 
 
 def check_metres(metres_per_unit: float | None) -> None:
-    """Refuse a unit of no length, or beyond all digits.
-
-    Raises:
-        InputError: it is one.
-    """
+    """Refuse a unit of no length, or beyond all digits."""
     if metres_per_unit is not None and not LEAST_UNIT <= metres_per_unit <= LARGEST_UNIT:
         raise InputError(
             f"scene.metres_per_unit={metres_per_unit}: give how many metres one unit of the capture is long, such as "
             "0.01 for centimetres, or null where that is unknown."
         )
-
-
-def check_bounds(near: float, far: float) -> None:
-    """Refuse distances (scene units) that do not satisfy 0 <= near < far, or that are beyond all digits.
-
-    Raises:
-        InputError: they do not.
-    """
-    if not 0.0 <= near < far <= FARTHEST:
-        raise InputError(
-            f"scene.near is {near} and scene.far is {far}, but rays need 0 <= near < far <= {FARTHEST:g}. Set "
-            "them to the distances from the cameras at which the content begins and ends, for example "
-            "scene.near=2.0 scene.far=6.0."
-        )
-
-
-def box_around_origin(half: int | float) -> Float[Tensor, "2 3"]:
-    """Return lower and upper corner of the cube whose sides lie `scene.aabb_half` (scene units) from the origin.
-
-    Raises:
-        InputError: it has no inside, or reaches beyond all digits.
-    """
-    if not 0 < half <= FARTHEST:
-        raise InputError(
-            f"scene.aabb_half is {half}, but half the side of a box must be above 0, and {FARTHEST:g} at most."
-        )
-    return torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float32)
 
 
 def known_background(name: str) -> Background:
@@ -122,79 +169,25 @@ def known_background(name: str) -> Background:
 
 
 def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
-    """Return a camera-to-world pose (float64) from a nested list or array of 4 x 4 numbers.
+    """Return a nested list or array of 3 x 4 numbers as a pose (float64), without the last row that it may have.
 
     Args:
         matrix: what the file holds.
         where: the file and frame, for the message.
 
     Raises:
-        InputError: not 4 x 4 numbers, not finite, or not a rotation with a centre over a last row 0 0 0 1.
+        InputError: no such matrix, or a last row that is not 0 0 0 1.
     """
     try:
         pose = torch.as_tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{where} is not a 4 x 4 matrix of numbers. Export the camera poses again.") from None
-    if pose.shape != (4, 4):
+    if pose.shape not in ((3, 4), (4, 4)):
         shape = " x ".join(str(size) for size in pose.shape) or "a single number"
         raise InputError(f"{where} must be a 4 x 4 matrix, but it is {shape}. Export the camera poses again.")
-    if not torch.isfinite(pose).all():
-        raise InputError(f"{where} holds NaN or infinite numbers. Remove that frame or export the poses again.")
-    if float(pose[:3, 3].abs().max()) > FARTHEST:
+    if not (pose[3:] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().le(1e-3).all():
         raise InputError(
-            f"{where} lies beyond {FARTHEST:g}, where no digit is left that a picture could show. Export the cameras "
-            "again, in units of about the scene's size."
-        )
-    last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if not is_rigid(pose[:3]) or (pose[3] - last).abs().max() > 1e-3:
-        raise InputError(
-            f"{where} is not a camera pose: it must be a rotation (no scale, no mirror) and a centre over "
-            "the row 0 0 0 1, camera to world with axes right, up, back. Apply the camera's scale before "
-            "exporting, and make sure that the matrix is not transposed."
+            f"{where} does not end in the row 0 0 0 1. Make sure that the matrix is not transposed, and export the "
+            "camera poses again."
         )
     return pose[:3]
-
-
-def one_size(sizes: Mapping[Path, tuple[int, int]]) -> tuple[int, int]:
-    """Return the (width, height) that all images share.
-
-    Raises:
-        InputError: some images differ from the most frequent size; they are named.
-    """
-    usual = Counter(sizes.values()).most_common(1)[0][0]
-    odd = [f"{path} ({size[0]} x {size[1]})" for path, size in sizes.items() if size != usual]
-    if odd:
-        raise InputError(
-            f"The images of this format must all have one size. Most are {usual[0]} x {usual[1]}, but not "
-            f"{listed(odd)}. Render or resize these again, or remove their frames."
-        )
-    return usual
-
-
-def check_divisible(width: int, height: int, downscale: int) -> None:
-    """Refuse a downscale that does not divide the image's size: the camera model knows no partial pixels.
-
-    Raises:
-        InputError: with the factors that work.
-    """
-    common = math.gcd(width, height)
-    if common % downscale:
-        factors = [factor for factor in range(1, common + 1) if common % factor == 0]
-        raise InputError(
-            f"scene.downscale={downscale} does not divide the images' size of {width} x {height} pixels. "
-            f"Choose one of {listed(factors, cap=40)}."
-        )
-
-
-def check_present(files: Iterable[Path], named_in: Path) -> None:
-    """Refuse absent files, all at once.
-
-    Raises:
-        InputError: the absent files, capped at ten, and the file that names them.
-    """
-    absent = [path for path in files if not is_there(path)]
-    if absent:
-        raise InputError(
-            f"{named_in} names {len(absent)} image(s) that do not exist: {listed(absent)}. Copy them there, "
-            "or remove their frames from the file."
-        )

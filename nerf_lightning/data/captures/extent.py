@@ -1,10 +1,12 @@
-"""The working frame of a capture, and where along its rays content may lie."""
+"""How much of space is modelled, the working frame of a capture, and where along its rays content may lie."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import FARTHEST
@@ -12,9 +14,11 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.frames import (
+    FORWARD_FACING,
     LARGEST_UNIT,
     LEAST_UNIT,
     average_pose,
+    least_agreement,
     middle_of_cameras,
     points_from_user,
     poses_from_user,
@@ -23,7 +27,7 @@ from nerf_lightning.nerf.geometry.frames import (
     up_direction,
     upright_rotation,
 )
-from nerf_lightning.nerf.types.scene import Cameras, Space
+from nerf_lightning.nerf.types.scene import Cameras, Scene, Space
 
 # The near plane lies at this share of the least depth (LLFF's bound factor).
 NEAR_SHARE = 0.75
@@ -41,6 +45,44 @@ NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
 ONE_PLACE = 1e-6
 # Of the cube that the ball of the cameras just holds.
 UNIT_BALL_HALF = 3**-0.5
+# The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
+# normalised device coordinates.
+LEAST_AHEAD = 0.1
+IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
+"""The models of model=auto."""
+
+
+def choose_space(
+    asked: Space | Literal["auto"], cameras: Cameras, capture: Capture, has_transparency: bool
+) -> tuple[Space, str]:
+    """Return the space, and why.
+
+    Raises:
+        InputError: NDC was asked for and cannot work.
+    """
+    cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
+    if asked == "ndc" and not ahead:
+        raise InputError(
+            f"scene.space=ndc needs cameras that all look the same way, but some pixels of {capture.source} look "
+            "sideways or back. Use scene.space=contracted, or auto."
+        )
+    if asked != "auto":
+        return asked, "as asked"
+    if has_transparency:
+        return "bounded", "since the pictures have transparent pixels: nothing lies behind the content"
+    if ahead and cosine > FORWARD_FACING and capture.bounds is not None:
+        return "ndc", "since all cameras look the same way and the capture gives depths"
+    if ahead and cosine > FORWARD_FACING and len(capture.points):
+        return "ndc", "since all cameras look the same way and sparse points give depths"
+    return "contracted", "since the photographs show whatever lies behind the content"
+
+
+def least_ahead(cameras: Cameras) -> float:
+    """Return the least cosine between a pixel's ray and the cameras' mean direction, over a coarse grid of pixels."""
+    cameras = replace(cameras, c2w=cameras.c2w.float())
+    zeros = torch.zeros(cameras.c2w.shape[0])
+    rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros)
+    return float((rays.directions @ -functional.normalize(cameras.c2w[:, :, 2].mean(dim=0), dim=0)).min())
 
 
 @dataclass(frozen=True)
@@ -80,12 +122,10 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
     if space == "bounded":
         aabb = _box(capture, cameras, to_user)
         nearest, farthest = _around_box(cameras, to_user, aabb, nearest)
-    if near is not None:
-        nearest = torch.full_like(nearest, near / unit)
+    # What was found yields to what the user says.
     if far is not None:
         farthest = torch.full_like(farthest, far / unit)
-    # What was found yields to what the user says.
-    nearest = nearest if near is not None else torch.minimum(nearest, 0.5 * farthest)
+    nearest = torch.full_like(nearest, near / unit) if near is not None else torch.minimum(nearest, 0.5 * farthest)
     if near is not None and not bool((nearest < farthest).all()):
         raise InputError(
             f"scene.near={near:g} lies behind all content of {capture.source}, which ends at "
@@ -97,10 +137,7 @@ def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | No
 def require_possible(extent: Extent, to_user: Float[Tensor, "4 4"], capture: Capture) -> None:
     """Refuse an extent that no checkpoint could keep: it follows from numbers of the capture that are mistakes.
 
-    Args:
-        extent: in the working frame.
-        to_user: from there to the frame that the capture's maker knows.
-        capture: where they come from.
+    `to_user` leads from the working frame to the frame that the capture's maker knows.
 
     Raises:
         InputError: content reaches beyond all digits, its box has no inside, or the frame's unit is none.
@@ -169,8 +206,8 @@ def _from_points(capture: Capture, cameras: Cameras, to_user: Tensor) -> tuple[T
 def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "2 3"]:
     """Return the box that the format names, or that holds the sparse points, or that the cameras have in view."""
     if capture.box is not None:
-        corners = torch.cartesian_prod(*capture.box.mT)
-        return _around(points_from_user(corners, to_user))
+        corners = points_from_user(torch.cartesian_prod(*capture.box.mT), to_user)
+        return torch.stack([corners.amin(dim=0), corners.amax(dim=0)]).float()
     if len(capture.points) >= FEWEST_POINTS:
         points = points_from_user(capture.points[:: 1 + len(capture.points) // MOST_POINTS], to_user)
         # Alike towards all sides, so that it does not depend on where the user's x axis points.
@@ -186,10 +223,6 @@ def _box(capture: Capture, cameras: Cameras, to_user: Tensor) -> Float[Tensor, "
     tangent = (half_size / cameras.focal).amax(dim=-1).double()
     radius = float((distance * tangent / (1.0 + tangent.square()).sqrt()).min())
     return _cube(min(radius, 0.95 * float(distance.min())))
-
-
-def _around(points: Float[Tensor, "points 3"]) -> Float[Tensor, "2 3"]:
-    return torch.stack([points.amin(dim=0), points.amax(dim=0)]).float()
 
 
 def _around_box(cameras: Cameras, to_user: Tensor, aabb: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
@@ -248,3 +281,10 @@ def _corners(cameras: Cameras) -> tuple[Float[Tensor, "points 3"], Float[Tensor,
     zeros = torch.zeros(cameras.c2w.shape[0])
     rays = rays_through_pixels(cameras, coarse_pixels(cameras), zeros, zeros + 1.0).map(lambda x: x.flatten(0, 1))
     return torch.cat([rays.origins, rays.origins + rays.far[:, None] * rays.directions]), rays.far.max()
+
+
+def model_for(scene: Scene) -> tuple[str, str]:
+    """Return the model that suits a scene, as model=auto chooses it, and why."""
+    if scene.space == "bounded":
+        return IN_A_BOX, "the scene stands in a box"
+    return PHOTOGRAPHS, "the photographs show whatever lies behind the content"

@@ -5,22 +5,19 @@ import math
 import os
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Literal, get_args
 
-from nerf_lightning.data.captures.capture import (
-    Capture,
-    cameras_of,
-    check_capture,
-    filtered,
-    without_impossible_lenses,
-)
-from nerf_lightning.data.captures.checks import check_metres, check_step
-from nerf_lightning.data.captures.extent import extent_of, require_possible
-from nerf_lightning.data.captures.space import choose_space
+import torch
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
+from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
-from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, image_size
+from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, downscaled_size, image_size
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.files.links import is_there, require_inside
@@ -29,9 +26,11 @@ from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
+LARGEST_STRETCH = 0.01
+"""Of width and height: how far a picture's scale may differ from one axis to the other."""
 
 log = logging.getLogger(__name__)
 
@@ -94,9 +93,7 @@ class CaptureReader(Reader):
             InputError: a setting that makes no sense, or anything wrong with the files.
         """
         self._check_settings()
-        capture = filtered(self.capture(), self.frames)
-        check_capture(capture)
-        capture = without_impossible_lenses(capture)
+        capture = usable(self._wanted(self.capture()))
         splits = self._splits(capture)
         if self.masks_keep == "black" and not any(view.photograph.mask for view in capture.views):
             raise InputError(
@@ -204,6 +201,18 @@ class CaptureReader(Reader):
                 f"scene.near={near} and scene.far={far}: rays need 0 <= near < far, in the capture's units."
             )
 
+    def _wanted(self, capture: Capture) -> Capture:
+        """Return the views whose names fit the pattern `frames`."""
+        if self.frames is None:
+            return capture
+        names = [view.name for view in capture.views]
+        kept = [number for number, name in enumerate(names) if fnmatch(name, self.frames)]
+        if not kept:
+            raise InputError(
+                f"scene.frames={self.frames!r} fits none of the views of {capture.source}; they are {listed(names, 5)}."
+            )
+        return capture.some(kept)
+
     def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
         if capture.splits is None:
             train, held = every_kth(range(len(capture.views)), self.hold_every)
@@ -227,6 +236,60 @@ class CaptureReader(Reader):
             "hold_every": str(self.hold_every),
             "frames": self.frames or "all",
         }
+
+
+def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
+    """Return the cameras at the size of the pixels that were read.
+
+    Args:
+        capture: intrinsics for the sizes that the format names.
+        files: (width, height) of each picture file.
+        pixels: what was read of them.
+        downscale: whole factor between the two; what it leaves over was cropped at the right and the bottom.
+
+    Raises:
+        InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are another capture's.
+    """
+    sizes = [downscaled_size(width, height, downscale) for width, height in files]
+    if sizes != list(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)):
+        raise InputError(
+            f"The pixels that were kept of {capture.source} have other sizes than its photographs: somebody else wrote "
+            "them. Remove them from scene.cache_dir (else ~/.cache/nerf_lightning), and the photographs are read anew."
+        )
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([getattr(view, name) for view in capture.views], dtype=torch.float64)
+
+    scales = []
+    for view, (width, height) in zip(capture.views, files, strict=True):
+        x, y = width / view.size[0], height / view.size[1]
+        # A shrunk picture's size is rounded: allow a pixel on either side.
+        slack = LARGEST_STRETCH + 1.0 / min(width, height)
+        if abs(x / y - 1.0) > slack:
+            raise InputError(
+                f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for "
+                f"{view.size[0]:g} x {view.size[1]:g}: the sides differ by other factors ({x:.3f} and {y:.3f}). The "
+                "picture was cropped, turned or stretched after the poses were estimated; use the original one."
+            )
+        scales.append((x / downscale, y / downscale))
+    scale = torch.tensor(scales, dtype=torch.float64)
+    focal = column("focal") * scale
+    possible = ((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all(dim=-1)
+    if not bool(possible.all()):
+        view = capture.views[possible.tolist().index(False)]
+        raise InputError(
+            f"{capture.source}: the view {view.name} has a focal length of {view.focal[0]:g}, {view.focal[1]:g} pixels "
+            f"of {view.size[0]:g} x {view.size[1]:g}, which no lens has on the picture that is there. Export it again."
+        )
+    return Cameras(
+        c2w=torch.stack([view.c2w for view in capture.views]),
+        focal=focal.float(),
+        center=(column("center") * scale).float(),
+        lens=column("lens").float(),
+        lens_model=capture.lens_model,
+        width=pixels.width,
+        height=pixels.height,
+    )
 
 
 def picture_files(folder: Path) -> list[str]:

@@ -46,14 +46,8 @@ def apart(
 ) -> tuple[View, ...]:
     """Return the views to learn from without those to judge by, and say which are left out.
 
-    Where a capture lists the very same views for training and test, that is meant, and said.
-
-    Args:
-        train: views, or what stands for them.
-        val: those to judge by while training; there may be none.
-        test: those to judge by in the end; there may be none.
-        named: a view's name.
-        source: the file that lists them, for messages.
+    Where a capture lists the very same views for training and test, that is meant, and said. `named` returns a view's
+    name, and `source` lists them.
 
     Raises:
         InputError: less than half of the views to learn from would be left, so that either list may be the mistake.

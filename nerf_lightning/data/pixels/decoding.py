@@ -1,4 +1,4 @@
-"""Photographs, with masks, to a pixel store that is decoded once and mapped into memory from then on."""
+"""Photographs, with masks, to a pixel store that is decoded once and mapped from then on; and hashes of them."""
 
 import hashlib
 import json
@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
 
-from nerf_lightning.data.captures.checks import check_step
 from nerf_lightning.data.pixels.images import (
     MaskColor,
     area_downscale,
@@ -21,7 +22,8 @@ from nerf_lightning.data.pixels.images import (
     read_rgba,
     whole_blocks,
 )
-from nerf_lightning.data.pixels.mapped_store import FORMAT, Header, check_room, stored
+from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
+from nerf_lightning.data.pixels.placement import num_bytes
 from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.regular import open_regular
@@ -31,6 +33,9 @@ from nerf_lightning.nerf.types.scene import PixelStore
 # Megapixels that take a few seconds: from here on there is a progress bar.
 NOTICEABLE_PIXELS = 50_000_000
 NOTICEABLE_FILES = 1000
+THINNED = 1 << 28
+"""Bytes that are hashed of pixels that are more than memory may hold (`CHECKED_WHOLE`): they come from the disk."""
+NOTICEABLE_BYTES = 1 << 31
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,6 @@ def read_photographs(
         InputError: a file is absent, cannot be decoded or is refused by `images.read_rgba`; a mask is of another
             size or keeps nothing; or the cache folder has no room.
     """
-    check_step("downscale", downscale)
     if not photographs:
         raise InputError(f"{label}: there is no photograph to read. Check the capture's folder.")
     folder = default_folder("photographs") if cache_dir is None else cache_dir.expanduser()
@@ -134,14 +138,16 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
     target.touch(mode=0o600)
 
     def decode(index: int) -> bool:
-        rgba = _picture(photographs[index], sizes[index], downscale)
+        photograph, size = photographs[index], sizes[index]
+        rgba = area_downscale(crop_to_multiple(read_rgba(photograph.path), downscale), downscale)
+        _check_unchanged(rgba, size, photograph.path)
         start = int(ends[index]) - rgba.shape[0] * rgba.shape[1]
         with target.open("r+b") as file:
             file.seek(4 * start)
             file.write(np.ascontiguousarray(rgba).data)
             if masked:
                 file.seek(4 * num_pixels + start)
-                file.write(_mask(photographs[index], sizes[index], downscale).data)
+                file.write(_mask(photograph, size, downscale).data)
         return bool((rgba[..., 3] < 255).any())
 
     transparent = in_threads(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
@@ -165,24 +171,13 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
     return in_threads(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
 
 
-def _picture(
-    photograph: Photograph, size: tuple[int, int], downscale: int
-) -> UInt8[np.ndarray, "small_height small_width 4"]:
-    """Return one photograph, shrunk."""
-    rgba = area_downscale(crop_to_multiple(read_rgba(photograph.path), downscale), downscale)
-    _check_unchanged(rgba.shape, size, photograph.path)
-    return rgba
-
-
 def _mask(
     photograph: Photograph, size: tuple[int, int], downscale: int
 ) -> Bool[np.ndarray, "small_height small_width"]:
-    """Return which of its pixels count."""
-    width, height = size
     if photograph.mask is None:
-        return np.ones((height, width), dtype=np.bool_)
+        return np.ones(size[::-1], dtype=np.bool_)
     kept = whole_blocks(read_mask(photograph.mask, photograph.mask_keeps), downscale)
-    _check_unchanged(kept.shape, size, photograph.mask)
+    _check_unchanged(kept, size, photograph.mask)
     if not kept.any():
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""
         white = photograph.mask_keeps == "white"
@@ -194,7 +189,27 @@ def _mask(
     return kept
 
 
-def _check_unchanged(shape: tuple[int, ...], size: tuple[int, int], path: Path) -> None:
+def _check_unchanged(pixels: np.ndarray, size: tuple[int, int], path: Path) -> None:
     """Refuse a file that is no longer what its header said a moment ago: it would be written over its neighbour."""
-    if (shape[1], shape[0]) != size:
+    if (pixels.shape[1], pixels.shape[0]) != size:
         raise InputError(f"{path} changed while it was read. Start again when it is no longer written to.")
+
+
+def photograph_hashes(pixels: PixelStore) -> Int[Tensor, "views"]:
+    """Return a hash (BLAKE2b, 64 bits) of each view's pixels and mask, as they are trained on.
+
+    Of more than 4 GiB every k-th row counts, 256 MiB in all: a photograph that was exposed, sharpened or cropped anew
+    is found, and one that was retouched in a few rows may not be.
+    """
+    total = num_bytes(pixels)
+    step = 1 if total <= CHECKED_WHOLE else -(-total // THINNED)
+
+    def digest(view: int) -> int:
+        kept = pixels.kept(view)
+        found = hashlib.blake2b(pixels.view(view)[::step].contiguous().numpy().data, digest_size=8)
+        if kept is not None:
+            found.update(kept[::step].contiguous().numpy().data)
+        return int.from_bytes(found.digest(), "little", signed=True)
+
+    shown = total > NOTICEABLE_BYTES
+    return torch.tensor(in_threads(digest, len(pixels.offset), "Comparing photographs", shown), dtype=torch.int64)

@@ -12,7 +12,7 @@ from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.images import image_size
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
-from nerf_lightning.data.readers.colmap.reader import ColmapReader
+from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.messages.errors import InputError
@@ -80,7 +80,11 @@ class AutoReader(CaptureReader):
             )
         file, scene, kind = found
         log.info("%s: read as scene=%s, for it has %s", self.root, scene, file)
-        return kind(**self._settings(scene, kind))
+        chosen = self._chosen() | {"root": self.root, "name": self.name}
+        refused = sorted(chosen.keys() - inspect.signature(kind).parameters.keys())
+        if refused:
+            raise InputError(f"scene.{refused[0]}: scene={scene}, which {self.root} is, has no such setting. Leave it.")
+        return kind(**chosen)
 
     @staticmethod
     def known_format(folder: Path) -> tuple[str, str, type[Reader]] | None:
@@ -88,7 +92,6 @@ class AutoReader(CaptureReader):
         return next((found for found in FORMATS if (folder / found[0]).is_file()), None)
 
     def _handy(self, reader: Reader) -> Reader:
-        """Let the reader shrink photographs, where their size is left open."""
         if self.downscale != "auto" or not isinstance(reader, CaptureReader):
             return reader
         longest = max(max(image_size(view.photograph.path)) for view in reader.capture().views)
@@ -100,10 +103,3 @@ class AutoReader(CaptureReader):
         """Return the settings that say something."""
         values = {field.name: (getattr(self, field.name), field.default) for field in fields(AutoReader)}
         return {name: value for name, (value, default) in values.items() if value not in (default, "auto")}
-
-    def _settings(self, scene: str, kind: type[Reader]) -> dict[str, Any]:
-        chosen = self._chosen() | {"root": self.root, "name": self.name}
-        refused = sorted(chosen.keys() - inspect.signature(kind).parameters.keys())
-        if refused:
-            raise InputError(f"scene.{refused[0]}: scene={scene}, which {self.root} is, has no such setting. Leave it.")
-        return chosen

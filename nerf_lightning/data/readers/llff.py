@@ -17,7 +17,6 @@ from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import HEADER_BYTES, array_header
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed
 
 COLUMNS = 17
 MOST_BYTES = 1 << 28
@@ -43,7 +42,10 @@ class LlffReader(CaptureReader):
         path = root / "poses_bounds.npy"
         self.require_inside(path)
         rows = _rows(path)
-        pictures = self._pictures(root)
+        asked = [self.images] if self.images else ["images", "images_2", "images_4", "images_8"]
+        pictures = next((root / name for name in asked if os.path.isdir(root / name)), None)
+        if pictures is None:
+            raise InputError(f"{root} has no folder {' or '.join(asked)} with the photographs. Set scene.images to it.")
         self.require_inside(pictures, self.images)
         names = picture_files(pictures)
         if len(names) != len(rows):
@@ -51,55 +53,41 @@ class LlffReader(CaptureReader):
                 f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
                 "in order of names. Remove the photographs that were not registered, or add those that are missing."
             )
-        for name in names:
+        views = []
+        for name, row in zip(names, rows, strict=True):
             self.require_inside(pictures / name, self.images)
-        bounds = torch.from_numpy(rows[:, 15:])
-        return Capture(
-            views=tuple(self._view(pictures / name, name, row) for name, row in zip(names, rows, strict=True)),
-            source=path,
-            bounds=bounds,
+            matrix = torch.from_numpy(row[:15].reshape(3, 5).copy())
+            down, right, back, center = matrix[:, :4].unbind(dim=-1)
+            height, width, focal = matrix[:, 4].tolist()
+            views.append(
+                View(
+                    name=name,
+                    photograph=Photograph(pictures / name, self.mask_of(name)),
+                    c2w=torch.stack([right, -down, back, center], dim=-1),
+                    focal=(focal, focal),
+                    center=(width / 2, height / 2),
+                    size=(width, height),
+                )
+            )
+        return Capture(views=tuple(views), source=path, bounds=torch.from_numpy(rows[:, 15:]))
+
+
+def _rows(path: Path) -> Float[ndarray, "views 17"]:
+    """Return a row for each view: a 3 x 5 matrix (down, right, back, centre; height, width, focal) and two depths."""
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist; the folder holds {contents(path.parent)}. "
+            "Point scene.root at the folder that has it."
         )
-
-    def _pictures(self, root: Path) -> Path:
-        asked = [self.images] if self.images else ["images", "images_2", "images_4", "images_8"]
-        for name in asked:
-            if os.path.isdir(root / name):
-                return root / name
-        raise InputError(f"{root} has no folder {' or '.join(asked)} with the photographs. Set scene.images to it.")
-
-    def _view(self, path: Path, name: str, row: Float[ndarray, "17"]) -> View:
-        matrix = torch.from_numpy(row[:15].reshape(3, 5).copy())
-        down, right, back, center = matrix[:, :4].unbind(dim=-1)
-        height, width, focal = matrix[:, 4].tolist()
-        return View(
-            name=name,
-            photograph=Photograph(path, self.mask_of(name)),
-            c2w=torch.stack([right, -down, back, center], dim=-1),
-            focal=(focal, focal),
-            center=(width / 2, height / 2),
-            size=(width, height),
-        )
-
-
-def _array(path: Path) -> ndarray:
     try:
         # Read by its own format: np.load would open archives too, and unpickle what is neither.
         with open_regular(path, MOST_BYTES, CURE) as file:
             # Its size is known before memory is taken, and its header is short.
             array_header(file.read(HEADER_BYTES), os.fstat(file.fileno()).st_size)
             file.seek(0)
-            return np.lib.format.read_array(file, allow_pickle=False)
+            rows = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path} is not an array of numbers as numpy saves it ({error}). {CURE}") from error
-
-
-def _rows(path: Path) -> Float[ndarray, "views 17"]:
-    if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; the folder holds {contents(path.parent)}. "
-            "Point scene.root at the folder that has it."
-        )
-    rows = _array(path)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind not in "iuf":
         shape = " x ".join(map(str, rows.shape)) or "a single number"
         raise InputError(
@@ -107,11 +95,4 @@ def _rows(path: Path) -> Float[ndarray, "views 17"]:
             f"two depths. {CURE}"
         )
     require_within("views", len(rows), str(path), "views")
-    rows = rows.astype(np.float64)
-    if not np.isfinite(rows).all():
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
-        raise InputError(f"{path} holds NaN or infinity in row {listed(bad)} (counted from 0). {CURE}")
-    bad = np.flatnonzero((rows[:, 15] <= 0) | (rows[:, 15] >= rows[:, 16])).tolist()
-    if bad:
-        raise InputError(f"{path}: row {listed(bad)} (counted from 0) does not have 0 < near < far in its end. {CURE}")
-    return rows
+    return np.asarray(rows, dtype=np.float64)

@@ -5,23 +5,25 @@ import io
 import json
 import sys
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from support.budget import budget
 from support.captures import write_blender, write_npz
 from support.fuzzing import harmless
 from support.malformed import WRITERS, edit_json
-from support.posed_captures import Known, read, write_colmap
+from support.posed_captures import Known, read, ring, write_transforms
 from support.running import refused
 
-from nerf_lightning.data.captures.checks import box_around_origin, check_step, require_different
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.checks import check_step, usable
 from nerf_lightning.data.captures.reader import picture_files
 from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
 from nerf_lightning.sfm.photograph_folder import find_photographs
@@ -93,7 +95,7 @@ def test_folders_are_walked_as_python_does(tmp_path):
     assert list(walk(tmp_path / "absent")) == []
 
 
-def test_equal_names_are_found_in_one_pass():
+def test_equal_names_are_found_in_one_pass(tmp_path):
     class Name(str):
         compared = 0
 
@@ -103,26 +105,13 @@ def test_equal_names_are_found_in_one_pass():
 
         __hash__ = str.__hash__
 
-    refused(require_different, [Name("a.png") for _ in range(1000)], "a.json", parts=("a.json lists a.png more than",))
+    (view,) = TransformsReader(str(write_transforms(tmp_path / "c", Known(c2w=ring(1))))).capture().views
+    views = tuple(replace(view, name=Name("a.png")) for _ in range(1000))
+    refused(usable, Capture(views, tmp_path / "a.json"), parts=("a.json lists a.png more than",))
     assert Name.compared < 5000
 
 
-@pytest.mark.parametrize(
-    ("kind", "settings", "words"),
-    [
-        ("transforms", {"file": "absent/transforms.json"}, "does not exist; the folder holds nothing that can be read"),
-        ("transforms", {"file": "x" * 5000}, "does not exist; the folder holds images"),
-        ("llff", {"images": "x" * 5000}, "has no folder x"),
-        ("colmap", {"images": "x" * 5000}, "does not exist, and the model's photographs are looked for there"),
-    ],
-)
-def test_settings_that_name_nothing(tmp_path, kind, settings, words):
-    root = WRITERS[kind](tmp_path / "capture")
-    refused(lambda: read(kind, root, **settings), parts=(words,))
-
-
 def test_a_folder_whose_name_is_none(tmp_path):
-    refused(read, "colmap", tmp_path / ("x" * 5000), parts=("does not exist",))
     refused(BlenderReader("x" * 5000).read, parts=("does not exist",))
     refused(NpzReader("x" * 5000).read, parts=("does not exist",))
 
@@ -134,11 +123,6 @@ def test_a_focal_length_that_is_possible_for_another_picture_alone(tmp_path, tim
     size = {key: times * value for key, value in {"w": 16, "h": 12, "cx": 8, "cy": 6}.items()}
     edit_json(root, lambda content: content | size | {"fl_x": focal, "fl_y": focal})
     refused(read, "transforms", root, parts=("the view images/p_0.png has a focal length of", "lens has"))
-
-
-def test_sparse_points_beyond_everything(tmp_path):
-    root = write_colmap(tmp_path / "capture", Known(points=np.full((60, 3), 1e300)))
-    refused(lambda: read("colmap", root, space="bounded"), parts=("60 of the 60 sparse points",))
 
 
 def test_points_of_a_text_are_counted_too(tmp_path):
@@ -156,10 +140,6 @@ def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
     refused(read, "llff", root, parts=("has 9 poses, but", "has 10 photographs"))
     with budget(views=9):
         refused(find_photographs, root / "images", parts=("has 10 photographs, and more than 9 are not taken",))
-
-
-def test_half_the_side_of_a_box_may_be_a_whole_number():
-    assert torch.equal(box_around_origin(2), torch.tensor([[-2.0] * 3, [2.0] * 3]))
 
 
 @pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
@@ -192,16 +172,7 @@ def blender(root, change):
 
 def test_a_frame_that_is_listed_twice(tmp_path):
     reader = blender(tmp_path / "a", lambda content: content["frames"].append(content["frames"][1]))
-    refused(reader.read, parts=("transforms_train.json lists train/r_1 more than once",))
-
-
-def test_a_picture_of_two_splits_has_two_names(tmp_path):
-    reader = blender(tmp_path / "a", lambda content: None)
-    val = tmp_path / "a" / "transforms_val.json"
-    val.write_text(val.read_text().replace("./val/r_1", "./test/r_0"))
-    names = reader.read().view_names
-    assert len(set(names)) == len(names) == 7
-    assert {"val/test/r_0", "test/test/r_0"} < set(names)
+    refused(reader.read, parts=("lists train/train/r_1 more than once",))
 
 
 def test_an_angle_of_true(tmp_path):

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from support.budget import budget
 from support.captures import write_blender, write_npz
-from support.malformed import WRITERS, Cases, edit_json, edit_rows, refused, refused_when_damaged
-from support.posed_captures import Known, ring, write_colmap
+from support.malformed import WRITERS, refused
+from support.posed_captures import Known, write_colmap
 
 from nerf_lightning.data.captures import reader as capture_reader
 from nerf_lightning.data.pixels.images import image_size, read_rgba
@@ -18,49 +18,6 @@ from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.messages.errors import InputError
-
-cases = Cases()
-REACH = "the content .* would reach .* the cameras' distance from the middle.* remove"
-
-
-@cases("llff", REACH)
-def one_bound_at_the_end_of_the_world(root):
-    edit_rows(root, lambda rows: np.concatenate([rows[:, :16], np.full((9, 1), 1e12)], axis=1))
-
-
-@cases("transforms", "in a frame whose unit is 4.6.*e-18 .* applied_scale")
-def tiny_units(root):
-    edit_json(root, lambda content: content | {"applied_scale": 1e18})
-
-
-@cases("transforms", "in a frame whose unit is .* applied_scale")
-def huge_units(root):
-    edit_json(root, lambda content: content | {"applied_scale": 1e-18})
-
-
-@cases("transforms", REACH, space="bounded")
-def a_huge_box(root):
-    edit_json(root, lambda content: content | {"aabb_scale": 1e12})
-
-
-@pytest.mark.parametrize(("kind", "damage", "message", "settings"), cases.params)
-def test_refused(tmp_path, kind, damage, message, settings):
-    refused_when_damaged(tmp_path, kind, damage, message, settings)
-
-
-def test_sparse_points_that_are_mistakes(tmp_path):
-    known = Known(c2w=ring() * [1.0, 1.0, 1.0, 1e-3])
-    points = 1e-4 * known.points[:20]  # of few points, the outermost ones count
-    points[0] = known.c2w[0] @ [0.0, 0.0, -5e8, 1.0]
-    refused("colmap", write_colmap(tmp_path / "capture", replace(known, points=points)), REACH, space="contracted")
-
-
-def test_a_name_that_no_file_system_takes(tmp_path):
-    root = write_blender(tmp_path / "a", {"train": 3, "val": 1, "test": 1})
-    path = root / "transforms_train.json"
-    path.write_text(path.read_text().replace("./train/r_1", "x" * 5000))
-    with pytest.raises(InputError, match=r"names 1 image\(s\) that do not exist"):
-        BlenderReader(str(root)).read()
 
 
 def test_a_jpeg_of_fewer_bits_than_blocks_was_cut_short(tmp_path):
@@ -123,12 +80,6 @@ def test_ten_million_cameras_in_other_files(tmp_path):
             BlenderReader(str(tmp_path / "blender")).read()
         with pytest.raises(InputError, match=r"a\.npz has 10 views"):
             NpzReader(str(write_npz(tmp_path / "a.npz"))).read()
-
-
-def test_names_that_no_frame_has_stay_in_one_line(tmp_path):
-    root = WRITERS["transforms"](tmp_path / "capture")
-    edit_json(root, lambda content: content | {"test_filenames": ["a\nb"]})
-    refused("transforms", root, r"test_filenames lists a\\nb, which no frame has")
 
 
 def test_kept_pixels_of_other_sizes_than_the_photographs(tmp_path, monkeypatch):

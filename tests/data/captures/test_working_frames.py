@@ -10,7 +10,6 @@ from PIL import Image
 from support.posed_captures import Known, read, ring, user_rays, wall, write_colmap, write_llff, write_transforms
 
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import unit_of
 
 AHEAD = np.array([0.0, 5.0, 0.0])
@@ -140,22 +139,6 @@ def test_instant_ngps_own_scale_and_offset_move_its_box(tmp_path):
     box = TransformsReader(root=str(root)).capture().box
     assert box is not None
     assert box.tolist() == [[-4.0, -3.0, -6.0], [4.0, 5.0, 2.0]]
-
-
-@pytest.mark.parametrize(
-    ("said", "text"),
-    [
-        ({"scale": 0}, "scale is 0.0, but must be a positive size"),
-        ({"offset": [0.5, 0.5]}, r"offset is \[0.5, 0.5\], but must be three numbers"),
-        ({"offset": [0.5, float("nan"), 0.5]}, "offset holds NaN"),
-    ],
-)
-def test_a_scale_or_offset_that_makes_no_box_is_refused(tmp_path, said, text):
-    root = write_transforms(tmp_path / "c", Known())
-    content = json.loads((root / "transforms.json").read_text()) | {"aabb_scale": 2} | said
-    (root / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=text):
-        read("transforms", root, space="bounded")
 
 
 def test_the_near_plane_lies_before_all_content(tmp_path):

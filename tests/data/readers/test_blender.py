@@ -74,54 +74,41 @@ def test_skip_takes_every_kth_frame(root):
     assert np.array_equal(scene.pixels.view(1).numpy(), picture(4))
 
 
-def test_names_are_the_shortest_that_differ(tmp_path):
-    write_blender(tmp_path, {"train": 2})
-    assert BlenderReader(str(tmp_path)).read().view_names == ("r_0", "r_1")
-
-
-def test_names_fall_back_to_the_path_in_the_file_of_a_split(root):
+def test_names_are_the_shortest_that_differ(tmp_path, root):
+    write_blender(tmp_path / "alone", {"train": 2})
+    assert BlenderReader(str(tmp_path / "alone")).read().view_names == ("r_0", "r_1")
+    # One picture may serve in two splits.
     frames = [{"file_path": f"./{split}/r_0.png", "transform_matrix": pose(0)} for split in ("val", "test")]
     write_transforms(root, "test", frames)
-    assert BlenderReader(str(root)).read().view_names[-2:] == ("test/val/r_0", "test/test/r_0")
+    names = BlenderReader(str(root)).read().view_names
+    assert names[-2:] == ("test/val/r_0", "test/test/r_0")
+    assert len(set(names)) == len(names)
 
 
-def test_missing_val_is_held_out_from_train(root, caplog):
-    (root / "transforms_val.json").unlink()
+@pytest.mark.parametrize(
+    ("absent", "val", "test", "judged", "said"),
+    [
+        (("val",), (0, 8), (9, 10, 11), "test", ["has no val split: every 8th train view is held out for it."]),
+        (("test",), (9, 10), (9, 10), "val", ["has no test split: the 2 val views serve as test."]),
+        (("val", "test"), (0, 8), (0, 8), "every 8th train view", ["has no val split", "has no test split"]),
+    ],
+)
+def test_missing_splits_are_held_out(root, caplog, absent, val, test, judged, said):
+    for split in absent:
+        write_transforms(root, split, []) if split == "test" else (root / f"transforms_{split}.json").unlink()
     with caplog.at_level(logging.INFO):
         scene = BlenderReader(str(root)).read()
-    assert scene.splits == {"train": tuple(range(1, 8)), "val": (0, 8), "test": (9, 10, 11)}
-    assert caplog.messages == [f"{root} has no val split: every 8th train view is held out for it."]
-    assert scene.protocol["test_views"] == "test"
+    train = tuple(range(1, 8)) if "val" in absent else tuple(range(9))
+    assert scene.splits == {"train": train, "val": val, "test": test}
+    assert all(message.startswith(f"{root} {start}") for message, start in zip(caplog.messages, said, strict=True))
+    assert scene.protocol["test_views"] == judged
 
 
-def test_missing_test_is_judged_on_val(root, caplog):
-    write_transforms(root, "test", [])
-    with caplog.at_level(logging.INFO):
-        scene = BlenderReader(str(root)).read()
-    assert scene.splits["test"] == scene.splits["val"] == (9, 10)
-    assert caplog.messages == [f"{root} has no test split: the 2 val views serve as test."]
-    assert scene.protocol["test_views"] == "val"
-
-
-def test_missing_val_and_test_are_the_same_held_out_views(root):
-    (root / "transforms_val.json").unlink()
-    (root / "transforms_test.json").unlink()
-    scene = BlenderReader(str(root)).read()
-    assert scene.splits == {"train": tuple(range(1, 8)), "val": (0, 8), "test": (0, 8)}
-    assert scene.protocol["test_views"] == "every 8th train view"
-
-
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".PNG"])
-def test_file_path_may_have_its_ending(root, ending):
-    Image.fromarray(picture(0)[..., :3]).save(root / f"view.1{ending}")
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".PNG", ""])
+def test_file_path_may_have_its_ending_and_a_dot_is_none(root, ending):
+    Image.fromarray(picture(0)[..., :3]).save(root / f"view.1{ending or '.png'}")
     change_frame(root, 0, file_path=f"view.1{ending}")
     assert BlenderReader(str(root)).read().pixels.view(0)[..., 3].min() == 255
-
-
-def test_a_dot_in_the_name_is_no_ending(root):
-    Image.fromarray(picture(5)).save(root / "view.1.png")
-    change_frame(root, 0, file_path="view.1")
-    assert np.array_equal(BlenderReader(str(root)).read().pixels.view(0).numpy(), picture(5))
 
 
 @pytest.mark.data

@@ -1,7 +1,6 @@
 """One capture in every format: the readers must agree with what was written."""
 
 import json
-import logging
 import os
 import shutil
 
@@ -165,38 +164,35 @@ def test_the_lenses_of_a_transforms_json(tmp_path, top, model, lens):
     np.testing.assert_allclose(cameras.lens[0], lens, rtol=1e-6)
 
 
-@pytest.mark.parametrize("naming", ["same", "added", "replaced"])
-def test_masks_of_a_folder(tmp_path, naming):
-    known = Known(names=tuple(f"p_{view}.jpg" for view in range(9)))
-    root = write_colmap(tmp_path / "c", known)
-    (root / "masks").mkdir()
-    for view, name in enumerate(known.names):
-        mask = np.full((12, 16), 255, np.uint8)
-        mask[view] = 0
-        named = {"same": name, "added": f"{name}.png", "replaced": name.replace(".jpg", ".png")}[naming]
-        Image.fromarray(mask).save(root / "masks" / named, format="PNG")
-    scene = read("colmap", root, masks="masks")
+def write_masks(folder, names, colors=(255, 0)):
+    """Masks of one colour, with a row of the other, elsewhere for each view."""
+    folder.mkdir(parents=True)
+    for view, name in enumerate(names):
+        mask = np.full((12, 16), colors[0], np.uint8)
+        mask[view] = colors[1]
+        Image.fromarray(mask).save(folder / name, format="PNG")
+
+
+def assert_all_but_a_row(scene):
     for view in range(9):
         kept = scene.pixels.kept(view)
         assert not bool(kept[view].any())
         assert int(kept.sum()) == 11 * 16
 
 
+@pytest.mark.parametrize("naming", ["p_{}.jpg", "p_{}.jpg.png", "p_{}.png"])
+def test_masks_of_a_folder(tmp_path, naming):
+    root = write_colmap(tmp_path / "c", Known(names=tuple(f"p_{view}.jpg" for view in range(9))))
+    write_masks(root / "masks", [naming.format(view) for view in range(9)])
+    assert_all_but_a_row(read("colmap", root, masks="masks"))
+
+
 def test_masks_may_keep_black(tmp_path):
     root = write_transforms(tmp_path / "c", Known())
-    (root / "masks" / "images").mkdir(parents=True)
-    for view, name in enumerate(Known().names):
-        mask = np.zeros((12, 16), np.uint8)
-        mask[view] = 255
-        Image.fromarray(mask).save(root / "masks" / "images" / name)
-    settings = {"masks": "masks", "masks_keep": "black"}
-    for scene in (read("transforms", root, **settings), read("transforms", root, **settings)):  # once from the cache
-        for view in range(9):
-            kept = scene.pixels.kept(view)
-            assert not bool(kept[view].any())
-            assert int(kept.sum()) == 11 * 16
-    white = read("transforms", root, masks="masks")
-    assert int(white.pixels.kept(0).sum()) == 16
+    write_masks(root / "masks" / "images", Known().names, (0, 255))
+    for _ in range(2):  # once from the cache
+        assert_all_but_a_row(read("transforms", root, masks="masks", masks_keep="black"))
+    assert int(read("transforms", root, masks="masks").pixels.kept(0).sum()) == 16
 
 
 def test_three_photographs_with_poses_make_a_scene(tmp_path):
@@ -290,22 +286,15 @@ def test_names_with_spaces_and_letters_of_all_languages(tmp_path, kind):
     assert_true(read(reader, root), known, read_as)
 
 
-def test_registered_photographs_alone_are_read_and_the_others_named(tmp_path, caplog):
-    known = Known()
-    root = write_colmap(tmp_path / "c", known)
+def test_photographs_without_pose_are_named(tmp_path, caplog):
+    write_colmap(tmp_path / "c", Known())
+    write_transforms(tmp_path / "d", Known())
     for name in ("lost.jpg", "sub/lost.png"):
-        write_pictures(root / "images", (name,), known.size)
-    (root / "images" / "notes.txt").write_text("no picture")
-    with caplog.at_level(logging.WARNING):
-        assert len(read("colmap", root).view_names) == 9
+        write_pictures(tmp_path / "c" / "images", (name,), (16, 12))
+    write_pictures(tmp_path / "d" / "images", ("zzz.png",), (16, 12))
+    (tmp_path / "c" / "images" / "notes.txt").write_text("no picture")
+    assert len(read("colmap", tmp_path / "c").view_names) == len(read("transforms", tmp_path / "d").view_names) == 9
     assert "2 photographs have no pose and are left out: lost.jpg, sub/lost.png" in caplog.text
-
-
-def test_photographs_beside_a_transforms_json_that_it_does_not_name(tmp_path, caplog):
-    root = write_transforms(tmp_path / "c", Known())
-    write_pictures(root / "images", ("zzz.png",), (16, 12))
-    with caplog.at_level(logging.WARNING):
-        read("transforms", root)
     assert "1 photographs have no pose and are left out: images/zzz.png" in caplog.text
 
 

@@ -1,18 +1,21 @@
-"""COLMAP reconstructions: `sparse/0` (or `sparse`) beside a folder of photographs."""
+"""COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, beside a folder of photographs."""
 
 import os
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.readers.colmap.model import find_model, model_files, read_model
-from nerf_lightning.data.readers.colmap.records import ColmapCamera, ColmapImage
+from nerf_lightning.data.readers.colmap_files import CURE, BinaryFiles, ColmapCamera, ColmapImage, TextFiles
 from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -30,6 +33,20 @@ LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
     "RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
 }
+FILES = ("cameras", "images", "points3D")
+KINDS: dict[str, BinaryFiles | TextFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
+TOLERANCE = 1e-4
+"""Relative and absolute, to which a model and its twin in text agree: few digits may have been written."""
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """What the three files say."""
+
+    cameras: dict[int, ColmapCamera]
+    images: tuple[ColmapImage, ...]
+    """In order of their names."""
+    points: Float[ndarray, "points 3"]
 
 
 @dataclass
@@ -47,8 +64,9 @@ class ColmapReader(CaptureReader):
         """Return the registered photographs, in order of their names."""
         root = self.folder()
         folder = find_model(root)
-        for path in model_files(folder):
-            self.require_inside(path)
+        for path in (folder / f"{name}{ending}" for name in FILES for ending in KINDS):
+            if path.is_file():
+                self.require_inside(path)
         model = read_model(folder)
         pictures = root / self.images
         if not os.path.isdir(pictures):
@@ -123,3 +141,68 @@ def _lens_model(used: set[str], folder: Path) -> LensModel:
             "the photographs with `colmap image_undistorter`, or split the capture."
         )
     return lens_model
+
+
+def find_model(root: Path) -> Path:
+    """Return the folder of the model in a capture: `sparse/0`, `sparse`, or the folder itself.
+
+    Raises:
+        InputError: none of them holds one.
+    """
+    for folder in (root / "sparse" / "0", root / "sparse", root):
+        if any((folder / f"cameras{ending}").is_file() for ending in KINDS):
+            return folder
+    raise InputError(
+        f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in sparse/0, in sparse, or in the "
+        "folder itself. Point scene.root at the folder above sparse/, or make a model with nerf poses images=DIR."
+    )
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read a model, binary or text.
+
+    Raises:
+        InputError: a file is missing, cut short, of an unknown kind, or disagrees with another.
+    """
+    models = [_read_kind(folder, ending) for ending in KINDS if (folder / f"cameras{ending}").is_file()]
+    if len(models) == 2 and not _agree(*models):
+        raise InputError(
+            f"{folder} holds the model twice, and its binary and its text files disagree. Remove the files of the "
+            "older one (compare their dates)."
+        )
+    model = models[0]
+    if not model.images:
+        raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
+    lost = sorted({image.camera for image in model.images} - set(model.cameras))
+    if lost:
+        raise InputError(f"The images of {folder} name cameras that its cameras file lacks: {listed(lost)}. {CURE}")
+    return model
+
+
+def _read_kind(folder: Path, ending: str) -> ColmapModel:
+    cameras_path, images_path, points_path = (folder / f"{name}{ending}" for name in FILES)
+    if not images_path.is_file():
+        raise InputError(f"{folder} holds {cameras_path.name} but no {images_path.name}: it is not whole. {CURE}")
+    files = KINDS[ending]
+    cameras = list(files.cameras(cameras_path))
+    twice = [number for number, count in Counter(camera.number for camera in cameras).items() if count > 1]
+    if twice:
+        raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
+    images = sorted(files.images(images_path), key=lambda image: image.name)
+    points = files.points(points_path) if points_path.exists() else np.zeros((0, 3))
+    return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
+
+
+def _agree(a: ColmapModel, b: ColmapModel) -> bool:
+    if [image.name for image in a.images] != [image.name for image in b.images]:
+        return False
+    pairs = zip(_numbers_of(a), _numbers_of(b), strict=True)
+    return all(len(x) == len(y) and np.allclose(x, y, rtol=TOLERANCE, atol=TOLERANCE) for x, y in pairs)
+
+
+def _numbers_of(model: ColmapModel) -> Iterable[list[float]]:
+    for image in model.images:
+        camera = model.cameras.get(image.camera)
+        intrinsics = (float(camera.width), float(camera.height), *camera.params) if camera else ()
+        # A quaternion and its negative are one rotation, and have the same products.
+        yield [*np.outer(image.rotation, image.rotation).ravel().tolist(), *image.translation, *intrinsics]

@@ -1,10 +1,16 @@
-"""Intrinsics as nerfstudio and instant-ngp write them; `settings` are a frame's, over those at the file's top."""
+"""The frames of json files, in the flavours of Blender, nerfstudio and instant-ngp: paths, poses and intrinsics.
+
+`settings` are a frame's keys over those at the file's top. What is read here is numbers; whether they make a camera is
+judged by `captures.checks`.
+"""
 
 import math
+from pathlib import Path
 from typing import Any
 
+from nerf_lightning.files.budgets import require_within
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.messages.escaping import listed
+from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
 from nerf_lightning.nerf.types.scene import LensModel
 
@@ -18,6 +24,30 @@ LENSES: dict[str, LensModel] = {
     "EQUIRECTANGULAR": "equirectangular",
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def list_of_frames(frames: object, path: Path) -> list[Any]:
+    """Return the frames of a file.
+
+    Raises:
+        InputError: they are no list, or more than a person has agreed to.
+    """
+    if not isinstance(frames, list):
+        raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
+    require_within("views", len(frames), str(path), "views")
+    return frames
+
+
+def path_of(name: object, key: str, where: str) -> str:
+    """Return a path as the file has it.
+
+    Raises:
+        InputError: it is no text, or a name that cannot be shown.
+    """
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{where}: {key} is {name!r}, but it must be the picture's path as text.")
+    require_printable(name, where)
+    return name
 
 
 def number_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
@@ -35,15 +65,24 @@ def number_of(settings: dict[str, Any], key: str, where: str, default: float | N
         raise InputError(f"{where}: {key} has too many digits for a number of a camera. Mend it.") from None
 
 
-def size_of(settings: dict[str, Any], where: str) -> tuple[float, float] | None:
-    """Return (width, height) for which the intrinsics hold; None where the file leaves it to the picture.
+def positive_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """Return a number above 0; `InputError` refuses another, and infinity."""
+    value = number_of(settings, key, where, default)
+    if not 0 < value < math.inf:
+        raise InputError(f"{where}: {key} is {value:g}, but it must be above 0. Mend it, or remove it.")
+    return value
+
+
+def focal_of_angle(settings: dict[str, Any], side: str, length: float, where: str) -> float:
+    """Return the focal length in pixels of a field of view of `camera_angle_x` or `_y` radians.
 
     Raises:
-        InputError: one of them is missing, or no number.
+        InputError: it is no angle between 0 and pi.
     """
-    if "w" not in settings and "h" not in settings:
-        return None
-    return number_of(settings, "w", where), number_of(settings, "h", where)
+    angle = number_of(settings, f"camera_angle_{side}", where)
+    if not 0.0 < angle < math.pi:
+        raise InputError(f"{where}: camera_angle_{side} is {angle}, but it must lie between 0 and pi radians.")
+    return focal_from_fov(length, angle)
 
 
 def focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
@@ -52,26 +91,18 @@ def focal_of(settings: dict[str, Any], width: float, height: float, where: str) 
     Raises:
         InputError: both are missing, or one is no number.
     """
-
-    def along(side: str, length: float) -> float | None:
+    found = []
+    for side, length in (("x", width), ("y", height)):
         if f"fl_{side}" in settings:
-            return number_of(settings, f"fl_{side}", where)
-        if f"camera_angle_{side}" not in settings:
-            return None
-        angle = number_of(settings, f"camera_angle_{side}", where)
-        if not 0.0 < angle < math.pi:
-            raise InputError(f"{where}: camera_angle_{side} is {angle}, but it must lie between 0 and pi radians.")
-        return focal_from_fov(length, angle)
-
-    x, y = along("x", width), along("y", height)
-    if x is not None:
-        return x, (x if y is None else y)
-    if y is not None:
-        return y, y
-    raise InputError(
-        f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) stands in it or at the "
-        "file's top. If the file comes from another tool, export it in nerfstudio's or instant-ngp's format."
-    )
+            found.append(number_of(settings, f"fl_{side}", where))
+        elif f"camera_angle_{side}" in settings:
+            found.append(focal_of_angle(settings, side, length, where))
+    if not found:
+        raise InputError(
+            f"{where} has no focal length: neither fl_x (pixels) nor camera_angle_x (radians) stands in it or at the "
+            "file's top. If the file comes from another tool, export it in nerfstudio's or instant-ngp's format."
+        )
+    return found[0], found[-1]
 
 
 def panorama_focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
@@ -101,16 +132,15 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     """
     k1, k2, k3, k4, p1, p2 = (number_of(settings, key, where, 0.0) for key in COEFFICIENTS)
     lens = (k1, k2, k3, k4, p1, p2)
-    bent = any(lens)
     model = settings.get("camera_model", "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV")
-    if not isinstance(model, str) or model not in LENSES:
+    kind = LENSES.get(model) if isinstance(model, str) else None
+    if kind is None:
         raise InputError(
             f"{where} has the camera_model {model!r}; known are {listed(LENSES)}. Undistort the photographs first, or "
             "export them as perspective pictures."
         )
-    kind = LENSES[model]
-    if kind in ("pinhole", "equirectangular") and bent:
+    if kind in ("pinhole", "equirectangular") and any(lens):
         raise InputError(
             f"{where} has the camera_model {model} and distortion coefficients. Remove the one or the other."
         )
-    return ("pinhole" if kind == "radial_tangential" and not bent else kind), lens
+    return ("pinhole" if kind == "radial_tangential" and not any(lens) else kind), lens

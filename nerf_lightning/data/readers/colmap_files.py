@@ -1,0 +1,245 @@
+"""The files of a COLMAP model (colmap.github.io/format.html), binary or text: cameras, photographs, sparse points.
+
+They are parsed here, every length checked before it is believed: COLMAP's own library hangs on some truncated ones.
+"""
+
+import io
+import mmap
+import os
+import struct
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
+
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+"""COLMAP's numbers of camera models, with their names and counts of parameters."""
+COUNTS = dict(MODELS.values())
+MOST_BYTES = 1 << 36
+"""Of a file; ten million points with long tracks take a tenth."""
+LONGEST_LINE = 1 << 24
+"""In characters; that of a photograph with a hundred thousand features takes less."""
+CURE = "Copy the model again, or run the reconstruction anew (nerf poses images=DIR)."
+CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """One camera's intrinsics."""
+
+    number: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered photograph."""
+
+    name: str
+    camera: int
+    rotation: tuple[float, float, float, float]
+    """World to camera, a quaternion w, x, y, z."""
+    translation: tuple[float, float, float]
+
+
+class BinaryFiles:
+    """Parse cameras.bin, images.bin and points3D.bin: little-endian records, each list after its length."""
+
+    def cameras(self, path: Path) -> Iterator[ColmapCamera]:
+        """Return the cameras."""
+        data = _Bytes(path)
+        for _ in range(data.count(24, "views")):
+            number, model, width, height = data.take("<IiQQ")
+            if model not in MODELS:
+                raise InputError(f"{path} holds a camera of the unknown model number {model}. {CURE_MODEL}")
+            name, count = MODELS[model]
+            yield ColmapCamera(number, name, width, height, data.take(f"<{count}d"))
+        data.end()
+
+    def images(self, path: Path) -> Iterator[ColmapImage]:
+        """Return the photographs; the features in them are passed over."""
+        data = _Bytes(path)
+        for _ in range(data.count(73, "views")):
+            values = data.take("<I7dI")
+            name = data.text()
+            data.skip(24 * data.take("<Q")[0])
+            yield ColmapImage(name, values[8], values[1:5], values[5:8])
+        data.end()
+
+    def points(self, path: Path) -> Float[ndarray, "points 3"]:
+        """Return the sparse points; the photographs that they were seen in are passed over."""
+        data, found = _Bytes(path), array("d")
+        for _ in range(data.count(51, "points")):
+            found.extend(data.take("<Q3d3Bd")[1:4])
+            data.skip(8 * data.take("<Q")[0])
+        data.end()
+        return np.frombuffer(found, np.float64).reshape(-1, 3)
+
+
+class _Bytes:
+    """A file's bytes, taken in order; what is not there is named."""
+
+    def __init__(self, path: Path):
+        self.path, self.place = path, 0
+        self.data: bytes | mmap.mmap
+        try:
+            with open_regular(path, MOST_BYTES, CURE) as file:
+                # Mapped: what is passed over (features, tracks) is most of the file, and need not be in memory.
+                empty = os.fstat(file.fileno()).st_size == 0
+                self.data = b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+
+    def take(self, form: str) -> tuple:
+        place = self.place
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self.data, place)
+
+    def count(self, least_bytes: int, budget: str) -> int:
+        """Return the length of a list whose entries take at least so many bytes."""
+        count = int(self.take("<Q")[0])
+        self._need(count * least_bytes)
+        require_within(budget, count, str(self.path), budget)
+        return count
+
+    def skip(self, size: int) -> None:
+        self._need(size)
+        self.place += size
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.place)
+        if end < 0:
+            self._need(len(self.data) + 1)
+        name, self.place = self.data[self.place : end], end + 1
+        try:
+            return name.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{self.path} holds a file name that is not UTF-8: {name!r}. {CURE}") from error
+
+    def end(self) -> None:
+        if self.place < len(self.data):
+            raise InputError(
+                f"{self.path} goes on for {len(self.data) - self.place} bytes after what it announces: it is damaged "
+                f"or is no such file. {CURE}"
+            )
+
+    def _need(self, size: int) -> None:
+        if self.place + size > len(self.data):
+            raise InputError(
+                f"{self.path} ends after {len(self.data)} bytes, in the middle of what it announces: it was cut short "
+                f"or is no such file. {CURE}"
+            )
+
+
+class TextFiles:
+    """Parse cameras.txt, images.txt and points3D.txt: lines of words; comments begin with #."""
+
+    def cameras(self, path: Path) -> Iterator[ColmapCamera]:
+        """Return the cameras."""
+        for where, line in _within(_lines(path), "views", path):
+            number, model, *values = [*line.split(), "", ""]
+            if model not in COUNTS:
+                raise InputError(f"{where} holds a camera of the unknown model {model!r}. {CURE_MODEL}")
+            width, height, *params = _numbers(values[:-2], where, 2 + COUNTS[model])
+            sides = _whole(width, where), _whole(height, where)
+            yield ColmapCamera(_whole(_numbers([number], where, 1)[0], where), model, *sides, tuple(params))
+
+    def images(self, path: Path) -> Iterator[ColmapImage]:
+        """Return the photographs, each of which takes two lines; the second one, with its features, may be empty."""
+        lines = _lines(path, keep_empty=True)
+        # COLMAP, too, passes over empty lines before a photograph, but not where features are due.
+        for where, line in _within(((where, line) for where, line in lines if line), "views", path):
+            words = line.split(maxsplit=9)
+            qw, qx, qy, qz, x, y, z, camera = _numbers(words[1:9], where, 8)
+            if len(words) < 10:
+                raise InputError(f"{where} lacks the photograph's name. {CURE}")
+            _check_features(next(lines, ("", ""))[1].split(), where)
+            yield ColmapImage(words[9], _whole(camera, where), (qw, qx, qy, qz), (x, y, z))
+
+    def points(self, path: Path) -> Float[ndarray, "points 3"]:
+        """Return the sparse points."""
+        found = array("d")
+        for where, line in _within(_lines(path), "points", path):
+            found.extend(_numbers(line.split(maxsplit=4)[1:4], where, 3))
+        return np.frombuffer(found, np.float64).reshape(-1, 3)
+
+
+def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
+    """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
+    try:
+        with open_regular(path, MOST_BYTES, CURE) as binary, io.TextIOWrapper(binary, "utf-8", newline="\n") as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
+                if len(line) > LONGEST_LINE:
+                    raise InputError(f"{path}, line {number} has more than {LONGEST_LINE:,} characters. {CURE}")
+                if not line.startswith("#") and (keep_empty or line.strip()):
+                    yield f"{path}, line {number}", line.strip()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file (it is not UTF-8). {CURE}") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}. Check its permissions.") from error
+
+
+def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterator[tuple[str, str]]:
+    """Return the lines, and refuse more than a budget allows: a text does not say how many there are."""
+    most = getattr(allowed(), budget)
+    for number, line in enumerate(lines):
+        if number == most:
+            raise InputError(
+                f"{path} has more than {most:,} {budget}, which are not taken from a file unasked. If you trust it, "
+                f"add budgets.{budget}=N; else use another file."
+            )
+        yield line
+
+
+def _check_features(words: list[str], where: str) -> None:
+    # Where the lines of features are missing, every second photograph would be taken for one.
+    try:
+        features = len(words) % 3 == 0 and (not words or int(words[-1]) >= -1)
+    except ValueError:
+        features = False
+    if not features:
+        raise InputError(
+            f"{where}: the line after it must hold the photograph's features (x, y, number of the point) or be empty. "
+            f"{CURE}"
+        )
+
+
+def _numbers(words: list[str], where: str, count: int) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(
+            f"{where} should hold {count} numbers there, but it holds {' '.join(words) or 'nothing'}. {CURE}"
+        )
+    return values
+
+
+def _whole(value: float, where: str) -> int:
+    if not value.is_integer():  # neither are NaN and infinity
+        raise InputError(f"{where} should hold a whole number where {value:g} stands. {CURE}")
+    return int(value)
