@@ -7,7 +7,7 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photogra
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.messages.console import say
 from nerf_lightning.runs.output_folder import beside_checkpoint, chosen_folder
-from nerf_lightning.viewer.admission import named_places
+from nerf_lightning.viewer.auth import names_of
 from nerf_lightning.viewer.page import Page, open_in_browser, require_viser
 from nerf_lightning.viewer.render_queue import RenderQueue, received_stop_signals
 from nerf_lightning.viewer.renderer import SlicedRenderer
@@ -17,7 +17,7 @@ from nerf_lightning.viewer.shown_photographs import Photographs
 def run(config: DictConfig) -> None:
     """Serve the page until Ctrl-C or SIGTERM."""
     require_viser()
-    named_places(config.viewer.hosts)
+    names_of(config.viewer.hosts)
     opened = open_checkpoint(config)
     record, scene = opened.checkpoint.scene, None
     if opened.model.needs_photographs:
@@ -38,6 +38,7 @@ def run(config: DictConfig) -> None:
     if config.open_browser:
         open_in_browser(page.address)
     try:
-        queue.work_until(stopped)
+        while not stopped:
+            queue.work_or_wait()
     finally:
         page.close()

@@ -1,8 +1,9 @@
-"""A view as a picture: one of its channels, or truth and render side by side, in a window of any shape."""
+"""A view as a picture: one of its channels, or truth and render side by side; and the depth that hides lines."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -10,10 +11,16 @@ from torch.nn.functional import pad
 
 from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
+from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.visualization.pictures import color_map, faded, to_bytes, visible_range
 
 COLOR = "colour"
+PAPER, LINE = 237, 255
+# Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
+MOST_DEPTH_SIDE = 320
+# viser sends depths as whole numbers of 1e-5 in three bytes: what is farther cannot be told.
+FARTHEST = 167.0
 
 
 def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
@@ -39,10 +46,14 @@ def _opacity(view: View) -> Float[Tensor, "height width 3"]:
 
 
 def _normals(view: View) -> Float[Tensor, "height width 3"]:
-    nothing = torch.zeros(1)
-    rays = rays_through_pixels(replace(view.camera, ndc=None), all_pixels(view.camera, 0), nothing, nothing)
+    rays = _rays(view, all_pixels(view.camera, 0))
     normals = normals_from_depth(rays.origins + view.depth[..., None] * rays.directions)
     return faded(0.5 + 0.5 * normals, view.opacity)
+
+
+def _rays(view: View, pixels: PixelIndex) -> RayBundle:
+    nothing = torch.zeros(1)
+    return rays_through_pixels(replace(view.camera, ndc=None), pixels, nothing, nothing)
 
 
 CHANNELS: dict[str, Callable[[View], Tensor]] = {
@@ -51,10 +62,6 @@ CHANNELS: dict[str, Callable[[View], Tensor]] = {
     "opacity": _opacity,
     "normals": _normals,
 }
-
-
-PAPER = 237
-LINE = 255
 
 
 def wiped(
@@ -83,3 +90,16 @@ def in_window(picture: UInt8[Tensor, "height width 3"], aspect: float) -> UInt8[
     above = max(0, round(width / aspect) - height)
     edges = (0, 0, beside // 2, beside - beside // 2, above // 2, above - above // 2)
     return pad(picture, edges, value=PAPER)
+
+
+def planar_depth(view: View) -> Float[np.ndarray, "height width"]:
+    """Return how far along the camera's axis each pixel's content lies (scene units), at most 320 pixels a side.
+
+    What light passes through, for more than half, hides nothing: it lies at `FARTHEST`.
+    """
+    step = max(1, -(-max(view.depth.shape) // MOST_DEPTH_SIDE))
+    inner = slice(step // 2, None, step)
+    rays = _rays(view, all_pixels(view.camera, 0).map(lambda each: each[inner, inner]))
+    depth = view.depth[inner, inner] * (rays.directions @ -view.camera.c2w[0, :, 2])
+    hidden = torch.where(view.opacity[inner, inner] > 0.5, depth, FARTHEST)
+    return hidden.clamp(0.0, FARTHEST).cpu().numpy()

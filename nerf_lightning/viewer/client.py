@@ -12,13 +12,14 @@ from nerf_lightning.nerf.geometry.clipping import CropBox
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.settings import Corner
 from nerf_lightning.viewer.camera_state import CameraState, fov_that_holds, pose_of, quaternion_of
-from nerf_lightning.viewer.channels import COLOR, in_window, picture_of, wiped
-from nerf_lightning.viewer.occlusion import FARTHEST, planar_depth
+from nerf_lightning.viewer.channels import COLOR, FARTHEST, in_window, picture_of, planar_depth, wiped
 from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.viewer.shown_photographs import Photographs
 
+# A window counts as no wider and no higher than this (pixels).
+MOST_SIDE = 4096
 # Coarse pictures are sent often, fine ones once.
 COARSE_QUALITY, FINE_QUALITY = 75, 92
 # Cameras lie this many times as far as the photographs were taken, at most: where depths cannot be told so far, nothing
@@ -57,12 +58,13 @@ class ViewerClient:
         self._drawn_over: set[str] = set()
         self._arrived = False
         self._seen: tuple[View, CameraState] | None = None
-        self._shown: UInt8[Tensor, "h w 3"] | None = None
+        self.picture: UInt8[Tensor, "height width 3"] | None = None
+        """What was sent last."""
         self._wants_present, self._presenting = False, threading.Lock()
 
     def start(self) -> None:
         """Follow the camera from now on; there is a picture at once."""
-        self.client.camera.on_update(self.queue.complaints.harmless(lambda _: self.look()))
+        self.client.camera.on_update(self.queue.errors.harmless(lambda _: self.look()))
         self.look()
         self.queue.add(self.client.client_id, self.refinement)
 
@@ -76,8 +78,8 @@ class ViewerClient:
             CameraState(
                 c2w=self.pose(),
                 fov=float(camera.fov),
-                width=max(1, int(camera.image_width)),
-                height=max(1, int(camera.image_height)),
+                width=min(max(1, int(camera.image_width)), MOST_SIDE),
+                height=min(max(1, int(camera.image_height)), MOST_SIDE),
                 crop=self.crop,
                 photograph=self.photograph,
             )
@@ -103,7 +105,7 @@ class ViewerClient:
 
     def is_here(self) -> bool:
         """Tell whether the person has not left."""
-        return self.queue.serves(self.client.client_id)
+        return self.queue.turn_of(self.client.client_id) is not None
 
     def enter(self, view: int) -> None:
         """Look through the camera of a photograph."""
@@ -144,10 +146,6 @@ class ViewerClient:
         if bool(self._drawn_over) != had:
             self.present()
 
-    def latest(self) -> UInt8[Tensor, "h w 3"] | None:
-        """Return the picture that was sent last."""
-        return self._shown
-
     def _show(self, view: View, look: CameraState, finest: bool) -> None:
         self._seen = view, look
         self._send(view, look, FINE_QUALITY if finest else COARSE_QUALITY)
@@ -164,7 +162,7 @@ class ViewerClient:
             picture = in_window(picture, look.width / look.height)
         elif self._drawn_over and self.around.radius < FARTHEST / FARTHER:
             depth = planar_depth(view)
-        self._shown = picture
+        self.picture = picture
         self.client.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality, depth=depth)
         self.client.flush()
 

@@ -1,4 +1,4 @@
-"""The panel of the page: what is shown, the crop box, photographs, the camera path, snapshots."""
+"""The panel of the page: what is shown, the crop box, photographs, the camera path, films, snapshots."""
 
 import math
 from pathlib import Path
@@ -7,21 +7,18 @@ from typing import Any
 import torch
 
 from nerf_lightning.nerf.geometry.clipping import CropBox
+from nerf_lightning.nerf.geometry.frames import points_to_user
 from nerf_lightning.nerf.types.scene import SceneRecord
-from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.channels import CHANNELS
 from nerf_lightning.viewer.client import ViewerClient
-from nerf_lightning.viewer.film_panel import FilmPanel
+from nerf_lightning.viewer.film import FilmPanel
 from nerf_lightning.viewer.frusta import Frusta
 from nerf_lightning.viewer.path_panel import PathPanel
 from nerf_lightning.viewer.photograph_panel import PhotographPanel
-from nerf_lightning.viewer.ranges import within
-from nerf_lightning.viewer.recorded_path import RecordedPath, free_name, not_saved
-from nerf_lightning.viewer.training_panel import TrainingPanel
-from nerf_lightning.viewer.training_switch import TrainingSwitch
+from nerf_lightning.viewer.recorded_path import RecordedPath, new_file, told
+from nerf_lightning.viewer.training_switch import TrainingPanel, TrainingSwitch
 from nerf_lightning.visualization.pictures import save_png
 
-AXES = ("x", "y", "z")
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
 # The crop box keeps this share of the scene's box along each axis.
 LEAST_SHARE = 0.01
@@ -41,36 +38,34 @@ class Controls:
     def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
         self.session, self.folder, self.training = session, folder, training
         self.gui = session.client.gui
-        self.harmless = session.queue.complaints.harmless
+        self.harmless = session.queue.errors.harmless
         self.frusta = Frusta(session, lambda view: self.photographs.enter(view))
         self.path = RecordedPath(session.around, folder)
         self._wants_snapshot = False
         session.on_finest = self._keep_snapshot
         if training is not None:
             TrainingPanel(session, training)
-        self._add_view(round(math.degrees(fov)))
+        self._add_view(min(max(float(round(math.degrees(fov))), LEAST_DEGREES), MOST_DEGREES))
         self.photographs = PhotographPanel(session, self.frusta)
-        PathPanel(session, self.path, self.frusta.hide)
-        self.film = FilmPanel(session, self.path, folder, self._why_no_film)
+        PathPanel(session, self.path, self.frusta)
+        self.film = FilmPanel(session, self.path, self._why_no_film)
         self._add_crop()
 
-    def _add_view(self, degrees: int) -> None:
+    def _add_view(self, degrees: float) -> None:
         channel = self.gui.add_dropdown("Show", tuple(CHANNELS), initial_value=self.session.channel)
-        shown = within(float(degrees), LEAST_DEGREES, MOST_DEGREES)
-        fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, shown)
+        fov = self.gui.add_slider("Field of view", LEAST_DEGREES, MOST_DEGREES, 1.0, degrees)
         snapshot = self.gui.add_button("Snapshot", hint="Save the finest picture of this view as PNG")
 
         @channel.on_update
         @self.harmless
         def _(_: Any) -> None:
-            if channel.value in CHANNELS:
-                self.session.channel = channel.value
-                self.session.present()
+            self.session.channel = channel.value
+            self.session.present()
 
         @fov.on_update
         @self.harmless
         def _(_: Any) -> None:
-            self.session.client.camera.fov = math.radians(within(fov.value, LEAST_DEGREES, MOST_DEGREES))
+            self.session.client.camera.fov = math.radians(fov.value)
 
         @snapshot.on_click
         @self.harmless
@@ -89,16 +84,14 @@ class Controls:
             if record.space == "ndc":
                 self.gui.add_markdown(NO_CROP)
                 return
-            low, high = in_user_frame(record)
             on = self.gui.add_checkbox("Show only what is in the box", False)
             sliders = [
                 self.gui.add_multi_slider(axis, a, b, LEAST_SHARE * (b - a), (a, b), min_range=LEAST_SHARE * (b - a))
-                for axis, a, b in zip(AXES, low, high, strict=True)
+                for axis, a, b in zip("xyz", *in_user_frame(record), strict=True)
             ]
 
         def update(_: Any) -> None:
-            ends = (ends_within(slider.value, a, b) for slider, a, b in zip(sliders, low, high, strict=True))
-            lower, upper = zip(*ends, strict=True)
+            lower, upper = zip(*(slider.value for slider in sliders), strict=True)
             self.session.crop = CropBox.from_user(lower, upper, record.to_user) if on.value else None
             self.session.crop_corners = (lower, upper) if on.value else None
             self.frusta.draw_box(self.session.crop)
@@ -108,33 +101,20 @@ class Controls:
             each.on_update(self.harmless(update))
 
     def _keep_snapshot(self) -> None:
-        picture = self.session.latest()
+        picture = self.session.picture
         if not self._wants_snapshot or picture is None:
             return
         self._wants_snapshot = False
         try:
-            with free_name(self.folder, "snapshot", ".png", limits.MOST_SNAPSHOTS) as path:
+            with new_file(self.folder, "snapshot", ".png") as path:
                 save_png(path, picture)
         except OSError as error:  # nothing that is clicked ends a training
-            self.session.client.add_notification("Snapshot", not_saved(error), color="red")
+            self.session.client.add_notification("Snapshot", told(error), color="red")
         else:
             self.session.client.add_notification("Snapshot", f"Saved as {path}", auto_close_seconds=10.0)
 
 
-def ends_within(ends: tuple[float, ...], least: float, most: float) -> tuple[float, float]:
-    """Return the two ends of an interval within a range, the second one greater.
-
-    >>> ends_within((9.0, -9.0), 0.0, 4.0)
-    (3.96, 4.0)
-    """
-    lower, upper = ends
-    gap = LEAST_SHARE * (most - least)
-    lower = within(lower, least, most - gap)
-    return lower, within(upper, lower + gap, most)
-
-
 def in_user_frame(record: SceneRecord) -> tuple[list[float], list[float]]:
     """Return the lower and the upper corner of the box along the user's axes that holds the scene's (user's units)."""
-    corners = torch.cartesian_prod(*record.aabb.unbind(dim=1)).double()
-    places = corners @ record.to_user[:3, :3].double().mT + record.to_user[:3, 3]
+    places = points_to_user(torch.cartesian_prod(*record.aabb.unbind(dim=1)).double(), record.to_user.double())
     return places.amin(dim=0).tolist(), places.amax(dim=0).tolist()

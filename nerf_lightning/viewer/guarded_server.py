@@ -1,133 +1,84 @@
-"""viser's server behind a guard: who may enter, what passes, and what is said when something goes wrong.
+"""viser's server, which answers those alone whom `Auth` lets in, and tells browsers to load nothing from elsewhere.
 
-viser by itself checks neither Origin nor Host, knows no token, has no limits and sends no headers of its own. It
-serves through `websockets.serve`, which can do all of that, but no argument of viser's reaches there. So while viser
-starts, it finds another `serve` in that place, which adds what is missing.
+viser by itself checks neither Origin nor Host, and knows no token. It serves through `websockets.serve`, which can do
+that, but no argument of viser's reaches there. So while viser starts, it finds another `serve` in that place.
 """
 
-import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from http import HTTPStatus
+from io import StringIO
 from typing import Any
 
+from viser import ViserServer
 from websockets.asyncio import server as websockets_server
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.http11 import Request, Response
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.viewer import limits
-from nerf_lightning.viewer.admission import Admission
-from nerf_lightning.viewer.complaints import Complaints
-from nerf_lightning.viewer.connections import GuardedConnection
-from nerf_lightning.viewer.page_headers import FIXED, UNMARKED, headers_for, marked
+from nerf_lightning.viewer.auth import Auth
 
-FULL = "So many look on already that the viewer takes no more connections: close a page of it.\n"
-
+# viser's page has its scripts and styles within it, unpacks itself with WebAssembly, and makes workers and pictures
+# from blobs. Older browsers do not count the page's own socket as 'self'.
+POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src data:; connect-src 'self' ws://{host} wss://{host} data: blob:; "
+    "worker-src blob: data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
 # websockets logs a traceback for each broken handshake, and any program can send one.
 unheard = logging.getLogger("nerf_lightning.viewer.handshakes")
 unheard.setLevel(logging.CRITICAL + 1)
 
-Handler = Callable[[ServerConnection], Awaitable[None]]
-ProcessRequest = Callable[[ServerConnection, Request], Response | None]
 
+def guarded_server(auth: Auth, host: str, port: int) -> ViserServer:
+    """Start viser's server behind the guard.
 
-class Guard:
-    """Stand between websockets and viser.
-
-    Args:
-        admission: judges requests.
-        complaints: hears of what goes wrong.
+    Raises:
+        InputError: this version of viser serves in a way that cannot be guarded.
     """
+    guarded = []
 
-    def __init__(self, admission: Admission, complaints: Complaints):
-        self.admission, self.complaints = admission, complaints
-        self.is_in_place = False
+    def guarded_serve(*where: Any, process_request: Callable[..., Response | None], **options: Any) -> serve:
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            return _answer(auth, process_request, connection, request)
 
-    @contextmanager
-    def in_place(self) -> Iterator[None]:
-        """Guard the server that viser starts within the block."""
-        websockets_server.serve = self._serve  # type: ignore[misc, assignment]
-        try:
-            yield
-        finally:
-            websockets_server.serve = serve  # type: ignore[misc]
+        guarded.append(where)
+        return serve(*where, process_request=answer, logger=unheard, server_header=None, **options)
 
-    def require_in_place(self) -> None:
-        """Refuse a viser that serves in another way.
-
-        Raises:
-            InputError: it does.
-        """
-        if not self.is_in_place:
-            raise InputError(
-                "This version of viser serves its page in a way that cannot be guarded against strangers. Install one "
-                "that can: pip install 'viser==1.1.1'."
-            )
-
-    def _serve(self, handler: Handler, host: str, port: int, **options: Any) -> serve:
-        self.is_in_place = True
-        asyncio.get_running_loop().set_exception_handler(self._complain)
-        options["process_request"] = partial(self._answer, options["process_request"])
-        options["max_size"] = limits.MOST_MESSAGE_BYTES
-        return serve(
-            partial(self._handle, handler),
-            host,
-            port,
-            create_connection=GuardedConnection,
-            logger=unheard,
-            server_header=None,
-            **options,
+    websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]
+    try:
+        with redirect_stdout(StringIO()):  # viser prints boxes
+            server = ViserServer(host, port, label="nerf_lightning", verbose=False)
+    finally:
+        websockets_server.serve = serve  # type: ignore[misc]
+    if not guarded:
+        server.stop()
+        raise InputError(
+            "This version of viser serves its page in a way that cannot be guarded against strangers. Install one "
+            "that can: pip install 'viser==1.1.1'."
         )
+    return server
 
-    async def _handle(self, handler: Handler, connection: ServerConnection) -> None:
-        try:
-            await handler(connection)
-        except Exception as error:
-            self.complaints.say("a connection to the viewer was ended", error)
 
-    def _complain(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        # Without an exception it is a task that did not live to see the end of the server.
-        if (error := context.get("exception")) is not None:
-            self.complaints.say("the viewer did not do what a message asked for", error)
-
-    def _answer(self, viser: ProcessRequest, connection: ServerConnection, request: Request) -> Response | None:
-        headers, port = request.headers, connection.local_address[1]
-        hosts = headers.get_all("Host")
-        reason = self.admission.refusal(request.path, hosts, headers.get_all("Origin"), headers.get_all("Cookie"), port)
-        if reason is not None:
-            return _with(connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n"), FIXED)
-        # The page is marked below, which is easier while it is not compressed.
-        if "Accept-Encoding" in headers:
-            del headers["Accept-Encoding"]
+def _answer(
+    auth: Auth, viser: Callable[..., Response | None], connection: ServerConnection, request: Request
+) -> Response | None:
+    port = connection.local_address[1]
+    reason = auth.refusal(request.path, request.headers.get_all, port)
+    if reason is not None:
+        response: Response | None = connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
+    else:
         response = viser(connection, request)
-        if response is None:
-            full = len(connection.server.connections) >= limits.MOST_CONNECTIONS
-            return _with(connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL), FIXED) if full else None
-        scripts = self._mark(response) if response.headers.get("Content-Type", "").startswith("text/html") else "'none'"
-        if self.admission.brings_token(request.path):
-            response = _with(response, {"Set-Cookie": self.admission.cookie(port)})
-        return _with(response, headers_for(hosts[0], scripts))
-
-    def _mark(self, response: Response) -> str:
-        """Mark the page's scripts; return which scripts its policy lets run."""
-        page = marked(response.body or b"")
-        if page is None:
-            self.complaints.say(
-                "the page of this version of viser is not known here: it is shown, but nothing would keep a stranger's "
-                "script from being run if one got in. viser 1.1.1 has a page that is known"
-            )
-            return UNMARKED
-        response.body, scripts = page
-        _with(response, {"Content-Length": str(len(response.body))})
-        return scripts
-
-
-def _with(response: Response, headers: dict[str, str]) -> Response:
-    for name, value in headers.items():
-        if name in response.headers:
-            del response.headers[name]
-        response.headers[name] = value
+    if response is not None:
+        headers = HEADERS | {"Content-Security-Policy": POLICY.format(host=request.headers.get("Host", ""))}
+        if reason is None:
+            headers["Set-Cookie"] = auth.cookie(port)
+        response.headers.update(headers)
     return response

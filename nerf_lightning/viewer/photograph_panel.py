@@ -8,9 +8,8 @@ from typing import Any
 from PIL import Image
 
 from nerf_lightning.viewer.client import ViewerClient
+from nerf_lightning.viewer.error_log import as_plain_markdown, one_line
 from nerf_lightning.viewer.frusta import Frusta
-from nerf_lightning.viewer.plain_text import as_plain_markdown, one_line
-from nerf_lightning.viewer.ranges import within
 
 AT_ONCE = 9
 QUALITY = 80
@@ -70,7 +69,7 @@ class PhotographPanel:
         self.session.enter(view)
 
     def _add_controls(self) -> None:
-        harmless = self.session.queue.complaints.harmless
+        harmless = self.session.queue.errors.harmless
         self.gui.add_html(STYLE)
         visible = self.gui.add_checkbox("Show cameras", False, hint="Those may be clicked, too")
         self.name = self.gui.add_markdown("", visible=False)
@@ -88,7 +87,7 @@ class PhotographPanel:
         self.turn.on_click(harmless(self._turn))
 
     def _compare(self, _: Any) -> None:
-        self.session.split = within(self.split.value, 0.0, 1.0)
+        self.session.split = self.split.value
         self.session.present()
 
     def _search(self, _: Any) -> None:
@@ -100,8 +99,8 @@ class PhotographPanel:
 
     def _turn(self, _: Any) -> None:
         with self._lock:
-            after = self.first + {BEFORE: -AT_ONCE, AFTER: AT_ONCE}.get(self.turn.value, 0)
-            if 0 <= after < len(self._found) and after != self.first:
+            after = self.first + (AT_ONCE if self.turn.value == AFTER else -AT_ONCE)
+            if 0 <= after < len(self._found):
                 self.first = after
                 self._show_pictures()
 
@@ -117,7 +116,7 @@ class PhotographPanel:
     def _picture(self, view: int) -> Any:
         button = self.gui.add_button(one_line(self.names[view], MOST_LETTERS))
         button._icon_html = f'<img class="{MARK}" alt="" src="{self._address(view)}">'
-        button.on_click(self.session.queue.complaints.harmless(lambda _: self.enter(view)))
+        button.on_click(self.session.queue.errors.harmless(lambda _: self.enter(view)))
         return button
 
     def _address(self, view: int) -> str:

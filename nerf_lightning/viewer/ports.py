@@ -1,4 +1,4 @@
-"""A port to listen on: the one that is wished, or the next one that is free."""
+"""Where the page is: a port to listen on, the one that is wished or the next one that is free, and its address."""
 
 import logging
 import socket
@@ -47,6 +47,16 @@ def require_address(host: str, port: int) -> None:
             f"host={host}: this machine cannot listen there ({error}). Use 127.0.0.1 (this machine alone), "
             "0.0.0.0 (everybody who can reach it), or one of its own addresses."
         ) from error
+
+
+def address_of(host: str, port: int) -> str:
+    """Return where a browser on this machine finds what listens there.
+
+    >>> address_of("0.0.0.0", 80), address_of("::", 80), address_of("fd00::2", 80)
+    ('http://127.0.0.1:80', 'http://[::1]:80', 'http://[fd00::2]:80')
+    """
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def _try(host: str, port: int) -> None:

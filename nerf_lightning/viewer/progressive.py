@@ -3,12 +3,13 @@
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
-from nerf_lightning.viewer import limits
 from nerf_lightning.viewer.camera_state import CameraState
 from nerf_lightning.viewer.renderer import SlicedRenderer, View
 
 # Each picture has so many times the height of the one before; the last one may have more.
 FINER, AT_MOST_FINER = 2, 2.5
+# A picture has at most this many times most_height x most_height pixels; windows wider than 4:1 get a coarser one.
+MOST_SQUARES = 4
 
 
 @dataclass(frozen=True)
@@ -97,5 +98,5 @@ class ProgressiveRendering:
         return Job(look, height, False, renderer.slices(look, height))
 
     def _full_height(self, look: CameraState) -> int:
-        widest = int(self.most_height * (limits.MOST_SQUARES * look.height / look.width) ** 0.5)
+        widest = int(self.most_height * (MOST_SQUARES * look.height / look.width) ** 0.5)
         return max(1, min(look.height, self.most_height, widest))

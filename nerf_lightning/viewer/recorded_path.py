@@ -1,26 +1,24 @@
-"""A camera path that somebody makes of keyframes: added, changed, moved, read from a file, and saved as one."""
+"""A camera path that somebody makes of keyframes: added, changed, read from a file, and saved as one."""
 
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import accumulate, pairwise
+from itertools import accumulate, count, pairwise
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.types.scene import SceneRecord
+from nerf_lightning.nerf.geometry.frames import directions_to_user, points_to_user
 from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve, keyframe_focal, keyframe_poses
-from nerf_lightning.video.paths.keyframes import Keyframe, Point, read_keyframes, write_keyframes
-from nerf_lightning.viewer import limits
+from nerf_lightning.video.paths.keyframes import Keyframe, read_keyframes, write_keyframes
 
-LEAST_SECONDS, USUAL_SECONDS = 0.1, 2.0
+USUAL_SECONDS = 2.0
 ENDING = ".yaml"
 
 
@@ -36,7 +34,7 @@ class RecordedPath:
         self.around, self.folder = around, folder
         self.keyframes: list[Keyframe] = []
         self.legs: list[float] = []
-        """Seconds from the keyframe before; of the first one 0."""
+        """Seconds from the keyframe before; that of the first one means nothing."""
 
     @property
     def shape(self) -> float:
@@ -46,58 +44,26 @@ class RecordedPath:
     @property
     def times(self) -> list[float]:
         """When each keyframe is passed, in seconds from the first."""
-        return list(accumulate(self.legs))
-
-    @property
-    def seconds(self) -> float:
-        """How long the path takes."""
-        return sum(self.legs, 0.0)
+        return list(accumulate(self.legs[1:], initial=0.0))
 
     def insert(self, number: int, keyframe: Keyframe) -> None:
         """Put a keyframe at this place of the list.
 
         Raises:
-            InputError: the path is full.
+            InputError: its picture has no top.
         """
-        if len(self.keyframes) >= limits.MOST_KEYFRAMES:
-            raise InputError(f"A path has {limits.MOST_KEYFRAMES} keyframes at most. Save it, then delete some.")
-        self._put(
-            [*self.keyframes[:number], keyframe, *self.keyframes[number:]],
-            [*self.legs[:number], USUAL_SECONDS, *self.legs[number:]],
-        )
-
-    def change(self, number: int, keyframe: Keyframe) -> None:
-        """Put another camera in the place of a keyframe, at its time."""
-        self._put([*self.keyframes[:number], keyframe, *self.keyframes[number + 1 :]], self.legs)
-
-    def set_leg(self, number: int, seconds: float) -> None:
-        """Let the camera take so many seconds from the keyframe before to this one; what follows is passed later."""
-        self._put(self.keyframes, [*self.legs[:number], seconds, *self.legs[number + 1 :]])
-
-    def move(self, number: int, by: int) -> int:
-        """Change places with the keyframe before (`by` = -1) or after (1), where there is one; return the new place."""
-        other = number + by
-        if not 0 <= other < len(self.keyframes):
-            return number
-        keyframes = list(self.keyframes)
-        keyframes[number], keyframes[other] = keyframes[other], keyframes[number]
-        self._put(keyframes, self.legs)
-        return other
+        keyframe_poses([keyframe], self.around)
+        self.keyframes.insert(number, keyframe)
+        self.legs.insert(number, USUAL_SECONDS)
 
     def remove(self, number: int) -> None:
         """Take a keyframe away."""
-        self._put(
-            [*self.keyframes[:number], *self.keyframes[number + 1 :]],
-            [*self.legs[:number], *self.legs[number + 1 :]],
-        )
+        del self.keyframes[number], self.legs[number]
 
-    def poses(self) -> Float[Tensor, "keys 3 4"]:
-        """Return the cameras to world of the keyframes."""
-        return keyframe_poses(self.keyframes, self.around)
-
-    def fovs(self) -> list[float]:
-        """Return the vertical fields of view of the keyframes, in radians."""
-        return [self._vertical(keyframe_focal(each, self.around)) for each in self.keyframes]
+    def views(self) -> list[tuple[Float[Tensor, "3 4"], float]]:
+        """Return the camera to world of each keyframe, and its vertical field of view in radians."""
+        focals = [keyframe_focal(each, self.around) for each in self.keyframes]
+        return list(zip(keyframe_poses(self.keyframes, self.around), map(self._vertical, focals), strict=True))
 
     def curve(self) -> KeyframeCurve | None:
         """Return the curve through the keyframes; None where there are fewer than two.
@@ -109,17 +75,16 @@ class RecordedPath:
 
     def view_at(self, curve: KeyframeCurve, seconds: float) -> tuple[Float[Tensor, "3 4"], float]:
         """Return the camera to world at a time, and its vertical field of view in radians."""
-        at = torch.tensor([seconds], dtype=curve.knots.dtype).clamp(0.0, self.seconds)
+        at = torch.tensor([seconds], dtype=curve.knots.dtype).clamp(0.0, float(curve.knots[-1]))
         return curve.poses(at)[0].float(), self._vertical(float(curve.focal(at)))
 
     def files(self) -> list[str]:
-        """Return the names of the keyframe files of the folder, the newest first."""
+        """Return the names of the keyframe files of the folder, which are no links, the newest first."""
         try:
-            found = [each for each in self.folder.iterdir() if each.suffix == ENDING and not each.name.startswith(".")]
-            ordered = sorted(((each.stat().st_mtime, each.name) for each in found if is_own_file(each)), reverse=True)
-        except OSError:  # there is none yet, or somebody is removing it
+            found = [each for each in self.folder.glob(f"[!.]*{ENDING}") if each.is_file() and not each.is_symlink()]
+            return [each.name for each in sorted(found, key=lambda each: each.stat().st_mtime, reverse=True)]
+        except OSError:  # somebody is removing one
             return []
-        return [name for _, name in ordered if len(name) <= limits.MOST_LETTERS][: limits.MOST_PATHS]
 
     def load(self, name: str) -> None:
         """Take the keyframes of a file of the folder in place of these.
@@ -130,92 +95,60 @@ class RecordedPath:
         if name not in self.files():
             raise InputError(f"There is no keyframe file of this name in {self.folder} any more.")
         keyframes = read_keyframes(self.folder / name)
-        if len(keyframes) > limits.MOST_KEYFRAMES:
-            raise InputError(
-                f"{name} has {len(keyframes)} keyframes, and the page shows {limits.MOST_KEYFRAMES} at most."
-            )
         given = [each.time for each in keyframes if each.time is not None]
-        even = KeyframeCurve(keyframes, self.around, given)
-        times = given or (even.knots * USUAL_SECONDS * (len(keyframes) - 1)).tolist()
-        if float(even.poses(even.knots)[:, :, 3].abs().max()) > limits.MOST_COORDINATE:
-            raise InputError(f"{name} has a keyframe that is too far away for the page to show.")
-        even.focal(even.knots)
-        self._put(keyframes, [0.0, *(after - before for before, after in pairwise(times))])
+        curve = KeyframeCurve(keyframes, self.around, given)
+        times = given or (curve.knots * USUAL_SECONDS * (len(keyframes) - 1)).tolist()
+        self.keyframes, self.legs = keyframes, [0.0, *(after - before for before, after in pairwise(times))]
+
+    def timed(self) -> list[Keyframe]:
+        """Return the keyframes with their times."""
+        return [replace(each, time=round(time, 3)) for each, time in zip(self.keyframes, self.times, strict=True)]
 
     def save(self) -> Path:
         """Write a file of a new name, and return where it is.
 
         Raises:
-            InputError: there are fewer than two keyframes.
             OSError: it cannot be written.
         """
-        with free_name(self.folder, "camera_path", ENDING, limits.MOST_PATHS) as path:
-            self.write(path)
+        with new_file(self.folder, "camera_path", ENDING) as path:
+            write_keyframes(path, self.timed())
         return path
-
-    def write(self, path: Path) -> None:
-        """Write the keyframes with their times.
-
-        Raises:
-            InputError: there are fewer than two.
-            OSError: it cannot be written.
-        """
-        if len(self.keyframes) < 2:
-            raise InputError("A path needs two keyframes or more.")
-        timed = zip(self.keyframes, self.times, strict=True)
-        write_keyframes(path, [replace(each, time=round(time, 3)) for each, time in timed])
-
-    def _put(self, keyframes: list[Keyframe], legs: list[float]) -> None:
-        keyframe_poses(keyframes, self.around)  # what has no top is refused before it is here
-        within = [min(max(leg, LEAST_SECONDS), limits.MOST_SECONDS_BETWEEN) for leg in legs]
-        self.keyframes, self.legs = keyframes, [0.0, *within[1:]] if within else []
 
     def _vertical(self, focal: float) -> float:
         return 2 * math.atan(0.5 * self.around.height / focal)
 
 
-def is_own_file(path: Path) -> bool:
-    """Tell whether something is a plain file and no link to elsewhere."""
-    return path.is_file() and not path.is_symlink()
-
-
-def keyframe_in_user_frame(
-    position: Float[Tensor, "3"],
-    look_at: Float[Tensor, "3"],
-    up: Float[Tensor, "3"],
-    fov: float,
-    record: SceneRecord,
+def keyframe_of(
+    position: Float[Tensor, "3"], look_at: Float[Tensor, "3"], up: Float[Tensor, "3"], fov: float, around: PathFrame
 ) -> Keyframe:
-    """Return a keyframe of a camera in the model's frame.
+    """Return a keyframe, in the user's frame, of a camera in the model's.
 
     `fov` is vertical, in radians. A film has the photographs' shape, not the window's, and keeps this field.
     """
-    linear, offset = record.to_user[:3, :3].double(), record.to_user[:3, 3].double()
-    shape = float(record.cameras.width[0]) / float(record.cameras.height[0])
-    return Keyframe(
-        position=_rounded(linear @ position.double() + offset),
-        look_at=_rounded(linear @ look_at.double() + offset),
-        up=_rounded(normalize(linear @ up.double(), dim=0)),
-        fov=round(math.degrees(2 * math.atan(shape * math.tan(fov / 2))), 3),
-    )
-
-
-def _rounded(values: Tensor) -> Point:
-    x, y, z = (round(value, 6) for value in values.tolist())
-    return x, y, z
+    to_user, shape = around.to_user.double(), around.width / around.height
+    rows = [*points_to_user(torch.stack([position, look_at]).double(), to_user)]
+    rows.append(directions_to_user(up.double(), to_user))
+    eye, target, top = ((round(x, 6), round(y, 6), round(z, 6)) for x, y, z in (row.tolist() for row in rows))
+    degrees = math.degrees(2 * math.atan(shape * math.tan(fov / 2)))
+    return Keyframe(position=eye, look_at=target, up=top, fov=round(degrees, 3))
 
 
 @contextmanager
-def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]:
+def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
     """Lend a path with the first number that no file has; names never come from the page.
 
     An empty file keeps the name, so that of several browsers that save at once each has its own; it goes where the
     block fails.
 
     Raises:
-        OSError: there are `most` such files already (more clicks would fill the disk), or it cannot be made.
+        OSError: it cannot be made.
     """
-    path = _made(folder, stem, ending, most)
+    make_folder(folder)
+    for number in count(1):
+        path = folder / f"{stem}_{number:03d}{ending}"
+        with suppress(FileExistsError):
+            path.touch(exist_ok=False)
+            break
     try:
         yield path
     except BaseException:
@@ -223,16 +156,8 @@ def free_name(folder: Path, stem: str, ending: str, most: int) -> Iterator[Path]
         raise
 
 
-def _made(folder: Path, stem: str, ending: str, most: int) -> Path:
-    make_folder(folder)
-    for number in range(1, most + 1):
-        path = folder / f"{stem}_{number:03d}{ending}"
-        with suppress(FileExistsError):
-            path.touch(exist_ok=False)
-            return path
-    raise OSError(f"{folder} holds {most} of them, the most that the page writes")
-
-
-def not_saved(error: OSError) -> str:
-    """Return what to tell a person whose file could not be written."""
+def told(error: Exception) -> str:
+    """Return what to tell a person whose wish could not be granted, or whose file could not be written."""
+    if not isinstance(error, OSError):
+        return str(error)
     return f"It could not be saved: {error}. Make room, or start again with another paths.output_dir=DIR."

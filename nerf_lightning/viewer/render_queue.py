@@ -7,7 +7,7 @@ import time
 from types import FrameType
 from typing import Protocol, runtime_checkable
 
-from nerf_lightning.viewer.complaints import Complaints
+from nerf_lightning.viewer.error_log import ErrorLog
 from nerf_lightning.viewer.renderer import SlicedRenderer
 
 IDLE_SECONDS = 0.2
@@ -45,13 +45,13 @@ class RenderQueue:
 
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
-        self.complaints = Complaints(log)
+        self.errors = ErrorLog(log)
         self._refinements: dict[int, Turn] = {}
         self._lock = threading.Lock()
         self._wish = threading.Event()
 
     def add(self, client: int, refinement: Turn) -> None:
-        """Render for a client from now on, or a film (`film_job.FILM`)."""
+        """Render for a client from now on, or a film (`film.FILM`)."""
         with self._lock:
             self._refinements[client] = refinement
         self.wake()
@@ -61,10 +61,6 @@ class RenderQueue:
         with self._lock:
             self._refinements.pop(client, None)
 
-    def serves(self, client: int) -> bool:
-        """Tell whether this client is rendered for."""
-        return client in self._refinements
-
     def turn_of(self, client: int) -> Turn | None:
         """Return what is rendered for a client, or None."""
         return self._refinements.get(client)
@@ -72,10 +68,6 @@ class RenderQueue:
     def wake(self) -> None:
         """Say that a client wants another picture."""
         self._wish.set()
-
-    def wait(self, seconds: float) -> None:
-        """Sleep until a client wants another picture, or this time has passed."""
-        self._wish.wait(seconds)
 
     def refresh(self) -> None:
         """Render all pictures again: the model has changed."""
@@ -90,31 +82,28 @@ class RenderQueue:
         rendered is dropped: it ends neither the other clients' pages nor a training.
         """
         self._wish.clear()
-        for refinement in self._in_order():
+        with self._lock:
+            in_order = sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))
+        for refinement in in_order:
             refinement.served = time.monotonic()
             try:
                 if refinement.work(self.renderer):
                     return True
             except Exception as error:
                 refinement.give_up()
-                self.complaints.say("a picture of the viewer could not be drawn", error)
+                self.errors.say("a picture of the viewer could not be drawn", error)
                 return True
         return False
 
-    def work_until(self, stopped: list[int]) -> None:
-        """Render for everybody, slice by slice, until there is something in the list."""
-        while not stopped:
-            if not self.work():
-                self.wait(IDLE_SECONDS)
+    def work_or_wait(self, seconds: float = IDLE_SECONDS) -> None:
+        """Render a slice; where nothing is left to do, sleep until somebody wants more, or for this time."""
+        if not self.work():
+            self._wish.wait(seconds)
 
     @property
     def is_empty(self) -> bool:
         """Whether there is no client."""
         return not self._refinements
-
-    def _in_order(self) -> list[Turn]:
-        with self._lock:
-            return sorted(self._refinements.values(), key=lambda each: (not each.is_moving, each.served))
 
 
 def received_stop_signals() -> list[int]:

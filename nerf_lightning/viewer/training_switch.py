@@ -3,8 +3,15 @@
 import time
 from collections.abc import Callable
 
+from nerf_lightning.viewer.client import ViewerClient
+
 # A page that is loaded again is away for a moment; whoever is away for longer has left.
 AWAY_SECONDS = 15.0
+PAUSE, GO_ON = "Pause", "Go on"
+STOP, SURE = "Stop training", "Really stop: press again"
+# How long the second press is waited for.
+SURE_SECONDS = 8.0
+WHAT_STOP_IS = "The checkpoint is written, and the run evaluated."
 
 
 class TrainingSwitch:
@@ -17,7 +24,7 @@ class TrainingSwitch:
     def __init__(self, can_pause: bool = True):
         self.can_pause = can_pause
         self.step, self.num_steps = 0, 0
-        """How far the training is."""
+        """How far the training is; its owner sets them."""
         self.wants_pause = self.wants_stop = False
         self.on_change: dict[int, Callable[[], None]] = {}
         """What shows each person how it stands, by their number."""
@@ -57,11 +64,51 @@ class TrainingSwitch:
                 self.go_on()
         return time.monotonic() - began
 
-    def count(self, step: int, num_steps: int) -> None:
-        """Say how far the training is."""
-        self.step, self.num_steps = step, num_steps
-
     def show(self) -> None:
         """Let every page show how it stands."""
         for show in list(self.on_change.values()):
             show()
+
+    @property
+    def state(self) -> str:
+        """How it stands, in words."""
+        how = "Stopping at" if self.wants_stop else "Paused at" if self.wants_pause else "Running:"
+        far = f"step {self.step:,} of {self.num_steps:,}" if self.num_steps else "the first step"
+        return f"{how} {far}. {WHAT_STOP_IS if self.wants_stop else ''}".strip()
+
+
+class TrainingPanel:
+    """The panel's part that lets one person hold or end the training."""
+
+    def __init__(self, session: ViewerClient, switch: TrainingSwitch):
+        self.session, self.switch = session, switch
+        self._asked = 0.0
+        gui, harmless = session.client.gui, session.queue.errors.harmless
+        with gui.add_folder("Training"):
+            self.said = gui.add_markdown("")
+            self.hold = gui.add_button(PAUSE, visible=switch.can_pause, hint="No step is taken until somebody lets it")
+            self.end = gui.add_button(STOP, color="gray", hint=WHAT_STOP_IS)
+        self.hold.on_click(harmless(lambda _: switch.go_on() if switch.wants_pause else switch.pause()))
+        self.end.on_click(harmless(lambda _: self._stop()))
+        switch.on_change[session.client.client_id] = harmless(self.show)
+        self.show()
+
+    def show(self) -> None:
+        """Show how it stands."""
+        switch = self.switch
+        if not self.session.is_here():
+            switch.on_change.pop(self.session.client.client_id, None)
+            return
+        self.hold.label = GO_ON if switch.wants_pause else PAUSE
+        self.hold.visible = switch.can_pause and not switch.wants_stop
+        self.end.visible = not switch.wants_stop
+        if time.monotonic() - self._asked > SURE_SECONDS:
+            self.end.label = STOP
+        self.said.content = switch.state
+
+    def _stop(self) -> None:
+        now = time.monotonic()
+        if now - self._asked < SURE_SECONDS:
+            self.switch.stop()
+        self._asked = now
+        self.end.label = SURE

@@ -21,7 +21,7 @@ OURS = {
     "export/page_file.py": ["read_text"],
     "console.py": ["print"],
     "training/loggers.py": ["open"],
-    "viewer/film_panel.py": ["read_bytes"],
+    "viewer/film.py": ["read_bytes"],
     "runs/sweep.py": ["print"],
     "evaluation/protocol.py": ["read_text"],
     "training/launch/processes.py": ["open", "read_text"],

@@ -78,8 +78,7 @@ def served(folder: Path, record: dict | None = None, model=None, scene=None, hei
 
     def work() -> None:
         while not over.is_set():
-            if not queue.work():
-                queue.wait(0.02)
+            queue.work_or_wait(0.02)
 
     worker = threading.Thread(target=work, daemon=True)
     worker.start()

@@ -100,9 +100,9 @@ class Panel:
 
     def press(self, label):
         """Press a button."""
-        self.gui.made[label].act(None)
+        self.gui.made[label].act(MagicMock())
 
     def set(self, label, value):
         """Give a control a value, as somebody does in the page."""
         self.gui.made[label].value = value
-        self.gui.made[label].act(None)
+        self.press(label)

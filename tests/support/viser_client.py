@@ -58,13 +58,9 @@ class ViserClient:
         self.send(message | changed)
 
     def set(self, label: str, value: object) -> None:
-        """Give what stands under this label on the panel a value; True presses a button."""
-        self.update(label, {"value": value})
-
-    def update(self, label: str, updates: dict) -> None:
-        """Wait for a control of the panel, and send changes of it."""
+        """Give what stands under this label on the panel a value, as soon as it is there; True presses a button."""
         self.wait_until(lambda: label in self._uuids)
-        self.send({"type": "GuiUpdateMessage", "uuid": self._uuids[label], "updates": updates})
+        self.send({"type": "GuiUpdateMessage", "uuid": self._uuids[label], "updates": {"value": value}})
 
     def send(self, message: object) -> None:
         """Send a message as it is."""

@@ -1,12 +1,14 @@
 """What the channels of a view show."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
-from nerf_lightning.viewer.channels import CHANNELS, picture_of
+from nerf_lightning.viewer.channels import CHANNELS, FARTHEST, picture_of, planar_depth
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.viewer.shown_photographs import Photographs
 
@@ -37,6 +39,11 @@ def test_colour_and_opacity_are_themselves(plane):
 def test_near_is_bright(plane):
     picture = picture_of(plane, "depth").float().sum(dim=-1)
     assert picture[6, 6] > picture[0, 0]
+
+
+def test_what_hides_lines_is_as_far_along_the_axis_as_the_wall_and_light_hides_nothing(plane):
+    assert planar_depth(plane) == pytest.approx(4.0, abs=1e-5)
+    assert planar_depth(replace(plane, opacity=torch.zeros(12, 12))).min() == pytest.approx(FARTHEST)
 
 
 def test_every_channel_has_the_views_size(plane):

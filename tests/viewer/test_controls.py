@@ -1,11 +1,9 @@
 """The panel: what is saved where it can be, and what is not there is said."""
 
-import math
-
 import pytest
 from support.viewer_panel import Panel
 
-from nerf_lightning.viewer import controls, limits
+from nerf_lightning.viewer import controls
 
 
 def snapshot(panel):
@@ -40,33 +38,6 @@ def test_a_full_disk_is_said_and_ends_nothing(tmp_path, monkeypatch):
 def test_a_place_that_cannot_be_a_folder_is_said(tmp_path):
     (tmp_path / "viewer").write_text("")
     assert "could not be saved" in snapshot(Panel(tmp_path / "viewer" / "deeper"))
-
-
-def test_snapshots_are_limited_and_it_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "MOST_SNAPSHOTS", 2)
-    panel = Panel(tmp_path)
-    assert [snapshot(panel) for _ in range(3)][-1].startswith(
-        f"It could not be saved: {tmp_path} holds 2 of them, the most that the page writes. Make room"
-    )
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_values_that_no_slider_has_are_clamped(tmp_path):
-    panel = Panel(tmp_path)
-    made = panel.gui.made
-    made["Field of view"].value = 1e9
-    made["Field of view"].act(None)
-    assert panel.client.camera.fov == pytest.approx(math.radians(120))
-    made["Show"].value = "no channel"
-    made["Show"].act(None)
-    assert panel.session.channel == "colour"
-    made["x"].value = (5.0, -5.0)
-    made["Show only what is in the box"].value = True
-    made["x"].act(None)
-    assert panel.session.crop.size[0].item() == pytest.approx(0.02)
-    made["Photograph | render"].value = -3.0
-    made["Photograph | render"].act(None)
-    assert panel.session.split == 0
 
 
 def test_a_click_that_fails_is_a_line_in_the_log(tmp_path, monkeypatch, caplog):

@@ -7,7 +7,6 @@ import pytest
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import ports
-from nerf_lightning.viewer.page import address_of
 from nerf_lightning.viewer.ports import free_port
 
 
@@ -42,11 +41,3 @@ def test_an_address_that_is_not_this_machines_is_named():
 def test_a_port_that_is_none_is_named(port):
     with pytest.raises(InputError, match=f"port={port}: give a number"):
         free_port("127.0.0.1", port)
-
-
-def test_an_address_is_one_that_a_browser_takes():
-    """What is heard everywhere has no address of its own; colons stand in brackets."""
-    assert address_of("::", 8080) == "http://[::1]:8080"
-    assert address_of("::1", 8080) == "http://[::1]:8080"
-    assert address_of("0.0.0.0", 8080) == "http://127.0.0.1:8080"
-    assert address_of("castle.example", 8080) == "http://castle.example:8080"

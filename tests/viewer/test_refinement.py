@@ -107,14 +107,3 @@ def test_who_moves_comes_before_who_waits_for_details_and_nobody_starves():
     queue.work()
     assert people[2]._job is not None
     assert people[1]._job is None
-
-
-def test_somebody_who_left_is_not_served():
-    queue = RenderQueue(FakeRenderer())
-    person = ProgressiveRendering(lambda *_: None, 300)
-    person.ask(a_look())
-    queue.add(1, person)
-    assert not queue.is_empty
-    queue.remove(1)
-    assert not queue.work()
-    assert queue.is_empty

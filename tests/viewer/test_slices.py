@@ -59,18 +59,10 @@ def test_a_photographs_look_in_slices_is_its_picture(scene, renderer):
 def test_a_free_look_from_a_photographs_place_sees_what_the_photograph_sees(scene, renderer):
     fov = 2 * float(torch.atan(torch.tensor(0.5 / 1.6)))
     view, _ = finished(renderer.slices(CameraState(scene.cameras.c2w[2], fov, 640, 640), 16))
-    whole = render_picture(
-        renderer.model, RayGenerator(scene.cameras, view_near(scene, 2), view_far(scene, 2)), 2, "white", 4096
-    )
+    _, near, far = camera_of(CameraState(scene.cameras.c2w[2], 1.0, 1, 1), scene_record(scene), 1)
+    rays = RayGenerator(scene.cameras, near.expand(4), far.expand(4))
+    whole = render_picture(renderer.model, rays, 2, "white", 4096)
     assert torch.allclose(view.rgb, whole.rgb, atol=1e-4)
-
-
-def view_near(scene, view):
-    return camera_of(CameraState(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[1].expand(4)
-
-
-def view_far(scene, view):
-    return camera_of(CameraState(scene.cameras.c2w[view], 1.0, 1, 1), scene_record(scene), 1)[2].expand(4)
 
 
 def test_outside_of_the_crop_box_there_is_only_background(scene, renderer):

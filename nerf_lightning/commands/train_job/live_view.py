@@ -16,11 +16,11 @@ from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS
-from nerf_lightning.viewer.admission import named_places
-from nerf_lightning.viewer.film_job import FILM, end_film
+from nerf_lightning.viewer.auth import names_of
+from nerf_lightning.viewer.film import FILM, end_film
 from nerf_lightning.viewer.page import Page, require_viser
 from nerf_lightning.viewer.ports import require_address
-from nerf_lightning.viewer.render_queue import IDLE_SECONDS, RenderQueue
+from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.shown_photographs import Photographs
 from nerf_lightning.viewer.training_switch import TrainingSwitch
@@ -54,8 +54,7 @@ class LiveView(Callback):
         share: largest part of the time that goes into pictures.
         refresh_seconds: time between two pictures of the same view.
         max_height: the finest picture, in pixels.
-        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1]; each at the page's port
-            unless it has its own, like gate.example:443.
+        hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1], like gate.example.
 
     Raises:
         InputError: no viser, no place to listen, or a host that is none.
@@ -72,7 +71,7 @@ class LiveView(Callback):
     ):
         require_viser()
         require_address(host, port)
-        named_places(hosts)
+        names_of(hosts)
         if not 0 < share < 1:
             raise InputError(f"viewer.live_view.share={share}: give a part of the time between 0 and 1, like 0.15.")
         self.host, self.port, self.hosts = host, port, hosts
@@ -113,7 +112,7 @@ class LiveView(Callback):
             self._say(f"the training was stopped in the page at step {trainer.global_step}")
         if self.page is None:
             return
-        self.switch.count(trainer.global_step, pl_module.step.num_steps)
+        self.switch.step, self.switch.num_steps = trainer.global_step, pl_module.step.num_steps
         if self.switch.wants_pause:
             self._pause(trainer, pl_module, self.page)
         now = time.perf_counter()
@@ -146,14 +145,9 @@ class LiveView(Callback):
         self.switch.show()
         try:
             renderer.share = 1.0
-
-            def work() -> None:
-                if not page.queue.work():
-                    page.queue.wait(IDLE_SECONDS)
-
             seconds = self.switch.pause_while(
-                work,
-                lambda: not page.is_empty or page.queue.serves(FILM),
+                page.queue.work_or_wait,
+                lambda: not page.is_empty or page.queue.turn_of(FILM) is not None,
                 lambda: any(each.received is not None for each in signals),
             )
         finally:

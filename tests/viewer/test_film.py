@@ -5,8 +5,7 @@ import pytest
 from support.videos import read_video
 from support.viewer_panel import Panel
 
-from nerf_lightning.viewer import limits
-from nerf_lightning.viewer.film_job import FILM
+from nerf_lightning.viewer.film import FILM, end_film
 
 
 @pytest.fixture
@@ -26,13 +25,12 @@ def said(panel):
 
 def finished(panel):
     panel.work()
-    panel.wait(lambda: not panel.queue.serves(FILM))
+    panel.wait(lambda: panel.queue.turn_of(FILM) is None)
 
 
 def test_the_path_becomes_a_film_that_is_downloaded(panel, tmp_path):
     panel.work()
     panel.press("Render film")
-    assert said(panel) == "Frame 0 of 1"
     while "Frame 3 of" not in said(panel):
         panel.queue.work()
     assert said(panel) == "Frame 3 of 7"
@@ -43,7 +41,7 @@ def test_the_path_becomes_a_film_that_is_downloaded(panel, tmp_path):
     assert said(panel) == "Frame 3 of 7"
     finished(panel)
     film = tmp_path / "viewer" / "film_001" / "video.mp4"
-    assert said(panel) == f"The film is at `{film}`"
+    panel.wait(lambda: said(panel) == f"The film is at `{film}`")
     assert sorted(each.name for each in film.parent.iterdir()) == ["camera_path.yaml", "video.mp4"]
     assert read_video(film)[1].shape == (7, 32, 32, 3)
     panel.press("Download")
@@ -51,44 +49,38 @@ def test_the_path_becomes_a_film_that_is_downloaded(panel, tmp_path):
     assert (name, content) == ("film_001.mp4", film.read_bytes())
 
 
-def test_a_film_is_stopped_and_leaves_nothing(panel, tmp_path):
+@pytest.mark.parametrize("stop", [lambda panel: panel.press("Stop the film"), lambda panel: end_film(panel.queue)])
+def test_a_film_is_stopped_and_leaves_nothing(panel, tmp_path, stop):
     panel.press("Render film")
     for _ in range(4):
         panel.queue.work()
-    panel.press("Stop the film")
+    stop(panel)
     finished(panel)
     assert "The film was stopped." in said(panel)
     assert list((tmp_path / "viewer").iterdir()) == []
     assert panel.gui.made["Render film"].visible
 
 
-def test_a_film_goes_on_when_its_maker_goes(panel, tmp_path):
-    panel.press("Render film")
-    panel.queue.remove(panel.client.client_id)
-    finished(panel)
-    assert (tmp_path / "viewer" / "film_001" / "video.mp4").is_file()
-
-
-def test_one_film_is_made_at_a_time(panel):
+def test_a_film_goes_on_when_its_maker_goes_and_stays_when_the_next_one_fails(panel, tmp_path):
     panel.press("Render film")
     panel.press("Render film")
     assert said(panel).startswith("Another film is being made.")
+    panel.queue.remove(panel.client.client_id)
+    finished(panel)
+    (tmp_path / "viewer").rename(tmp_path / "kept")
+    (tmp_path / "viewer").write_text("")
+    panel.press("Render film")
+    assert panel.queue.turn_of(FILM) is None
+    assert (tmp_path / "kept" / "film_001" / "video.mp4").is_file()
 
 
-def test_what_cannot_be_filmed_is_said_and_leaves_nothing(panel, tmp_path, monkeypatch):
-    panel.set("Show only what is in the box", True)
-    for axis in "xyz":
-        panel.set(axis, (-1.0, 1.0))
-    panel.controls.session.crop_corners = ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+def test_what_cannot_be_filmed_is_said_and_leaves_nothing(panel, tmp_path):
+    panel.session.crop_corners = ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
     panel.press("Render film")
     finished(panel)
     assert "stands inside the box" in said(panel)
     assert list((tmp_path / "viewer").iterdir()) == []
-    monkeypatch.setattr(limits, "MOST_FILMS", 0)
-    panel.press("Render film")
-    assert "holds 0 films" in said(panel)
-    for _ in range(2):
-        panel.set("Change it", "Delete")
+    panel.press("Delete keyframe")
     panel.press("Render film")
     assert said(panel).startswith("Add two keyframes")
 
@@ -102,15 +94,8 @@ def test_a_frame_that_cannot_be_rendered_ends_the_film_alone(panel, tmp_path, mo
     assert list((tmp_path / "viewer").iterdir()) == []
 
 
-def test_numbers_that_no_control_has_are_clamped_and_large_films_are_not_sent(panel, tmp_path, monkeypatch):
+def test_numbers_that_no_control_has_are_clamped(panel, tmp_path):
     panel.gui.made["Width"].value, panel.gui.made["Frame rate"].value = -(10**9), -5
     panel.press("Render film")
     finished(panel)
     assert read_video(tmp_path / "viewer" / "film_001" / "video.mp4")[1].shape == (1, 32, 32, 3)
-    monkeypatch.setattr(limits, "MOST_DOWNLOAD_BYTES", 10)
-    panel.press("Download")
-    assert said(panel).startswith("It is too large to be sent")
-    (tmp_path / "viewer" / "film_001" / "video.mp4").unlink()
-    panel.press("Download")
-    assert "cannot be read any more" in said(panel)
-    panel.client.send_file_download.assert_not_called()

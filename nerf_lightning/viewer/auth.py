@@ -1,0 +1,96 @@
+"""Who may speak to the page: whoever has its token, under a name that is known, and from no other site."""
+
+import hmac
+import re
+import secrets
+from collections.abc import Callable, Sequence
+
+from nerf_lightning.messages.errors import InputError
+
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+# A machine's name or address, and perhaps a port.
+HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9_-]+(?:\.[a-z0-9_-]+)*)(?::[0-9]{1,5})?")
+NO_TOKEN = "This page is for whoever has its token: open the address with ?token= that nerf printed when it started."
+FOREIGN = "This request comes from another site, which may not speak to this page."
+
+
+class Auth:
+    """Judge requests by their address and their headers.
+
+    A site that somebody visits can send requests to this machine with that person's browser, which says truthfully
+    where they come from (Origin) and which name it believes to speak to (Host). Other programs lie as they please, so
+    they need the token; it comes in the address at first, and then in a cookie that no script reads.
+
+    Ports are not compared with the page's own, so tunnels work.
+
+    Args:
+        host: the address that is listened on.
+        hosts: further names by which browsers find the page.
+
+    Raises:
+        InputError: a name that is none.
+    """
+
+    def __init__(self, host: str, hosts: Sequence[str] | str | None = None):
+        self.token = secrets.token_urlsafe(32)
+        self._given = names_of(hosts)
+        self._known = {*LOCAL, f"[{host}]" if ":" in host else host.lower(), *self._given}
+
+    def refusal(self, path: str, values: Callable[[str], list[str]], port: int) -> str | None:
+        """Return why a request is refused, in one sentence; None: it may pass.
+
+        Args:
+            path: what is asked for, with the query.
+            values: returns those of a header.
+            port: where the page listens.
+        """
+        host, origin = (", ".join(values(name)).lower() for name in ("Host", "Origin"))
+        name = name_of(host)
+        if name not in self._known:
+            return f"The page is not served under this name: if it is yours, start nerf with viewer.hosts=[{name}]."
+        source = origin.partition("://")[2]
+        if origin and source != host and name_of(source) not in self._given:
+            return FOREIGN
+        cookies = [pair.strip() for header in values("Cookie") for pair in header.split(";")]
+        in_query = _holds(path.partition("?")[2].split("&"), f"token={self.token}")
+        return None if in_query or _holds(cookies, self._pair(port)) else NO_TOKEN
+
+    def cookie(self, port: int) -> str:
+        """Return the header that keeps the token in the browser: no other site's request carries it."""
+        return f"{self._pair(port)}; HttpOnly; SameSite=Strict; Path=/"
+
+    def _pair(self, port: int) -> str:
+        # Browsers keep the cookies of one machine together, whatever the port.
+        return f"nerf_lightning_{port}={self.token}"
+
+
+def names_of(hosts: Sequence[str] | str | None) -> set[str]:
+    """Return the names in `viewer.hosts`, without their ports.
+
+    Raises:
+        InputError: a name that is none.
+    """
+    names = set()
+    for each in [hosts] if isinstance(hosts, str | int) else hosts or ():
+        name = name_of(str(each).lower())
+        if name is None:
+            raise InputError(
+                f"viewer.hosts: {each!r} is no name of a machine: give names of machines like castle.example or "
+                "192.168.1.5."
+            )
+        names.add(name)
+    return names
+
+
+def name_of(host: str) -> str | None:
+    """Return the name in a host that may have a port, or None where it is none.
+
+    >>> name_of("localhost:80"), name_of("[::1]"), name_of("a b")
+    ('localhost', '[::1]', None)
+    """
+    found = HOST.fullmatch(host)
+    return found[1] if found else None
+
+
+def _holds(given: list[str], secret: str) -> bool:
+    return any(hmac.compare_digest(each.encode("utf-8", "surrogateescape"), secret.encode()) for each in given)
