@@ -38,7 +38,7 @@ def watching_seconds(
         batch: the rays of a step.
     """
     seconds = {}
-    outputs = step(batch, optimizer, measure_gradients=True)
+    outputs = {"step": step(batch, optimizer, measure_gradients=True)}
     with _trainer(data) as trainer:
         system = _system(step, optimizer)
         for watcher in watchers:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.nerf.kernels.backends import can_compile
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
@@ -16,25 +15,12 @@ from nerf_lightning.nerf.products import Products, cpu_multiplies_bfloat16
 POINTS, RAY_SAMPLES = 65_536, 32
 
 
-def kernel_ratios(device: torch.device, rounds: int) -> dict[str, list[float]]:
-    """Return seconds of our kernels, and how many times longer torch takes, round by round (forward and backward)."""
-    result: dict[str, list[float]] = {}
+def compared_kernels(device: torch.device) -> dict[str, dict[str, Callable[[], None]]]:
+    """Return our kernels with what torch does in their place, forward and backward; "ours" comes first."""
     compared = {"hash grid 8 x 4": _hash_grid(device), "MLP 32-64-64-3": _mlp(device, "float32")}
     if device.type != "cpu" or cpu_multiplies_bfloat16():
         compared["MLP 32-64-64-3 in bfloat16"] = _mlp(device, "bfloat16")
-    for name, kinds in compared.items():
-        seconds = {kind: [seconds_of(work) for _ in range(2)][1:] for kind, work in kinds.items()}
-        for _ in range(rounds):
-            for kind, work in kinds.items():
-                seconds[kind].append(seconds_of(work))
-        ours = seconds["ours"][1:]
-        result[f"{name}, milliseconds"] = [1e3 * value for value in ours]
-        for kind in kinds:
-            if kind != "ours":
-                result[f"{name}, times torch {kind}"] = [
-                    theirs / mine for theirs, mine in zip(seconds[kind][1:], ours, strict=True)
-                ]
-    return result
+    return compared
 
 
 def points_along_rays(device: torch.device) -> Tensor:

@@ -112,6 +112,6 @@ def flops_per_ray(step: TrainStep, batch: Batch) -> float:
     # Where rays differ in their samples, many make the mean.
     few = 8 if step.model.points_per_ray(training=True) > 64 else min(1024, batch.num_rays)
     rays = batch[:few]
-    with FlopCounterMode(display=False) as counter, without("mlp.cpu"):  # it counts one thread's
+    with FlopCounterMode(display=False) as counter, without("mlp.cpu", "render.gradients"):  # it sees torch's alone
         step.gradients(rays)
     return counter.get_total_flops() / few

@@ -1,25 +1,20 @@
-"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page; or pages of several."""
-
-import os
-from pathlib import Path
+"""Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page."""
 
 import torch
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
-from nerf_lightning.commands.gallery_pages import page_maker
 from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.compute import ranks
-from nerf_lightning.config.instantiate import build, required_path
+from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
-from nerf_lightning.export.base import Export, PageExtras, RunsExport
+from nerf_lightning.export.base import Export, PageExtras
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say
 from nerf_lightning.nerf.models.base import point_field
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
-from nerf_lightning.runs.results import find_runs
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
 from nerf_lightning.video.paths.base import CameraPath
@@ -34,13 +29,6 @@ def export(config: DictConfig) -> None:
     """Export a checkpoint; it is all that is needed. One process does it, however many there are."""
     if not ranks.is_first():
         return
-    several = isinstance(build(config.what), RunsExport)
-    written = export_runs(config) if several else export_one(config)
-    say(*map(str, written))
-
-
-def export_one(config: DictConfig) -> list[Path]:
-    """Export one checkpoint, and return where the files are."""
     what: Export = build(config.what)
     path = build(config.path) if what.plays_path else None
     # In float32, whatever the run was trained in: a surface shows the steps of bfloat16.
@@ -57,19 +45,7 @@ def export_one(config: DictConfig) -> list[Path]:
         written = what.export(opened.model, record, folder, opened.tile_points)
     if opened.checkpoint.given_cameras is not None:
         say("the cameras are those that training refined (refinement=...), not those that were read")
-    return written
-
-
-def export_runs(config: DictConfig) -> list[Path]:
-    """Export several runs; by default where all of them lie."""
-    what: RunsExport = build(config.what)
-    given = config.ckpt if isinstance(config.ckpt, ListConfig) else [config.ckpt]
-    folders = [Path(required_path("ckpt", each)) for each in given]
-    runs = find_runs(folders, "ckpt")
-    first = folders[0].absolute()
-    default = first if len(folders) == 1 else Path(os.path.commonpath([each.absolute().parent for each in folders]))
-    with filled_folder(config.paths.output_dir, default) as folder:
-        return what.export(runs, folder, page_maker(export_one))
+    say(*map(str, written))
 
 
 def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> PageExtras:

@@ -1,7 +1,7 @@
 """The contract of an export: a model in, files out, in the user's own frame."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,23 +51,6 @@ class Export(ABC):
 
         Raises:
             InputError: a setting that makes no sense, or a model in which there is nothing to export.
-        """
-
-
-class RunsExport(ABC):
-    """Write what several runs have learnt as files beside each other."""
-
-    @abstractmethod
-    def export(self, runs: Sequence[Path], target: Path, page_of: Callable[[Path, Any], Path]) -> list[Path]:
-        """Write files into `target` and return where they are.
-
-        Args:
-            runs: their folders.
-            target: is there, and can be written.
-            page_of: makes the page of a run in a quality, and returns where it is, or raises `InputError`.
-
-        Raises:
-            InputError: a setting that makes no sense.
         """
 
 

@@ -8,7 +8,7 @@ from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export, require_setting
-from nerf_lightning.export.page_file import MARK, is_page, page_of, write_page
+from nerf_lightning.export.page_file import is_page, page_of, write_page
 from nerf_lightning.export.voxel_kernels.layout import ROOM
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
@@ -96,13 +96,13 @@ class PageExport(Export):
         return [f"size         {size} (what.quality={self.quality})", *(f"{a:<12} {b}" for a, b in cost.facts())]
 
 
-def require_no_other(target: Path, mark: bytes = MARK) -> None:
+def require_no_other(target: Path) -> None:
     """Refuse to write over what is no page of ours.
 
     Raises:
         InputError: there is such a file, or a folder.
     """
-    if target.is_dir() or (target.exists() and not is_page(target, mark)):
+    if target.is_dir() or (target.exists() and not is_page(target)):
         kind = "a folder" if target.is_dir() else "a file that is no page of this program"
         raise InputError(
             f"{target} is {kind}, and would be lost. Move it away, or give another folder with paths.output_dir=DIR."

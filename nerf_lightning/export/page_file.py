@@ -135,11 +135,11 @@ def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
         raise InputError(f"The page {path} is damaged: {error}. Export it again.") from error
 
 
-def is_page(path: Path, mark: bytes = MARK) -> bool:
-    """Tell whether a file begins as our pages do, or as others of ours with a mark of their own."""
+def is_page(path: Path) -> bool:
+    """Tell whether a file begins as our pages do."""
     try:
         with open_regular(path, None) as file:
-            return mark in file.read(200)
+            return MARK in file.read(200)
     except InputError:
         return False
 

@@ -88,19 +88,15 @@ def _as_given(patterns: Sequence[str] | None) -> str:
     return patterns[0] if len(patterns) == 1 else f"[{','.join(patterns)}]"
 
 
-def find_runs(folders: Sequence[Path], setting: str = "runs") -> list[Path]:
+def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders in these folders, and what `nerf eval` wrote on its own; nothing is followed out of them.
-
-    `setting` is what the folders were given with.
 
     Raises:
         InputError: a folder is not there, or there is no run in them.
     """
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(
-                f"{setting}={folder}: there is no such folder. Give run folders, or folders that hold some."
-            )
+            raise InputError(f"runs={folder}: there is no such folder. Give run folders, or folders that hold some.")
     found = list(dict.fromkeys(run for folder in folders for run in _runs_below(folder)))
     if not found:
         named = ", ".join(map(str, folders))

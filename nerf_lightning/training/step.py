@@ -259,9 +259,6 @@ class TrainStep:
             context = StepContext(progress.step / self.num_steps, progress.step, self._key)
             for part in self._parts():
                 part.on_step(context)
-            key = fold(self.seed, progress.attempt, progress.step, "correction")
-            tile_points = WHOLE_BATCH_POINTS if self.tile_points is None else self.tile_points
-            self.correction.follow(context.progress, self.model, self.rays, tile_points, key)
         self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
         share = self._share(ranks.total(batch.weight.sum()))

@@ -36,7 +36,7 @@ from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.page import Report, page
-from nerf_lightning.report.pages import address_from
+from nerf_lightning.report.read_run import address_from
 from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.visualization.figures import new_figure, picture_of
 from nerf_lightning.visualization.pictures import with_caption

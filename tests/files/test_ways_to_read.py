@@ -56,8 +56,6 @@ OTHERWISE = {
     "sfm/video_frames.py": ["imiter"],
     "files/atomic.py": ["open", "open"],
     "export/points.py": ["open"],
-    # The still picture of a page, of limited size, decoded and encoded anew.
-    "report/gallery.py": ["open", "read_text"],
     "files/tensor_files.py": ["load"],
     "files/regular.py": ["open"],
 }

@@ -7,8 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.types.rays import PixelIndex
@@ -35,17 +33,6 @@ class Correction(Part, ABC):
                 f"The scene {scene.name} trains on one photograph, and a correction learns how the colours of several "
                 "differ: add correction=none, or give more photographs."
             )
-
-    def follow(self, share: float, model: Model, rays_of: RayGenerator, tile_points: int, key: int) -> None:
-        """Take note of how far the run is, before each step of training.
-
-        Args:
-            share: of the run's steps that have been taken.
-            model: as it has been learnt so far.
-            rays_of: the cameras, likewise.
-            tile_points: most points that go through a field at once.
-            key: of this step's random numbers.
-        """
 
     def photographed(self, rendering: Rendering, pixels: PixelIndex) -> Rendering:
         """Return a rendering whose colours are those that photographs show.

@@ -140,28 +140,6 @@ def picture_surface(
 
 
 @torch.no_grad()
-def surface_points(
-    model: Model, rays_of: RayGenerator, pixels: PixelIndex, tile_points: int
-) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels"]]:
-    """Return where in the world the light of pixels comes from, at the expected depth, and their opacity; on the CPU.
-
-    Args:
-        model: in evaluation mode.
-        rays_of: the cameras.
-        pixels: any pixels of any views.
-        tile_points: most points that go through a field at once.
-    """
-    pixels = pixels.to(rays_of.near.device)
-    rays = rays_of(pixels).to("cpu")
-    seen = render_rays(model, rays, "black", tile_points)
-    if rays_of.cameras.ndc is None:
-        return rays.origins + seen.depth[:, None] * rays.directions, seen.opacity
-    straight = rays_of.through_world(pixels).to("cpu")
-    depth = world_distance(straight, seen.depth / rays.far)
-    return straight.origins + depth[:, None] * straight.directions, seen.opacity
-
-
-@torch.no_grad()
 def render_rays(model: Model, rays: RayBundle, background: Background, tile_points: int) -> Picture:
     """Return what rays see, as at evaluation, on the CPU.
 

@@ -22,17 +22,6 @@ def to_linear(rgb: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
     return torch.where(above, power, rgb / SLOPE)
 
 
-def to_encoded(light: Float[Tensor, "*colours"]) -> Float[Tensor, "*colours"]:
-    """Return the encoded colours of linear light, x(v).
-
-    >>> to_encoded(torch.tensor([0.0, 0.5, 1.0]))
-    tensor([0.0000, 0.7354, 1.0000])
-    """
-    above = light > KNEE / SLOPE
-    power = (1.0 + OFFSET) * torch.where(above, light, 1.0) ** (1.0 / POWER) - OFFSET
-    return torch.where(above, power, light * SLOPE)
-
-
 def scale_light(rgb: Float[Tensor, "*colours"], gain: Float[Tensor, "*#colours"]) -> Float[Tensor, "*colours"]:
     """Return the encoded colours of g times the light of encoded colours, x(g v(x)).
 

@@ -12,9 +12,8 @@ from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.models.render_image import render_picture, surface_points
+from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
-from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 
@@ -49,10 +48,6 @@ def test_depth_in_normalised_device_coordinates_is_distance_in_the_world(depth):
     expected = (depth + 0.3) / -rays.directions[..., 2]
     torch.testing.assert_close(picture.depth, expected, rtol=0.01, atol=0)
     assert bool((picture.opacity > 0.999).all())
-    pixels = PixelIndex(*(each.flatten()[:5] for each in vars(all_pixels(straight, 0)).values()))
-    points, opacity = surface_points(model, RayGenerator(bent, near, far), pixels, tile_points=100_000)
-    torch.testing.assert_close(points[:, 2], torch.full((5,), -depth), rtol=0.01, atol=0)
-    assert bool((opacity > 0.999).all())
 
 
 def test_what_is_cut_off_in_normalised_device_coordinates_is_gone_and_depth_stays():
@@ -84,13 +79,6 @@ def test_elsewhere_depth_is_the_distance_along_the_ray():
     )
     rays = rays_through_pixels(cameras, all_pixels(cameras, 0), torch.zeros(1), torch.ones(1))
     torch.testing.assert_close(picture.depth, 3.0 / -rays.directions[..., 2], rtol=0.01, atol=0)
-    pixels = PixelIndex(torch.zeros(2, dtype=torch.int64), torch.tensor([0, 3]), torch.tensor([1, 2]))
-    near, far = torch.full((1,), 1.0), torch.full((1,), 6.0)
-    points, _ = surface_points(model, RayGenerator(cameras, near, far), pixels, tile_points=100_000)
-    expected = torch.tensor(
-        [[3 * (0.5 - 2) / 10, -3 * (1.5 - 2) / 10, -3.0], [3 * (3.5 - 2) / 10, -3 * 0.5 / 10, -3.0]]
-    )
-    torch.testing.assert_close(points, expected, rtol=0.01, atol=1e-3)
 
 
 class Ball(Wall):

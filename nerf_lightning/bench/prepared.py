@@ -1,0 +1,119 @@
+"""`nerf bench`: the model, its data and its optimizer, ready to be trained on and rendered, our way or plainly.
+
+"Plain" is the same mathematics as one would first write it: float32, whole batches, torch around the same hash grid
+kernel, no screening of what lies behind opaque samples.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from omegaconf import DictConfig
+
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.data.datamodule import RayDataModule
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.kernels.backends import without
+from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.render_image import render_rays
+from nerf_lightning.nerf.rendering.blending import background_colors
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import Batch
+from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.training.build import build_step
+from nerf_lightning.training.launch.trainer import TrainerSettings
+from nerf_lightning.training.step import TrainStep
+from nerf_lightning.training.tile_size import measured_tile
+
+
+@dataclass
+class Bench:
+    """What is measured, ready to run."""
+
+    settings: TrainerSettings
+    step: TrainStep
+    data: RayDataModule
+    optimizer: torch.optim.Optimizer
+    plain_optimizer: torch.optim.Optimizer
+
+    @property
+    def batches(self) -> RayBatches:
+        """The training rays."""
+        return self.data.batches
+
+    @cached_property
+    def batch(self) -> Batch:
+        """The batch that every kind gets, as large as batches are once the model has been trained."""
+        return self.batches.at(0, self.batches.crop_rays(0)).to(self.settings.device)
+
+    def train(self, steps: int, plain: bool = False) -> None:
+        """Take steps on the one batch."""
+        with self._plainly() if plain else nullcontext():
+            for _ in range(steps):
+                self.train_on(self.batch, plain)
+        self.step.tile_points = self.settings.tile_points
+
+    def train_on(self, batch: Batch, plain: bool = False) -> None:
+        """Compute gradients and update, and nothing else."""
+        optimizer = self.plain_optimizer if plain else self.optimizer
+        optimizer.zero_grad()
+        self.step.gradients(batch)
+        optimizer.step()
+
+    def take_step(self) -> None:
+        """Take one step of training, loading and all."""
+        progress = self.batches.progress
+        batch = self.batches.at(progress.attempt, progress.rays_seen).to(self.settings.device)
+        self.step(batch, self.optimizer)
+
+    def render(self, num_rays: int, plain: bool = False) -> None:
+        """Render rays of the one batch."""
+        places = torch.arange(num_rays, device=self.settings.device) % self.batch.num_rays
+        model, background = self.step.model, self.step.background
+        with torch.no_grad():
+            rays = self.step.rays(self.batch.pixels[places])
+            if not plain:  # as pictures are
+                render_rays(model, rays, background, self.settings.inference_tile_points)
+                return
+            with self._plainly():
+                model(rays, background_colors(background, num_rays, rays.near.device, random=None), random=None)
+
+    @contextmanager
+    def _plainly(self) -> Iterator[None]:
+        model = self.step.model
+        samplers = [level.sampler for level in model.modules() if isinstance(level, PackedLevel)]
+        former = [sampler.opaque_below for sampler in samplers]
+        self.step.tile_points = None
+        model.multiply_in("float32")
+        for sampler in samplers:
+            sampler.opaque_below = 0.0
+        self._release_gradients()
+        with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"):
+            yield
+        self.settings.prepare(model)
+        for sampler, value in zip(samplers, former, strict=True):
+            sampler.opaque_below = value
+        self._release_gradients()
+
+    def _release_gradients(self) -> None:
+        for parameter in self.step.model.parameters():
+            parameter.grad = None
+            parameter.grad_in_place = False  # type: ignore[attr-defined]
+
+
+def prepare(config: DictConfig, scene: Scene) -> Bench:
+    """Build what is to be measured."""
+    settings: TrainerSettings = build(config.trainer)
+    settings.prepare_machine()
+    progress = Progress()
+    step = build_step(config, settings, scene, progress).to(settings.device)
+    step.num_steps = max(1, config.warmup_steps)
+    settings.prepare(step.model)
+    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
+    data.settle(settings.device)
+    if settings.measures_tile:
+        settings.tile_points = step.tile_points = measured_tile(settings, step, data.batches)
+    optimizer, plain = step.new_optimizer(), torch.optim.Adam(step.model.parameters(), lr=1e-6)
+    return Bench(settings, step, data, optimizer, plain)
