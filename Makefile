@@ -120,7 +120,7 @@ doctor-rates: setup ## How often each check of the doctor raises a false alarm, 
 	@$(VENV)/bin/python tests/doctor_rates.py $(SEEDS)
 
 fuzz: setup ## Try damaged files, TIMES as many as in make test, other ones each time
-	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_fuzz_*.py
+	@FUZZ_TIMES=$(TIMES) $(PYTEST) tests/fuzz tests/commands/test_planted_resume.py
 
 clean: ## Remove the virtual environment and caches (run folders stay)
 	rm -rf $(VENV) $(XLA_VENV) build dist docs/_build docs/settings.md .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

@@ -1,156 +1,99 @@
-"""What a checkpoint is, key by key: what is written and what is read are both checked against this description."""
+"""What a checkpoint is, key by key: what is written and what is read are held against the same annotations."""
 
-from typing import get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
 
-import torch
+from jaxtyping import Int
+from packaging.version import Version
+from torch import Tensor
 
-from nerf_lightning.checkpoints.packing import packed_format
+from nerf_lightning.checkpoints.packing import Packed
 from nerf_lightning.compute.cores import MOST_THREADS
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL
-from nerf_lightning.files.budgets import allowed
-from nerf_lightning.files.schema import (
-    Choice,
-    Description,
-    Many,
-    Maybe,
-    Named,
-    Number,
-    Numbers,
-    Plain,
-    Record,
-    Text,
-    Whole,
-)
-from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
-from nerf_lightning.nerf.types.scene import Background, LensModel, Space
+from nerf_lightning.data.captures.checks import check_cameras, check_scene
+from nerf_lightning.files.trust import Mismatch, require_fit
+from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
-FORMAT = 4
+FORMAT = 5
 KEY = "nerf_lightning"
-PRECISIONS = ("32-true", "tf32", "bf16-mixed")
-PARTS = ("model", "rays", "correction")
+PARTS = ("model.", "rays.", "correction.", "loss.")
 """Of a training step: what their weights' names begin with."""
-WEIGHTS = (torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool)
-"""Types of what those hold. Numbers of other types would be cast without a word."""
 LOOPS = ("fit_loop", "validate_loop", "test_loop", "predict_loop")
-"""Lightning's; each is held against the trainer's own (`resume_state`)."""
-VERSION = r"\d+\.\d+(\.\d+)?[\w.+-]*"
+"""Lightning's."""
+LIGHTNING = "pytorch-lightning_version"
+Precision = Literal["32-true", "tf32", "bf16-mixed"]
+PRECISIONS = get_args(Precision)
+
+RECORD: dict[str, Any] = {
+    "format": Literal[5],
+    "version": str,
+    "config": str,
+    "choices": dict[str, str],
+    "scene": SceneRecord,
+    "precision": Precision,
+    "tile_points": Annotated[int, 1, 1 << 31] | None,
+}
+OF_A_RUN: dict[str, Any] = {
+    "progress": Progress,
+    "bad_steps": list[int],
+    "num_threads": Annotated[int, 1, MOST_THREADS],
+    "world_size": int,
+}
+OPTIONAL: dict[str, Any] = {"refined": Cameras, "pixels": Int[Tensor, "views"], "packed": Packed}
+FILE: dict[str, Any] = {"state_dict": dict[str, Tensor], "global_step": int, KEY: object}
+TRAINING: dict[str, Any] = {
+    "epoch": int,
+    LIGHTNING: str,
+    "loops": dict[str, object],
+    "callbacks": dict[str, object],
+    "optimizer_states": list[dict[str, object]],
+    "lr_schedulers": list[object],
+}
+"""What training goes on from, beside the record; the run that does holds it against its own (`resume_checks`)."""
+OF_SUBCLASSES: dict[str, Any] = {"hyper_parameters": object, "hparams_name": object, "hparams_type": object}
+"""What `save_hyperparameters` of somebody's subclass adds; nothing here reads it."""
+SIDES: dict[str, tuple[int, ...]] = {"c2w": (3, 4), "focal": (2,), "center": (2,), "lens": (6,), "ndc": (2,)}
+SIDES |= dict.fromkeys(("width", "height", "near", "far", "pixels"), ())
+"""Of what there is for each view, behind the views."""
 
 
-def cameras() -> Record:
-    """Return what the cameras in a checkpoint may be: the fields of `Cameras`, with their shapes and ranges."""
-    pixels = allowed().view_pixels
-    return Record(
-        {
-            "c2w": Numbers(("views", 3, 4), low=-FARTHEST, high=FARTHEST),
-            "focal": Numbers(("views", 2), low=LEAST_FOCAL, high=FARTHEST),
-            "center": Numbers(("views", 2), low=-FARTHEST, high=FARTHEST),
-            "lens": Numbers(("views", 6), low=-FARTHEST, high=FARTHEST),
-            "lens_model": Choice(get_args(LensModel)),
-            "width": Numbers(("views",), (torch.int64,), low=1, high=pixels),
-            "height": Numbers(("views",), (torch.int64,), low=1, high=pixels),
-            "ndc": Maybe(Numbers(("views", 2), low=1e-6, high=FARTHEST)),
-        }
-    )
-
-
-def scene() -> Record:
-    """Return what the scene in a checkpoint is; `require_possible_scene` asks what no single key can answer."""
-    name = Text(allowed().name_characters)
-    views = allowed().views
-    numbers = Many(Whole(0, views), views, tuple)
-    return Record(
-        {
-            "view_names": Many(name, views, tuple, least=1, size="views"),
-            "name": name,
-            "cameras": cameras(),
-            "near": Numbers(("views",), low=0.0, high=FARTHEST),
-            "far": Numbers(("views",), low=0.0, high=FARTHEST),
-            "aabb": Numbers((2, 3), low=-FARTHEST, high=FARTHEST),
-            "splits": Record(
-                {"train": Many(Whole(0, views), views, tuple, least=1)},
-                {"val": numbers, "test": numbers, "sources": numbers},
-            ),
-            "background": Choice(get_args(Background)),
-            "to_user": Numbers((4, 4)),
-            "space": Choice(get_args(Space)),
-        },
-        # Of several captures that were joined, and of units that are known; earlier versions wrote none of these.
-        {
-            "capture_of": Maybe(numbers),
-            "captures": Many(name, views, tuple),
-            "metres_per_unit": Maybe(Number(LEAST_UNIT, LARGEST_UNIT)),
-        },
-    )
-
-
-def progress() -> Record:
-    """Return what a run's place is, one key for each field of `Progress`."""
-    rays = Whole(1, 1 << 31)
-    counts = {key: Whole() for key in ("attempt", "step", "rays_seen", "rollbacks")}
-    return Record(counts | {"batch_rays": rays, "largest_batch": rays})
-
-
-def record(resumable: bool) -> Record:
-    """Return what lies under this program's own key."""
-    use: dict[str, Description] = {
-        "format": Choice((FORMAT,)),
-        "version": Text(40, VERSION),
-        "config": Text(allowed().yaml_characters),
-        "choices": Named(Text(200), Text(200), 200),
-        "scene": scene(),
-        "precision": Choice(PRECISIONS),
-        "tile_points": Maybe(Whole(1, 1 << 31)),
-    }
-    run: dict[str, Description] = {
-        "progress": progress(),
-        "bad_steps": Many(Whole(), 2, least=2),
-        "num_threads": Whole(1, MOST_THREADS),
-        "world_size": Whole(1, 1 << 16),
-    }
-    # Earlier versions wrote no hashes of the pixels.
-    learnt: dict[str, Description] = {"refined": cameras(), "pixels": Numbers(("views",), (torch.int64,))}
-    # Nothing goes on from a file that was made smaller but its weights (`init_from`).
-    smaller: dict[str, Description] = {"packed": packed_format()}
-    return Record(use | run, learnt) if resumable else Record(use, run | learnt | smaller)
-
-
-def checkpoint(resumable: bool) -> Record:
-    """Return what a checkpoint is.
-
-    Args:
-        resumable: whether it must have what training goes on from, beside what rendering needs.
-    """
-    name = Text(500)
-    use: dict[str, Description] = {
-        "state_dict": Named(Text(500, rf"({'|'.join(PARTS)}|loss)\..+"), Numbers(dtypes=WEIGHTS), 100_000),
-        "global_step": Whole(),
-        KEY: record(resumable),
-    }
-    # What exactly an optimizer keeps, it says itself (`optimizer_state`).
-    kept, group = Named(name, Plain(depth=0, tensors=True), 100), Named(name, Plain(depth=1, most=100_000), 100)
-    run: dict[str, Description] = {
-        "epoch": Whole(),
-        "pytorch-lightning_version": Text(40, VERSION),
-        "loops": Record({key: Plain(most=1000) for key in LOOPS}),
-        "callbacks": Named(name, Plain(tensors=True), 100),
-        "optimizer_states": Many(
-            Record({"state": Named(Whole(), kept, 100_000), "param_groups": Many(group, 100, least=1)}), 1, least=1
-        ),
-        "lr_schedulers": Many(Plain(), 0),
-    }
-    # What `save_hyperparameters` of somebody's subclass adds; nothing here reads it.
-    of_subclasses: dict[str, Description] = {
-        "hyper_parameters": Named(name, Plain(most=100_000, tensors=True), 1000),
-        "hparams_name": name,
-        "hparams_type": name,
-    }
-    return Record(use | run, of_subclasses) if resumable else Record(use, run | of_subclasses)
-
-
-def require_checkpoint(content: object, resumable: bool) -> None:
-    """Hold a checkpoint against its description.
+def require_checkpoint(content: dict[str, Any], where: str) -> None:
+    """Hold a checkpoint against what one is.
 
     Raises:
-        Unfit: the first key that is missing, unknown, or not what it must be.
+        Mismatch: the first key that is missing, unknown, or not what it must be.
+        InputError: more than the budgets allow.
     """
-    checkpoint(resumable).require(content, "", {})
+    require_fit(content, FILE, "", TRAINING | OF_SUBCLASSES)
+    for name in content["state_dict"]:
+        if not name.startswith(PARTS):
+            raise Mismatch(f"state_dict.{name}", "belongs to no part of a run")
+    record = content[KEY]
+    require_fit(record, RECORD, KEY, OF_A_RUN | OPTIONAL)
+    scene = record["scene"]
+    views, refined = len(scene["view_names"]), record.get("refined", {})
+    for place, tensors in (("scene", scene), ("scene.cameras", scene["cameras"]), ("refined", refined), (KEY, record)):
+        for name in tensors.keys() & SIDES.keys():
+            if tensors[name] is not None and tensors[name].shape != (views, *SIDES[name]):
+                raise Mismatch(f"{place}.{name}", f"has the shape {tuple(tensors[name].shape)}, of {views} views")
+    check_scene(scene_of(record), where)
+    if refined:
+        check_cameras(Cameras(**refined), "refined", where)
+
+
+def scene_of(record: Mapping[str, Any]) -> SceneRecord:
+    """Return the scene in a checkpoint's record, with the cameras that were read."""
+    return SceneRecord(**record["scene"] | {"cameras": Cameras(**record["scene"]["cameras"])})
+
+
+def require_training_state(content: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint that training cannot go on from, such as one that was made smaller.
+
+    Raises:
+        Mismatch: with the first key that it lacks.
+    """
+    for place, kinds, found in (("", TRAINING, content), (KEY, OF_A_RUN, content[KEY])):
+        for key in kinds.keys() - found.keys():
+            raise Mismatch(place or "the file", f"lacks {key}, so that no training goes on from it")
+    if Version(content[LIGHTNING]) < Version("2.0"):
+        raise Mismatch(LIGHTNING, "is of a version that this program has never used")

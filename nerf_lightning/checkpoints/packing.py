@@ -6,6 +6,7 @@ how large it may become in memory is held to a budget before anything is made (`
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -13,14 +14,42 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.files.budgets import allowed, require_within
-from nerf_lightning.files.schema import Choice, Description, Many, Maybe, Named, Numbers, Record, Text, Unfit, Whole
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.trust import Mismatch
 
 NumberType = Literal["float32", "float16", "int8"]
 TYPES: dict[NumberType, torch.dtype] = {"float32": torch.float32, "float16": torch.float16, "int8": torch.int8}
 SWITCHES = {"bool": torch.bool, "uint8": torch.uint8}
 LARGEST_INT8 = 127
-MOST_BLOCKS = 1 << 10
+
+
+@dataclass(frozen=True)
+class PackedRows:
+    """A table in a checkpoint, as `pack_rows` has it."""
+
+    shape: list[int]
+    starts: list[int]
+    kept: UInt8[Tensor, "_"] | None
+    values: Tensor
+    scales: Tensor
+    means: Tensor
+
+
+@dataclass(frozen=True)
+class PackedSwitches:
+    """A tensor of zeros and ones in a checkpoint, as `pack_switches` has it."""
+
+    shape: list[int]
+    type: Literal["bool", "uint8"]
+    bits: UInt8[Tensor, "_"]
+
+
+@dataclass(frozen=True)
+class Packed:
+    """All of them, by the names of the weights."""
+
+    rows: dict[str, PackedRows]
+    switches: dict[str, PackedSwitches]
 
 
 def pack_rows(
@@ -75,75 +104,39 @@ def from_bits(bits: UInt8[Tensor, "bytes"], count: int) -> Bool[Tensor, "count"]
     return torch.from_numpy(np.unpackbits(bits.numpy(), count=count, bitorder="little")).bool()
 
 
-def packed_format() -> Record:
-    """Return what a checkpoint says of its packed weights; `unpacked` asks what no single key can answer."""
-    name = Text(500, r"model\..+")
-    shape = Many(Whole(1, 1 << 40), 8, least=1)
-    number = Numbers(dtypes=tuple(TYPES.values()))
-    bits = Numbers(dtypes=(torch.uint8,))
-    rows: dict[str, Description] = {
-        "shape": shape,
-        "starts": Many(Whole(), MOST_BLOCKS, least=1),
-        "kept": Maybe(bits),
-        "values": number,
-        "scales": Numbers(),
-        "means": Numbers(),
-    }
-    switches: dict[str, Description] = {"shape": shape, "type": Choice(tuple(SWITCHES)), "bits": bits}
-    return Record({"rows": Named(name, Record(rows), 1000), "switches": Named(name, Record(switches), 1000)})
-
-
 def unpacked(packed: Mapping[str, Any], where: str) -> dict[str, Tensor]:
-    """Return the tensors that a record of packed weights stands for.
+    """Return the tensors that a record of packed weights stands for; whoever loads them compares them with a template.
 
     Args:
-        packed: as `packed_format` describes it.
+        packed: as `Packed` describes it.
         where: the file, for messages.
 
     Raises:
-        Unfit: its parts do not fit each other.
+        Mismatch: its parts do not fit each other.
         InputError: it would take more memory than a person has agreed to.
     """
-    _require_memory(packed, where)
-    rows = {name: _table(table, f"packed.rows.{name}") for name, table in packed["rows"].items()}
-    switches = {name: _switches(each, f"packed.switches.{name}") for name, each in packed["switches"].items()}
-    return rows | switches
+    rows = {name: PackedRows(**table) for name, table in packed["rows"].items()}
+    switches = {name: PackedSwitches(**each) for name, each in packed["switches"].items()}
+    size = sum(4 * math.prod(each.shape) for each in rows.values())
+    size += sum(math.prod(each.shape) for each in switches.values())
+    require_within("unpacked_bytes", size, where, "bytes of packed weights, once they are unpacked")
+    tables = {name: _table(each, f"packed.rows.{name}") for name, each in rows.items()}
+    return tables | {
+        name: from_bits(each.bits, math.prod(each.shape)).to(SWITCHES[each.type]).view(each.shape)
+        for name, each in switches.items()
+    }
 
 
-def _require_memory(packed: Mapping[str, Any], where: str) -> None:
-    sizes = [4 * math.prod(table["shape"]) for table in packed["rows"].values()]
-    sizes += [math.prod(each["shape"]) for each in packed["switches"].values()]
-    if sum(sizes) > allowed().unpacked_bytes:
-        require_within("unpacked_bytes", sum(sizes), where, "bytes of packed weights, once they are unpacked")
-
-
-def _table(table: Mapping[str, Any], place: str) -> Tensor:
-    values, shape, starts, means = table["values"], table["shape"], table["starts"], table["means"]
-    if values.ndim != 2 or values.shape[1] != (shape[1] if len(shape) == 2 else 1):
-        raise Unfit(f"{place}.values", f"has the shape {tuple(values.shape)}, in a table of {shape}")
-    count = math.prod(shape) // values.shape[1]
-    if starts[0] != 0 or any(b <= a for a, b in zip(starts, [*starts[1:], count], strict=True)):
-        raise Unfit(f"{place}.starts", "does not ascend from 0 within the table")
-    if table["scales"].shape != (len(starts),) or means.shape != (len(starts), values.shape[1]):
-        raise Unfit(place, f"has not one scale and one mean for each of {len(starts)} blocks")
-    kept = torch.ones(count, dtype=torch.bool)
-    if table["kept"] is not None:
-        kept = _switches({"bits": table["kept"], "shape": [count], "type": "bool"}, f"{place}.kept")
-    if int(kept.sum()) != values.shape[0]:
-        raise Unfit(f"{place}.values", f"has {values.shape[0]:,} rows, where {int(kept.sum()):,} are kept")
-    block = _block_of(starts, count)
-    rows = means[block]
-    rows[kept] = values.float() * table["scales"][block[kept], None]
-    if not bool(torch.isfinite(rows).all()):
-        raise Unfit(f"{place}.scales", "makes infinity of numbers")
-    return rows.view(shape)
-
-
-def _switches(each: Mapping[str, Any], place: str) -> Tensor:
-    count = math.prod(each["shape"])
-    if each["bits"].shape != (-(-count // 8),):
-        raise Unfit(place, f"has not one bit for each of {count:,} switches")
-    return from_bits(each["bits"], count).to(SWITCHES[each["type"]]).view(each["shape"])
+def _table(table: PackedRows, place: str) -> Tensor:
+    width = table.shape[1] if len(table.shape) == 2 else 1
+    count = math.prod(table.shape) // max(1, width)
+    if table.values.shape[1:] != (width,) or table.means.shape != (len(table.starts), width):
+        raise Mismatch(place, f"has rows of {tuple(table.values.shape)} in a table of {table.shape}")
+    kept = torch.ones(count, dtype=torch.bool) if table.kept is None else from_bits(table.kept, count)
+    block = _block_of(table.starts, count)
+    rows = table.means[block]
+    rows[kept] = table.values.float() * table.scales[block[kept], None]
+    return rows.view(table.shape)
 
 
 def _block_of(starts: Sequence[int], count: int) -> Tensor:

@@ -9,32 +9,26 @@ the system adds.
 
 import contextlib
 import logging
+import os
 import pickle
-import zipfile
-import zlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from nerf_lightning import __version__
-from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint
-from nerf_lightning.checkpoints.format import scene as scene_format
+from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, scene_of
 from nerf_lightning.checkpoints.packing import unpacked
-from nerf_lightning.checkpoints.possible_scenes import require_possible_refinement, require_possible_scene
-from nerf_lightning.files.schema import Unfit, shown
+from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.files.trust import Mismatch, reading, shown
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 DAMAGED = "damaged.ckpt"
-OUTLIVED = ".sampler.grid.floor"
-"""How the names of weights end that earlier versions kept, and nothing reads now."""
-ONCE_FLOAT64 = ".measured"
-"""How those end that earlier versions kept in float64, which not every device has."""
 
 log = logging.getLogger(__name__)
 
@@ -74,21 +68,24 @@ def make_record(scene: Scene, config: str, choices: dict[str, str]) -> dict[str,
     Raises:
         InputError: the scene is one that no checkpoint could keep, which is better said before training than after.
     """
-    kept = dict(vars(scene_record(scene)))
-    kept["cameras"] = dict(vars(scene.cameras))
+    record = scene_record(scene)
     try:
-        scene_format().require(kept, "scene", {})
-        require_possible_scene(kept, "The scene")
-    except Unfit as error:
+        check_scene(record, "The scene")
+    except Mismatch as error:
         raise InputError(
             f"The scene {for_terminal(scene.name[:200])} cannot be kept in a checkpoint: {error}. Mend the capture, or "
             "the settings (scene.*, budgets.*)."
         ) from error
+    kept = vars(record) | {"cameras": dict(vars(scene.cameras))}
     return {"format": FORMAT, "version": __version__, "config": config, "choices": choices, "scene": kept}
 
 
-def read_checkpoint(path: str | Path) -> Checkpoint:
+def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
     """Read a checkpoint onto the CPU; of a run folder the newest that is whole.
+
+    Args:
+        path: the file, or a run folder.
+        to_resume: keep what was read for the training that is about to ask for it (`content_to_resume`).
 
     Raises:
         InputError: the file is missing, damaged, not a checkpoint of this program, or of another format.
@@ -96,58 +93,60 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     path = Path(path)
     if path.is_dir():
         return _newest_of_run(path)
-    content = read_content(path, resumable=False)
+    content = read_content(path)
+    if to_resume:
+        _Kept.content = _identity(path), content
     record, prefix = content[KEY], "model."
-    state = content["state_dict"] | _unpacked(record, path)
-    scene = record["scene"]
-    given = Cameras(**scene["cameras"])
-    refined = Cameras(**record["refined"]) if "refined" in record else None
+    with reading(path, _instead_of(path)):
+        state = content["state_dict"] | (unpacked(record["packed"], str(path)) if "packed" in record else {})
+    scene, refined = scene_of(record), Cameras(**record["refined"]) if "refined" in record else None
     return Checkpoint(
         path=path,
         config=record["config"],
         choices=record["choices"],
-        scene=SceneRecord(**scene | {"cameras": refined or given}),
-        given_cameras=None if refined is None else given,
+        scene=scene if refined is None else replace(scene, cameras=refined),
+        given_cameras=None if refined is None else scene.cameras,
         weights={k[len(prefix) :]: value for k, value in state.items() if k.startswith(prefix)},
         step=content["global_step"],
         precision=record["precision"],
         tile_points=record["tile_points"],
-        good=record.get("bad_steps", [0, 0])[1] == 0,
+        good=record.get("bad_steps", [0, 0])[-1] == 0,
         record=record,
     )
 
 
-def _unpacked(record: dict[str, Any], path: Path) -> dict[str, Tensor]:
-    try:
-        return unpacked(record["packed"], str(path)) if "packed" in record else {}
-    except Unfit as problem:
-        raise _damaged(path, problem) from problem
-
-
-def read_content(path: Path, resumable: bool) -> dict[str, Any]:
-    """Return a checkpoint as it lies in its file, of which everything is as `format.checkpoint` says.
-
-    What earlier versions kept and nothing reads now is left out, and what they kept in float64 is float32.
-
-    Args:
-        path: the file.
-        resumable: whether it must have what training goes on from.
+def read_content(path: Path) -> dict[str, Any]:
+    """Return a checkpoint as it lies in its file, of which everything is as `checkpoints.format` says.
 
     Raises:
         InputError: as `read_checkpoint`.
     """
     content = _load(path)
-    require_ours(content, path, resumable)
-    for weights in (content["state_dict"], content[KEY].get("packed", {}).get("rows", {})):
-        for name in [name for name in weights if name.endswith(OUTLIVED)]:
-            del weights[name]
-    state = content["state_dict"]
-    state |= {name: number.float() for name, number in state.items() if name.endswith(ONCE_FLOAT64)}
+    require_ours(content, path)
     return content
 
 
-def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
-    """Refuse what was loaded from a file and is not as `format.checkpoint` says.
+class _Kept:
+    content: tuple[tuple[int, ...], dict[str, Any]] | None = None
+
+
+def _identity(path: Path) -> tuple[int, ...]:
+    state = os.stat(path)
+    return state.st_dev, state.st_ino, state.st_mtime_ns, state.st_size
+
+
+def content_to_resume(path: Path) -> dict[str, Any]:
+    """Return a checkpoint as it lies in its file, which is read once: not again where `to_resume` has kept it.
+
+    Raises:
+        InputError: as `read_checkpoint`.
+    """
+    kept, _Kept.content = _Kept.content, None
+    return kept[1] if kept is not None and path.is_file() and kept[0] == _identity(path) else read_content(path)
+
+
+def require_ours(content: dict[str, Any], path: Path) -> None:
+    """Refuse what was loaded from a file and is not as `checkpoints.format` says.
 
     Raises:
         InputError: with the first thing that is not.
@@ -164,21 +163,14 @@ def require_ours(content: dict[str, Any], path: Path, resumable: bool) -> None:
             f"{path} has checkpoint format {shown(written)} (written by nerf_lightning {version}), "
             f"and this version, {__version__}, reads format {FORMAT}. Use the version that wrote it, or train again."
         )
-    try:
-        require_checkpoint(content, resumable)
-        require_possible_scene(record["scene"], str(path))
-        if "refined" in record:
-            require_possible_refinement(record["refined"], record["scene"]["cameras"])
-    except Unfit as problem:
-        raise _damaged(path, problem) from problem
+    with reading(path, _instead_of(path)):
+        require_checkpoint(content, str(path))
 
 
-def _damaged(path: Path, problem: Unfit) -> InputError:
-    return InputError(f"{path} is damaged, or made by somebody else: {problem}. {_instead_of(path)}")
-
-
-def newest_checkpoint(folder: Path) -> Checkpoint | None:
+def newest_checkpoint(folder: Path, to_resume: bool = False) -> Checkpoint | None:
     """Read `last.ckpt`, or where it is damaged or missing `previous.ckpt`, and say so; None where nothing was saved.
+
+    See `read_checkpoint` for `to_resume`.
 
     Raises:
         InputError: neither can be read.
@@ -187,10 +179,10 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     if not last.is_file() and not previous.is_file():
         return None
     try:
-        return read_checkpoint(last)
+        return read_checkpoint(last, to_resume)
     except InputError as error:
         try:
-            found = read_checkpoint(previous)
+            found = read_checkpoint(previous, to_resume)
         except InputError:
             raise error from None
     reason = "is damaged" if last.exists() else "is missing"
@@ -224,18 +216,14 @@ def _load(path: Path) -> dict[str, Any]:
             f"There is no checkpoint at {path}. A run keeps its checkpoints in RUN_FOLDER/checkpoints/; "
             "look there for last.ckpt or best.ckpt."
         )
-    try:
-        content = load_tensors(path)
-    except pickle.UnpicklingError as error:
-        raise InputError(
-            f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and nothing "
-            "from a file is executed. Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run folder."
-        ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"{path} cannot be read ({path.stat().st_size} bytes; damaged, cut off, empty, or not a checkpoint). "
-            f"{_instead_of(path)}"
-        ) from error
+    with reading(path, _instead_of(path)):
+        try:
+            content = load_tensors(path)
+        except pickle.UnpicklingError as error:
+            raise InputError(
+                f"{path} is not a checkpoint of nerf_lightning: it holds more than tensors and plain values, and "
+                "nothing from a file is executed. Give the checkpoints/last.ckpt or checkpoints/best.ckpt of a run."
+            ) from error
     return content if isinstance(content, dict) else {}
 
 

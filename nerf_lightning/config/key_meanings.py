@@ -1,12 +1,12 @@
-"""What each setting means: one table, asked by whoever treats settings differently.
+"""What settings mean, by group: one table, asked by whoever treats settings differently.
 
 Is a run of another value another run? Has a finished one of another value something left to do? Does what is learnt
 depend on it? Has it a column in a table of runs? And may a file choose it that comes from anybody, such as the saved
-overrides of a run folder or the scene that a checkpoint recorded? What is not in the table is trusted to nobody but the
-person at the command line, so whoever adds a setting decides here.
+overrides of a run folder or the scene that a checkpoint recorded? A group that is not in the table is trusted to nobody
+but the person at the command line; a new reader, field, loss or callback has the row of its group.
 
-A key is listed as it stands in a composed config. `x.*` is each key that stands in the section x, and `x.**` is x and
-whatever lies below it. The most precise entry holds.
+`x.*` is each key that stands in the section x, and `x.**` is x and whatever lies below it. The most precise entry
+holds: a setting of a trusted group that says where to write, what to fetch or how far to trust needs one of its own.
 """
 
 import os
@@ -67,17 +67,12 @@ class Meaning:
 
 UNKNOWN = Meaning()
 
-# A part of the mathematics. Nothing that nerf/ builds opens a file, and its constructors refuse what they do not know,
-# so that one row does for whole rooms, and a new encoder needs no line here.
+# A part of the mathematics. Nothing that nerf/ builds opens a file, and its constructors refuse what they do not know.
 PART = Meaning(trust=Trust.WORDS)
-# Data, and what else decides what is learnt.
+# Data: what a reader is told, such as the folders in a capture.
 LEARNT = Meaning(trust=Trust.PLAIN)
 # It tells whose results they are, and stands in a table's own column.
 OWN_COLUMN = Meaning(learnt=False, shown=False, trust=Trust.PLAIN)
-# The file of a capture, which is fetched where it is not there.
-FILE = replace(OWN_COLUMN, trust=Trust.IF_THERE)
-# What is fetched, and from where.
-FETCHED = Meaning()
 # The checkpoint that the first start began from. Jobs of a sweep that have not begun start from there still.
 FIRST_START = Meaning(learnt=False, trust=Trust.ONE_START, in_sweep=Trust.PLAIN)
 # The machine, and how it computes.
@@ -85,108 +80,43 @@ MACHINE = Meaning(learnt=False, trust=Trust.PLAIN)
 # How long a run lasts: a longer one goes on with a shorter one's checkpoints.
 LENGTH = Meaning(identity=False, trust=Trust.PLAIN)
 # What looks on while it trains.
-WATCHING = Meaning(identity=False, learnt=False, trust=Trust.PLAIN)
-# What Lightning's Trainer is told beside what settings of ours say.
-FLAG = replace(WATCHING, trust=Trust.WORDS)
+WATCHING = Meaning(identity=False, learnt=False, trust=Trust.WORDS)
 # What follows the training, or changes nothing of it.
-AFTERWARDS = replace(WATCHING, shown=False)
-# The curve of a film's camera; which of its settings are texts stands below.
-CURVE = replace(AFTERWARDS, trust=Trust.WORDS)
+AFTERWARDS = replace(WATCHING, shown=False, trust=Trust.PLAIN)
 # Where to write, and how to serve and to limit this start; the viewer opens a server for whoever sits there now.
 ONE_START = Meaning(identity=False, outcome=False, learnt=False, shown=False, trust=Trust.ONE_START)
-# Where to write, and how far to trust: the user's alone.
+# Where to write, what to fetch, and how far to trust: the user's alone.
 OF_THE_USER = replace(ONE_START, trust=Trust.NOTHING)
-# How a sweep is cut into jobs and how many there are. Its record may say so; what they run is no number and no word.
-SWEEP_NUMBER = replace(OF_THE_USER, in_sweep=Trust.NUMBERS)
-SWEEP_WORD = replace(OF_THE_USER, in_sweep=Trust.WORDS)
-# Settings of commands that make no run.
-OF_OTHER_COMMANDS = Meaning()
 
 ROWS: tuple[tuple[Meaning, str], ...] = (
     (
         PART,
-        """
-        model.** encoder.** direction_encoder.** field.** loss.** plain_loss.** correction.** refinement.** optimizer.**
-        scheduler.**
-        """,
+        "model.** encoder.** direction_encoder.** field.** loss.** plain_loss.** correction.** refinement.** "
+        "optimizer.** scheduler.** data.** callbacks.collapse_guard.**",
     ),
-    (
-        LEARNT,
-        """
-        budget.seconds trainer.clip_norm
-        data.batch_rays data.sample_budget data.crop_steps data.crop_fraction data.restart_crop_steps data.val_rays
-        data.device_budget data.prefetch data.overfit_views data.views_per_step
-        scene.background scene.cut_out scene.near scene.far scene.space scene.aabb_half scene.downscale scene.resolution
-        scene.variant
-        scene.images scene.masks scene.masks_keep scene.file scene.frames scene.hold_every scene.train_fraction
-        scene.skip.train scene.skip.val scene.skip.test scene.num_train scene.num_val scene.num_test
-        scene.variants scene.unseen scene.gain scene.gamma
-        callbacks.collapse_guard.every_steps callbacks.collapse_guard.until_step callbacks.collapse_guard.patience
-        callbacks.collapse_guard.ratio callbacks.collapse_guard.max_restarts
-        """,
-    ),
+    (LEARNT, "scene.** budget.** trainer.clip_norm"),
     (OWN_COLUMN, "seed model scene scene.name scene.root scene.video"),
-    (FILE, "scene.path"),
-    (FETCHED, "scene.download.**"),
+    (replace(OWN_COLUMN, trust=Trust.IF_THERE), "scene.path"),  # fetched where it is not there
     (FIRST_START, "init_from"),
-    (
-        MACHINE,
-        """
-        trainer.accelerator trainer.devices trainer.launched_by trainer.precision trainer.num_threads
-        trainer.tile_points trainer.compile trainer.cuda_graph trainer.deterministic
-        """,
-    ),
+    (MACHINE, "trainer.**"),
     (LENGTH, "trainer.max_steps trainer.max_epochs trainer.lightning.fast_dev_run"),
-    (FLAG, "trainer.lightning.**"),
-    (
-        WATCHING,
-        """
-        trainer.val_every_steps callbacks.monitor.every_steps
-        callbacks.epoch_figures.every_epochs callbacks.epoch_figures.every_steps callbacks.epoch_figures.view
-        callbacks.ray_histograms.every_steps callbacks.ray_histograms.num_rays
-        callbacks.validation_pictures.every_steps callbacks.validation_pictures.view
-        callbacks.progress_bar.refresh_seconds callbacks.progress_bar.line_seconds
-        callbacks.nan_guard.on_nan callbacks.nan_guard.patience callbacks.nan_guard.factor
-        callbacks.nan_guard.max_rollbacks callbacks.nan_guard.every_steps
-        callbacks.checkpoints.every_steps callbacks.checkpoints.monitor
-        """,
-    ),
-    (
-        AFTERWARDS,
-        """
-        scene.verify scene.metres_per_unit doctor final.evaluate final.video final.page final.report
-        path.file path.view path.views
-        evaluation.split evaluation.max_views evaluation.quantize evaluation.num_pictures evaluation.num_worst
-        evaluation.lpips_weights evaluation.lpips_net evaluation.colors evaluation.nearest_views
-        """,
-    ),
-    (CURVE, "path.**"),
+    (WATCHING, "callbacks.** trainer.val_every_steps trainer.lightning.**"),
+    (replace(WATCHING, trust=Trust.PLAIN), "callbacks.checkpoints.monitor"),
+    (AFTERWARDS, "scene.verify scene.metres_per_unit doctor final.** evaluation.** path.file path.view path.views"),
+    (replace(AFTERWARDS, trust=Trust.WORDS), "path.**"),
     (ONE_START, "resume resume_changed_capture print_config paths.** sweep.** viewer.** budgets.**"),
     (OF_THE_USER, "logger.** hydra.** scene.cache_dir scene.allow_outside scene.max_gigabytes"),
-    (SWEEP_NUMBER, "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*"),
-    (SWEEP_WORD, "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction"),
+    (UNKNOWN, "scene.download.**"),
+    # How a sweep is cut into jobs and how many there are: its record may say so. What they run is no number or word.
     (
-        OF_OTHER_COMMANDS,
-        """
-        ckpt trust what.** labels outputs mosaic format alpha background crop near hold_camera projection
-        host port open_browser photographs max_height
-        run measured max_megabytes runs scenes models sort published force curves out
-        rounds steps warmup_steps target_psnr kernels render_rays scaling
-        images video every allow_outside matching camera_mode camera_model num_features max_image_size num_threads
-        """,
+        replace(OF_THE_USER, in_sweep=Trust.NUMBERS),
+        "hydra.launcher.* hydra.sweeper.* hydra.sweeper.sampler.*",
+    ),
+    (
+        replace(OF_THE_USER, in_sweep=Trust.WORDS),
+        "hydra.launcher.batch_size hydra.launcher.name hydra.launcher.partition hydra.sweeper.direction",
     ),
 )
-
-# Of settings that a person adds, and of the names of classes: they belong where their room does. Nothing of them is
-# taken from a file.
-THE_REST = {
-    "callbacks": WATCHING,
-    "callbacks.camera_layout": WATCHING,
-    "callbacks.collapse_guard": LEARNT,
-    "evaluation": AFTERWARDS,
-    "final": AFTERWARDS,
-    "trainer": MACHINE,
-}
 
 CHOSEN_GROUPS = (
     *("callbacks", "correction", "data", "debug", "encoder", "evaluation", "experiment"),
@@ -208,16 +138,13 @@ def meaning_of(key: str) -> Meaning:
 
     >>> meaning_of("optimizer.lr").identity, meaning_of("trainer.max_steps").identity
     (True, False)
-    >>> meaning_of("scene.near").trust.name, meaning_of("scene.unheard_of").trust.name
+    >>> meaning_of("scene.near").trust.name, meaning_of("unheard_of").trust.name
     ('PLAIN', 'NOTHING')
     """
-    row = row_of(key)
-    rest = (THE_REST[section] for section in _sections(key) if section in THE_REST)
-    found = next(rest, UNKNOWN) if row is None else TABLE[row]
-    is_decided = row is not None and not names_a_class(key)
-    if is_decided or found.trust is Trust.ONE_START:
-        return found
-    return replace(found, trust=Trust.NOTHING, in_sweep=None)
+    found = TABLE.get(row_of(key) or "", UNKNOWN)
+    if names_a_class(key) and found.trust is not Trust.ONE_START:
+        return replace(found, trust=Trust.NOTHING, in_sweep=None)
+    return found
 
 
 def row_of(key: str) -> str | None:
@@ -230,9 +157,7 @@ def row_of(key: str) -> str | None:
 def is_removable(section: str) -> bool:
     """Tell whether a file may take a section or a setting away: all that is known of it must be taken from files."""
     below = [meaning for key, meaning in TABLE.items() if key.startswith(f"{section}.")]
-    below += [TABLE[row] for row in (row_of(section),) if row is not None]
-    taken = all(each.trust not in (Trust.ONE_START, Trust.NOTHING) for each in below)
-    return taken and bool(below or section in THE_REST)
+    return all(each.trust not in (Trust.ONE_START, Trust.NOTHING) for each in (*below, meaning_of(section)))
 
 
 def _sections(key: str) -> list[str]:

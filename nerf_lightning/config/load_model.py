@@ -12,12 +12,17 @@ from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.trust import reading, require_like
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.base import Encoder, matrices_of
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.samplers.base import Sampler
 
+CURE = (
+    "Use another one, or give the model, field and encoder settings that it was trained with (.hydra/overrides.yaml of "
+    "that run)."
+)
 SPARE_NUMBERS = 1 << 24
 """What a model may hold beside its weights."""
 
@@ -43,7 +48,13 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     # First without memory: sizes from a stranger must be those of the weights beside them.
     with torch.device("meta"):
         shapes = build_model(config, checkpoint)
-    _require_fitting(shapes, checkpoint)
+    asked = sum(tensor.numel() for tensor in (*shapes.parameters(), *shapes.buffers()))
+    held = sum(tensor.numel() for tensor in checkpoint.weights.values())
+    if asked > held + SPARE_NUMBERS:
+        raise InputError(
+            f"{checkpoint.path} is damaged: its config describes a model of {asked:,} numbers, and its weights are "
+            f"{held:,}. Use another checkpoint."
+        )
     model = build_model(config, checkpoint)
     load_weights(model, checkpoint)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
@@ -93,35 +104,12 @@ def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
     return model
 
 
-def _require_fitting(model: Model, checkpoint: Checkpoint) -> None:
-    """Refuse a model that would take much more memory than its weights do."""
-    asked = sum(tensor.numel() for tensor in (*model.parameters(), *model.buffers()))
-    held = sum(tensor.numel() for tensor in checkpoint.weights.values())
-    if asked > held + SPARE_NUMBERS:
-        raise InputError(
-            f"{checkpoint.path} is damaged: its config describes a model of {asked:,} numbers, and its weights are "
-            f"{held:,}. Use another checkpoint."
-        )
-
-
 def load_weights(model: Model, checkpoint: Checkpoint) -> None:
     """Put a checkpoint's weights into a model.
 
     Raises:
         InputError: the model has another shape than the checkpoint's.
     """
-    known = model.state_dict()
-    other = [name for name, tensor in checkpoint.weights.items() if name in known and tensor.dtype != known[name].dtype]
-    if other:
-        raise InputError(
-            f"{checkpoint.path} is damaged: its {other[0]} holds {checkpoint.weights[other[0]].dtype}, and the model "
-            f"{known[other[0]].dtype}. Use another checkpoint."
-        )
-    try:
-        model.load_state_dict(checkpoint.weights)
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:400]
-        raise InputError(
-            f"The weights of {checkpoint.path} do not fit this model: {reason}. Give the model, field and encoder "
-            "settings that they were trained with (.hydra/overrides.yaml of that run)."
-        ) from error
+    with reading(checkpoint.path, CURE):
+        model.load_state_dict(checkpoint.weights)  # keys and shapes, which some parts take from the file
+        require_like(checkpoint.weights, model.state_dict(), "weights")

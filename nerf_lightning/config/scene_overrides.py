@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from nerf_lightning.checkpoints.reading import read_checkpoint
-from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_a_class, row_of
+from nerf_lightning.config.key_meanings import PLACES, Trust, meaning_of, names_a_class
 from nerf_lightning.config.overrides import leaves, quoted
 from nerf_lightning.files.folders import conf_file, option_names
 from nerf_lightning.files.yaml_files import plain_yaml, read_plain_yaml
@@ -66,13 +66,13 @@ def _settings_of(file: Path) -> dict[str, Any]:
 
 def _taken(recorded: dict[str, Any], ours: dict[str, Any], path: str) -> dict[str, Any]:
     """Return what is taken from a file: plain values of settings that our yaml has and the table trusts to files."""
-    undecided = [key for key in recorded if row_of(key) is None and not names_a_class(key)]
-    if undecided:
+    unknown = [key for key in recorded if key not in ours and not names_a_class(key)]
+    if unknown:
         log.warning(
             "%s was trained with %s. Such settings, which this program does not know, are not taken from a file. "
             "Give them by hand if they are yours.",
             for_terminal(path),
-            listed(undecided, cap=5),
+            listed(unknown, cap=5),
         )
     return {
         key: value

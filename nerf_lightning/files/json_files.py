@@ -90,9 +90,6 @@ LARGEST = 1e30
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
-    # Imported late: it brings torch, and Hydra loads this module (of sweeps) before it composes any command's config.
-    from nerf_lightning.files.json_files import read_json
-
     try:
         content = read_json(path)
     except InputError:

@@ -69,7 +69,7 @@ class RunFolder:
             InputError: there are checkpoints, and none can be read.
         """
         folder, named = self.path / "checkpoints", self.named_checkpoint
-        found = newest_checkpoint(folder) if named is None else read_checkpoint(named)
+        found = newest_checkpoint(folder, True) if named is None else read_checkpoint(named, True)
         if found is None:
             return None
         path = found.path

@@ -11,9 +11,9 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 from torch.optim import Optimizer
 
-from nerf_lightning.checkpoints.format import KEY, LOOPS, record
+from nerf_lightning.checkpoints.format import KEY, LOOPS
 from nerf_lightning.checkpoints.reading import LAST, read_checkpoint, require_ours
-from nerf_lightning.checkpoints.resume_checks import require_callbacks, require_loops, require_resumable
+from nerf_lightning.checkpoints.resume_checks import require_resumable
 from nerf_lightning.checkpoints.same_capture import require_same_capture
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import use_threads
@@ -26,6 +26,7 @@ from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.callbacks.monitor import Monitor
 from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
+from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 from nerf_lightning.training.launch.fitting import length_of_run
 from nerf_lightning.training.rendering_step import rendering_step
 from nerf_lightning.training.step import WHOLE_BATCH_POINTS, TrainStep
@@ -153,7 +154,6 @@ class RadianceFieldSystem(LightningModule):
 
         Raises:
             InputError: the weights are not finite.
-            Unfit: what would be written is not what is read, which is a mistake of this program.
         """
         if self.step.broken_weights():
             raise InputError(
@@ -171,7 +171,6 @@ class RadianceFieldSystem(LightningModule):
         refined = self.rays.refined(self.record["scene"]["splits"]["train"])
         if refined is not None:
             checkpoint[KEY]["refined"] = dict(vars(refined))
-        record(resumable=True).require(checkpoint[KEY], KEY, {})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up the state again: place, threads, and the tile (`TrainerSettings.keep_tile`) decide a sum's last bits.
@@ -179,16 +178,22 @@ class RadianceFieldSystem(LightningModule):
         Raises:
             InputError: the checkpoint is not one of this run, or of its capture; nothing was taken from it.
         """
-        require_ours(checkpoint, Path(self.trainer.ckpt_path or LAST), resumable=True)
-        trainer, step, state = self.trainer, self.step, checkpoint[KEY]
+        trainer, step, path = self.trainer, self.step, Path(self.trainer.ckpt_path or LAST)
+        if not isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO):  # which has checked what it read
+            require_ours(checkpoint, path)
+        state = checkpoint[KEY]
         if trainer.state.fn == TrainerFn.FITTING:  # a model may be tested on any capture
             require_same_capture(state, self.record, self.resume_changed_capture)
         require_resumable(
-            checkpoint, self.state_dict(), step.build_optimizer, step.progress, self.configure_optimizers()
+            checkpoint,
+            path,
+            weights=self.state_dict(),
+            optimizer=self.configure_optimizers(),
+            build=step.build_optimizer,
+            callbacks=trainer.callbacks,  # type: ignore[attr-defined]
+            loops={key: getattr(trainer, key).state_dict() for key in LOOPS},
+            progress=step.progress,
         )
-        require_callbacks(checkpoint["callbacks"], trainer.callbacks)  # type: ignore[attr-defined]
-        loops = {key: getattr(trainer, key).state_dict() for key in LOOPS}
-        require_loops(checkpoint["loops"], loops, checkpoint["global_step"], skipped=state["bad_steps"][0])
         step.progress.take_up(Progress(**state["progress"]))
         step.guard.restore(state["bad_steps"], self.device)
         if state["world_size"] == ranks.world_size():

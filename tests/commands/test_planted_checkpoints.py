@@ -50,22 +50,12 @@ def test_a_sound_one_is_rendered(nerf, sound, tmp_path):
     assert result.code == 0, result.err
 
 
-PICKLED = [
-    lambda content, payload: content.update(more=payload),
-    lambda content, payload: content["state_dict"].update({"model.x": payload}),
-    lambda content, payload: content["nerf_lightning"].update(config=payload),
-    lambda content, payload: content["nerf_lightning"]["scene"].update(name=payload),
-]
-
-
-@pytest.mark.parametrize("place", PICKLED)
-def test_pickled_calls_do_not_run(nerf, capture, tmp_path, place):
+def test_pickled_calls_do_not_run(nerf, capture, tmp_path):
     mark = tmp_path / "ran"
-    file = write_checkpoint(tmp_path / "a.ckpt", lambda content: place(content, Payload(os.system, f"touch {mark}")))
-    words = ("a.ckpt", "nothing from a file is executed")
-    refused(loaded, file, parts=words)
-    for command in commands(file, tmp_path, capture) if place is PICKLED[0] else ():
-        said(nerf(*command), *words)
+    payload = Payload(os.system, f"touch {mark}")
+    file = write_checkpoint(tmp_path / "a.ckpt", lambda content: content["state_dict"].update({"model.x": payload}))
+    for command in commands(file, tmp_path, capture):
+        said(nerf(*command), "a.ckpt", "nothing from a file is executed")
     assert not mark.exists()
     assert not (tmp_path / "out").exists()
 
@@ -85,18 +75,14 @@ def test_a_file_of_lpips_weights_does_not_run(nerf, sound, capture, tmp_path):
 
 
 TARGETS = [
-    "builtins.exec",
-    "torch.hub.load",
+    "os.system",
     "lightning.pytorch.loggers.csv_logs.os.system",
-    "hydra.utils.instantiate",
     "nerf_lightning.nerf.models.base.torch.hub.load",
     "nerf_lightning.nerf.encoders.../../evil.Class",
-    "nerf_lightning.commands.train.run",
+    "nerf_lightning.nerf.fields.nerf_mlp.Encoder",
+    "nerf_lightning.nerf.encoders.nothing.Here",
     ["os.system"],
-    {"_target_": "os.system"},
 ]
-
-
 PLACES = [
     lambda model, evil: model.update(evil),
     lambda model, evil: model["levels"].update(extra=evil),
@@ -106,23 +92,23 @@ PLACES = [
 
 
 @pytest.mark.parametrize(
-    ("target", "place"), [*(("os.system", place) for place in PLACES), *((target, PLACES[2]) for target in TARGETS)]
+    ("target", "place"), [*(("os.system", place) for place in PLACES), *((target, PLACES[2]) for target in TARGETS[1:])]
 )
 def test_only_our_own_model_parts_are_built(nerf, tmp_path, target, place):
     mark, words = tmp_path / "ran", "which is not a model part of this program"
     evil = {"_target_": target, "command": f"touch {mark}"}
     file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda config: place(config["model"], evil)))
     refused(loaded, file, parts=(words,))
-    if target == "os.system":
+    if place is PLACES[0]:
         for trust in ([], ["trust=[os,builtins]"]):  # a module that is trusted has no part of a model for that
             said(nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out", *trust), words)
     assert not mark.exists()
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("place", PLACES[:3])
-def test_a_model_setting_that_no_part_has_is_refused(tmp_path, place):
-    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: place(c["model"], {"unheard_of": "/tmp/evil"})))
+@pytest.mark.parametrize("key", ["unheard_of", "_partial_"])
+def test_a_model_setting_that_no_part_has_is_refused(tmp_path, key):
+    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: PLACES[2](c["model"], {key: "/tmp/evil"})))
     refused(loaded, file, parts=("a.ckpt", "its model part"))
 
 
@@ -148,26 +134,21 @@ def test_what_lies_beside_the_model_is_not_built(nerf, tmp_path):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("value", ["${oc.env:HOME}", "a${oc.env:HOME}", "${oc.create:{}}", "\\${x}"])
-def test_the_environment_is_not_looked_up(nerf, tmp_path, value):
-    file = write_checkpoint(tmp_path / "a.ckpt", in_config(lambda c: c["model"]["levels"]["fine"].update(note=value)))
-    words = ("holds an interpolation", "which is not read from files")
-    paragraph = refused(loaded, file, parts=words)
-    assert os.environ["HOME"] not in paragraph.replace(str(tmp_path), "")
-    if value == "${oc.env:HOME}":
-        result = nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out")
-        said(result, *words)
-        assert os.environ["HOME"] not in result.err.replace(str(tmp_path), "")
+def test_the_environment_is_not_looked_up(nerf, tmp_path):
+    change = in_config(lambda c: c["model"]["levels"]["fine"].update(note="a${oc.env:HOME}"))
+    file = write_checkpoint(tmp_path / "a.ckpt", change)
+    result = nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out")
+    said(result, "holds an interpolation", "which is not read from files")
+    assert os.environ["HOME"] not in result.err.replace(str(tmp_path), "")
 
 
 BAD_YAML = {
-    "aliases": "a: &a [x, x]\n"
-    + "".join(f"{n}: &{n} [*{p}, *{p}]\n" for p, n in zip("abcdefgh", "bcdefghi", strict=True)),
+    "aliases": "a: &a [x, x]\nb: [*a, *a]\n",
     "depth": "model: " + "[" * 900 + "]" * 900,
     "length": "model: '" + "x" * 2_000_000 + "'",
     "python": "model: !!python/object/apply:os.system ['touch ran']",
     "date": "model: 2001-99-99",
-    "number": "model: !!int ''",
+    "set": "model: !!set {a, b}",
     "digits": "model: " + "9" * 10_000,
     "no mapping": "[1, 2]",
     "not yaml": "model: [",
@@ -175,14 +156,12 @@ BAD_YAML = {
 
 
 @pytest.mark.parametrize("text", BAD_YAML.values(), ids=BAD_YAML)
-@pytest.mark.parametrize(("command", "read"), [("render", loaded), ("eval", scene_of)])
-def test_a_config_that_is_no_config(nerf, tmp_path, command, read, text):
+def test_a_config_that_is_no_config(nerf, tmp_path, text):
     file = write_checkpoint(tmp_path / "a.ckpt", lambda content: content["nerf_lightning"].update(config=text))
-    words = "it holds references" if "&a" in text else "The config in" if "model" in text else "damaged"
-    words = "nerf_lightning.config has" if len(text) > 1_000_000 else words
-    refused(read, file, parts=("a.ckpt", words))
+    for read in (loaded, scene_of):
+        refused(read, file, parts=("a.ckpt",))
     if text == BAD_YAML["depth"]:
-        said(nerf(command, f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", words)
+        said(nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", "The config in")
     assert not (tmp_path / "out").exists()
 
 
@@ -198,54 +177,61 @@ def state(**changed):
     return lambda content: content["nerf_lightning"].update(changed)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (camera(c2w=torch.zeros(3, 4)), "c2w"),
-        (camera(width=torch.full((6,), 1 << 40)), "width"),
-        (camera(height=torch.full((6,), 1 << 27), width=torch.full((6,), 1 << 27)), "pixels"),
-        (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
-        (camera(lens="pinhole"), "lens"),
-        (camera(c2w=torch.zeros(6, 3, 4)), "a pose that is not a rotation"),
-        (camera(c2w=torch.zeros(6, 3, 4, dtype=torch.float16)), "c2w holds float16, not float32"),
-        (camera(focal=torch.zeros(6, 2)), "focal has numbers from 0 to 0, not 0.001 to"),
-        (recorded(far=torch.full((6,), 3e38)), "far has numbers from 3e+38"),
-        (recorded(near=torch.full((6,), 9.0), far=torch.full((6,), 8.0)), "near is not everywhere less than far"),
-        (recorded(aabb=torch.tensor([[1.0] * 3, [-1.0] * 3])), "a lower corner that is not below the upper one"),
-        (recorded(aabb=torch.zeros(2, 3)), "a lower corner that is not below the upper one"),
-        (recorded(to_user=torch.zeros(4, 4)), "to_user is singular"),
-        (recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))), "to_user is not a rotation, a scale"),
-        (recorded(view_names=()), "view_names has 0 entries"),
-        (recorded(view_names=("a\x00", *"bcdef")), r"a\x00', which holds control characters"),
-        (recorded(view_names=("a\udc80", *"bcdef")), r"a\udc80', which holds control characters or is not UTF-8"),
-        (recorded(view_names=("a" * 2000, *"bcdef")), "view_names[0] has 2,000 characters"),
-        (recorded(more=1), "holds 'more', which no file of this program does"),
-        (recorded(near=1.0), "near"),
-        (recorded(aabb=torch.zeros(3)), "aabb"),
-        (recorded(background="\x1b[2Jwhite"), "background"),
-        (recorded(space="hyper"), "space"),
-        (recorded(view_names=tuple("abc")), "view_names has 3 entries"),
-        (recorded(splits={"train": (0, 99)}), "splits"),
-        (recorded(splits=[1]), "splits"),
-        (recorded(splits={"test": (0,)}), "splits lacks train"),
-        (recorded(splits={"train": (), "test": (0,)}), "splits.train has 0 entries"),
-        (recorded(splits={"train": (0, 1, 0)}), "splits.train names a view twice"),
-        (recorded(view_names=("a",) * 6), "view_names names two views alike"),
-        (state(precision="transformer-engine"), "precision"),
-        (state(tile_points=-1), "tile_points"),
-        (state(choices=["scene"]), "choices"),
-        (state(config=3), "config"),
-        (state(format=[[["1"]]]), "format a list"),
-        (state(format=torch.zeros(2)), "format a tensor"),
-    ],
-)
-def test_a_garbled_record_is_named(nerf, tmp_path, change, words):
+RECORDS = {
+    "another shape": (camera(focal=torch.ones(6, 3)), "focal holds"),
+    "fewer": (camera(focal=torch.ones(3, 2)), "focal has the shape (3, 2), of 6 views"),
+    "another dtype": (camera(c2w=torch.zeros(6, 3, 4, dtype=torch.float16)), "c2w holds torch.float16"),
+    "NaN": (camera(focal=torch.full((6, 2), float("nan"))), "focal holds NaN"),
+    "no poses": (camera(c2w=torch.zeros(6, 3, 4)), "a pose that is not a rotation"),
+    "far away": (camera(center=torch.full((6, 2), 3e38)), "center has numbers beyond 1e+09"),
+    "no lens": (camera(focal=torch.zeros(6, 2)), "focal is not at least 0.001"),
+    "too many pixels": (camera(height=torch.full((6,), 1 << 27), width=torch.full((6,), 1 << 27)), "pixels in one"),
+    "no pixels": (camera(height=torch.zeros(6, dtype=torch.int64)), "width is not above 0"),
+    "no extent": (recorded(far=torch.zeros(6)), "near is not everywhere from 0"),
+    "no box": (recorded(aabb=torch.zeros(2, 3)), "aabb has no inside"),
+    "no frame": (
+        recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))),
+        "to_user is not a rotation",
+    ),
+    "no views": (recorded(view_names=()), "of 0 views"),
+    "views alike": (recorded(view_names=("a",) * 6), "view_names names two views alike"),
+    "a long name": (recorded(view_names=("a" * 2000, *"bcdef")), "2,000 characters in a name"),
+    "a terminal's name": (recorded(view_names=("a\x1b[2J", *"bcdef")), "which holds control characters"),
+    "other views": (recorded(splits={"train": (0, 99)}), "splits.train names views that are not among the 6"),
+    "nothing to train on": (recorded(splits={"test": (0,)}), "splits has no views to train on"),
+    "an unknown key": (recorded(more=1), "holds 'more', which no file of this program does"),
+    "an unknown word": (recorded(background="\x1b[2Jwhite"), "background is '\\x1b[2Jwhite', not white or"),
+    "a missing key": (lambda content: content["nerf_lightning"].pop("config"), "lacks config"),
+    "another type": (state(choices=["scene"]), "choices is a list"),
+    "another format": (state(format=[[["1"]]]), "format a list"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), RECORDS.values(), ids=RECORDS)
+def test_the_first_difference_of_a_record_is_named(nerf, tmp_path, change, words):
     file = write_checkpoint(tmp_path / "a.ckpt", change)
-    for command, read in (("render", loaded), ("eval", scene_of)):
+    for read in (loaded, scene_of):
         refused(read, file, parts=("a.ckpt", words))
-        if words.startswith(("background", "format")):  # letters for a terminal, and one of those that nest themselves
-            said(nerf(command, f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", words)
+    if words.startswith("background"):  # letters for a terminal
+        said(nerf("render", f"ckpt={file}", f"paths.output_dir={tmp_path}/out"), "a.ckpt", "background is")
     assert not (tmp_path / "out").exists()
+
+
+WEIGHT = "model.levels.fine.field.feature.weight"
+WEIGHTS = {
+    "missing": (lambda weights: weights.pop(WEIGHT), "Missing key"),
+    "more": (lambda weights: weights.update({"model.more": torch.zeros(1)}), "Unexpected key"),
+    "another shape": (lambda weights: weights.update({WEIGHT: weights[WEIGHT][:1]}), "size mismatch"),
+    "another dtype": (lambda weights: weights.update({WEIGHT: weights[WEIGHT].double()}), "holds torch.float64"),
+    "infinite": (lambda weights: weights.update({WEIGHT: weights[WEIGHT] / 0}), "holds NaN or infinity"),
+    "of no part": (lambda weights: weights.update({"x": torch.zeros(1)}), "belongs to no part of a run"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), WEIGHTS.values(), ids=WEIGHTS)
+def test_weights_have_the_keys_shapes_and_dtypes_that_the_config_says(tmp_path, change, words):
+    file = write_checkpoint(tmp_path / "a.ckpt", lambda content: change(content["state_dict"]))
+    refused(loaded, file, parts=("a.ckpt", words))
 
 
 def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_far_to_trust(
@@ -268,19 +254,15 @@ def test_a_recorded_scene_says_neither_where_to_write_nor_what_to_fetch_nor_how_
     assert not (tmp_path / "planted").exists()
 
 
-def test_of_a_recorded_scene_settings_that_nobody_decided_about_are_not_taken(tmp_path, monkeypatch, caplog):
-    """Whether the yaml of this name has them, or not."""
+def test_of_a_recorded_scene_settings_that_our_yaml_lacks_are_not_taken(tmp_path, monkeypatch, caplog):
     (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nunheard_of: null\n")
+    (tmp_path / "scene" / "mine.yaml").write_text("_target_: mine.Reader\nroot: ???\nof_mine: null\n")
     monkeypatch.setattr("nerf_lightning.files.folders.conf_folder", lambda: tmp_path)
-    scene = {"root": "data", "unheard_of": "/tmp/evil", "not\x1b[2J in_it": 1, "allow_outside": True}
+    scene = {"root": "data", "of_mine": 3, "not\x1b[2J in_it": 1, "allow_outside": True}
     file = write_checkpoint(tmp_path / "a.ckpt", state(choices={"scene": "mine"}), scene=scene)
-    assert scene_of(file) == ["scene=mine", "scene.root='data'"]
-    (said_once,) = [record.getMessage() for record in caplog.records]
-    assert "scene.unheard_of" in said_once
-    assert "scene.not\\x1b[2J in_it" in said_once
-    assert "are not taken from a file. Give them by hand" in said_once
-    assert "allow_outside" not in said_once
+    assert scene_of(file) == ["scene=mine", "scene.root='data'", "scene.of_mine=3"]
+    assert "\x1b" not in caplog.text
+    assert "are not taken from a file. Give them by hand" in caplog.text
 
 
 def test_links_beside_a_checkpoint_do_not_lead_out(nerf, sound, tmp_path):
@@ -361,24 +343,12 @@ def test_more_samples_than_agreed_are_not_taken(tmp_path, level):
         loaded(file)
 
 
-SAMPLER = "nerf_lightning.nerf.samplers.occupancy.OccupancySampler"
-FREQUENCY = "nerf_lightning.nerf.encoders.frequency.FrequencyEncoder"
-GRID = "nerf_lightning.nerf.encoders.hash_grid.HashGridEncoder"
-FIELD = "nerf_lightning.nerf.fields.hash_field.HashField"
 IMPOSSIBLE = [
-    *({"sampler": {"_target_": SAMPLER, key: value}} for key, value in (
-        ("num_steps", 0), ("num_steps", -1), ("num_cascades", 0), ("num_cascades", 60), ("cone_angle", -1e-3),
-        ("cone_angle", 1e9), ("update_every", 0), ("warmup_steps", -1), ("prune_after", -1), ("decay", 2.0),
-        ("decay", -1.0), ("min_alpha", -1.0), ("opaque_below", -1.0), ("opaque_below", 2.0), ("capacity", 0),
-    )),
+    {"sampler": {"_target_": "nerf_lightning.nerf.samplers.occupancy.OccupancySampler", "num_cascades": 60}},
     {"sampler": {"_target_": "nerf_lightning.nerf.samplers.importance.ImportanceSampler", "num_samples": -1}},
-    {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": 10_000}}},
-    {"field": {"position_encoder": {"_target_": FREQUENCY, "num_frequencies": -1}}},
-    {"field": {"position_encoder": {"_target_": GRID, "max_resolution": 1 << 40}}},
-    {"field": {"_target_": FIELD, "feature_dim": 0}},
-    {"field": {"_target_": FIELD, "width": 0}},
+    {"field": {"_target_": "nerf_lightning.nerf.fields.hash_field.HashField", "width": 0}},
     {"field": {"width": 1}},
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("part", IMPOSSIBLE, ids=lambda part: str(part)[-60:])
@@ -387,22 +357,17 @@ def test_settings_that_no_model_has_are_named(tmp_path, part):
         level = config["model"]["levels"]["fine"]
         level["sampler"] |= {"num_samples": 3}
         for name, settings in part.items():
-            if "_target_" in settings:
-                encoders = {key: value for key, value in level[name].items() if key.endswith("_encoder")}
-                level[name] = encoders | settings
-            else:
-                level[name] |= settings
+            encoders = {key: value for key, value in level[name].items() if key.endswith("_encoder")}
+            level[name] = encoders | settings if "_target_" in settings else level[name] | settings
 
     file = write_checkpoint(tmp_path / "a.ckpt", in_config(change))
     refused(loaded, file, parts=("a.ckpt: its model part cannot be built", ": give "))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, -(10**30)], ids=lambda value: str(value)[:9])
-@pytest.mark.parametrize("key", ["density_bias", "note"])
-def test_numbers_that_no_model_has_are_named(tmp_path, key, value):
-    change = in_config(lambda c: c["model"]["levels"]["fine"]["field"].update({key: value}))
-    file = write_checkpoint(tmp_path / "a.ckpt", change)
-    refused(loaded, file, parts=("a.ckpt", "its model part holds the number"))
+@pytest.mark.parametrize("value", [float("nan"), 1e30])
+def test_numbers_that_no_model_has_are_named(tmp_path, value):
+    change = in_config(lambda c: c["model"]["levels"]["fine"]["field"].update(density_bias=value))
+    refused(loaded, write_checkpoint(tmp_path / "a.ckpt", change), parts=("a.ckpt", "its model part holds the number"))
 
 
 def test_wider_layers_than_agreed_are_not_taken(tmp_path):
@@ -416,27 +381,6 @@ def test_wider_layers_than_agreed_are_not_taken(tmp_path):
     loaded(file)
     with budget(layer_width=256):
         refused(loaded, file, parts=("a.ckpt", "features of one point", "add budgets.layer_width=3"))
-
-
-YAML_NUMBER = {"hex": "0x" + "f" * 5000, "clock": ":".join(["1"] * 3000)}
-YAML_PLAIN = {
-    "a day": "[2001-01-01]",
-    "a set": "!!set {a, b}",
-    "keys of two kinds": "{1: 1, b: 2}",
-    "a day as key": "{2001-01-01: 1}",
-    "bytes": "!!binary aGk=",
-}
-
-
-@pytest.mark.parametrize("value", [*YAML_NUMBER.values(), *YAML_PLAIN.values()], ids=[*YAML_NUMBER, *YAML_PLAIN])
-def test_values_that_no_config_of_ours_holds_are_refused(tmp_path, value):
-    """They would be found out only where they are written: in the hash of a measurement's settings."""
-
-    def change(content):
-        content["nerf_lightning"]["config"] += f"\nmore: [{value}]\n"
-
-    file = write_checkpoint(tmp_path / "a.ckpt", change)
-    refused(loaded, file, parts=("The config in", "a.ckpt", "holds a value that cannot be read"))
 
 
 @pytest.mark.parametrize("path", ["x" * 5000, "a\0b"], ids=["long", "nul"])

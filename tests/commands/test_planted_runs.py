@@ -30,23 +30,18 @@ def write_overrides(run, *lines):
 
 HARMLESS = [
     "model=fast",
-    "scene=colmap",
     "+experiment=lego_article",
     "sampler@model.levels.fine.sampler=occupancy",
     "scene.root='my data/it\\'s'",
-    "scene.root=../captures/fox",
     "scene.skip={train:1,val:1,test:8}",
-    "scene.name=null",
+    "+scene.of_a_new_reader=images_4",
     "optimizer.lr=2e-3",
     "callbacks=[default]",
     "~callbacks.monitor",
-    "~callbacks.camera_layout",
     "~logger",
     "+optimizer.amsgrad=true",
-    "+callbacks.collapse_guard.ratio=0.1",
     "path.views=[train/r_1.png,3]",
     "evaluation.lpips_weights='my weights/alex.pt'",
-    "logger=none",
     "trainer.max_steps=100",
     "++data.batch_rays=64",
     "model.levels.fine.field.skip=null",
@@ -60,51 +55,38 @@ def test_ordinary_overrides_are_repeated(run):
 
 
 PLANTED = [
+    # Classes and programs.
     "scene._target_=os.system",
-    "+scene._target_=os.system",
     "++callbacks.evil={_target_:os.system,command:'touch ran'}",
     "callbacks={evil:{deep:[{_target_:os.system}]}}",
     "+trainer._args_=[1]",
-    "scene={_target_:os.system}",
-    "hydra.run.dir=/tmp",
-    "hydra.job_logging.formatters.simple={'()':os.system}",
     "hydra/launcher=evil",
-    "hydra={run:{dir:x}}",
     "--config-dir=/tmp/evil",
-    "-m",
-    "--multirun",
+    "encoder@callbacks.evil=frequency",
+    "encoder@model._target_=frequency",
+    # Files.
     "model=../../../tmp/evil",
-    "scene=/tmp/evil",
     "+experiment=[fern,../evil]",
-    "encoder@direction_encoder=../evil",
-    "scene.root=${oc.env:HOME}",
+    # What is looked up.
     "scene.root='${oc.env:HOME}'",
     "seed=1,2",
-    "seed=range(1,9)",
+    # Where to write, what to fetch, how far to trust.
+    "hydra={run:{dir:x}}",
+    "logger.tensorboard.name=../../elsewhere",
     "scene.cache_dir=/tmp/elsewhere",
     "scene.allow_outside=true",
-    "+scene.max_gigabytes=1000",
-    "scene.download.url=https://x/y",
     "scene={download:{url:https://x/y}}",
-    "scene.path=not_there.npz",
-    "logger.tensorboard.name=../../elsewhere",
-    "encoder@hydra.callbacks.evil=hash_grid",
     "encoder@scene.download=frequency",
-    "encoder@model._target_=frequency",
-    # What this program has no setting for.
-    "+unheard_of=1",
-    "scene.unheard_of=/tmp/evil",
-    "+trainer.unheard_of=1",
-    "++callbacks.evil.port=80",
-    "callbacks={evil:{port:80}}",
-    "~callbacks.evil",
-    "encoder@callbacks.evil=frequency",
-    "unheard/of=any",
+    "scene.path=not_there.npz",
+    # Paths where there are words, groups that nobody has decided about, and what is no override.
     "encoder.unheard_of=/tmp/evil",
-    "s" * 300 + "=1",
+    "+unheard_of=1",
+    "unheard/of=any",
     "not an override",
-    "=",
     "",
+    "scene.path=" + "x" * 5000,
+    "a=" + "[" * 900 + "]" * 900,
+    "seed=" + "9" * 5000,
 ]
 
 
@@ -117,19 +99,9 @@ def test_a_planted_override_is_not_repeated(run, line):
 
 @pytest.mark.parametrize(
     "line",
-    [
-        "paths.output_dir=/x",
-        "++paths.root_dir=/x",
-        "resume=auto",
-        "+init_from=/x.ckpt",
-        "paths={root_dir:/x}",
-        "viewer=on",
-        "viewer@callbacks=on",
-        "viewer.live_view.host=0.0.0.0",
-        "++viewer.live_view.port=80",
-        "viewer={live_view:{host:0.0.0.0}}",
-    ],
-)
+    ["++paths.root_dir=/x", "resume=auto", "+init_from=/x.ckpt", "paths={root_dir:/x}", "viewer@callbacks=on",
+     "viewer.live_view.host=0.0.0.0", "viewer={live_view:{host:0.0.0.0}}"],
+)  # fmt: skip
 def test_what_belongs_to_one_start_is_left_out(run, line):
     write_overrides(run, line, "seed=1")
     assert former_overrides(run, []) == ["seed=1"]
@@ -148,11 +120,8 @@ def test_the_printed_command_repeats_what_the_folder_does_not(run):
 
 FILES = {
     "aliases": "a: &a [x, x]\nb: [*a, *a]\n",
-    "a mapping": "scene: bricks\n",
     "numbers": "[1, 2]\n",
-    "not yaml": "[",
     "objects": "!!python/object/apply:os.system ['touch ran']\n",
-    "deep": "[" * 900 + "]" * 900,
     "long": "- x\n" * 2_000_000,
     "binary": b"\xff\xfe\x00",
 }
@@ -173,33 +142,14 @@ def test_nothing_planted_runs_through_the_command_line(nerf, capture, run, tmp_p
     assert sorted(path.name for path in run.iterdir()) == [".hydra", "checkpoints", "run.json"]
 
 
-@pytest.mark.parametrize(
-    "note", ["[" * 100_000, "{" * 5, '{"fingerprint": ' + "[" * 900 + "]" * 900 + "}", "[1]", "9" * 9999]
-)
-def test_a_garbled_note_is_damaged(nerf, capture, run, note):
-    (run / "run.json").write_text(note)
+def test_a_garbled_note_is_damaged(nerf, capture, run):
+    (run / "run.json").write_text('{"fingerprint": ' + "[" * 900 + "]" * 900 + "}")
     write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
     said(nerf("train", f"resume={run}"), f"{run / 'run.json'} is damaged", "Remove it")
 
 
-@pytest.mark.parametrize("note", [{"finished_at_step": "x"}, {"seconds": "x"}, {"seconds": 10**400}, {"seconds": [1]}])
-def test_a_note_of_other_kinds_is_no_number(tmp_path, note):
-    from support.configs import composed
-
-    config = composed("train", f"paths.root_dir={tmp_path}", f"paths.output_dir={tmp_path}/here")
-    open_run(config, 100, None).release()
-    file = tmp_path / "here" / "run.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | note))
-    run = open_run(composed("train", f"paths.root_dir={tmp_path}", "resume=auto"), 100, None)
-    run.finish(100)
-    run.release()
-    assert run.path == tmp_path / "here"
-    assert json.loads(file.read_text())["seconds"] < 100
-
-
-@pytest.mark.parametrize("content", ["a: &a [x, x]\nb: [*a, *a]\n", "[1]\n", "x: ${oc.env:HOME}\nscene: 3\n"])
-def test_a_garbled_config_is_compared_as_text(nerf, capture, run, content):
-    (run / ".hydra" / "config.yaml").write_text(content)
+def test_a_garbled_config_is_compared_as_text(nerf, capture, run):
+    (run / ".hydra" / "config.yaml").write_text("x: ${oc.env:HOME}\nscene: 3\n")
     write_overrides(run, "scene=npz", f"scene.path={capture}", *FAST)
     said(nerf("train", f"resume={run}"), "run")
 
@@ -254,21 +204,6 @@ def test_pictures_in_a_run_folder_start_no_program(tmp_path):
         _film_progress(tmp_path)
 
 
-OVERRIDES = {
-    "a path that is too long": "scene.path=" + "x" * 5000,
-    "deep": "a=" + "[" * 900 + "]" * 900,
-    "deep dictionaries": "a=" + "{a:" * 500 + "1" + "}" * 500,
-    "a number of many digits": "seed=" + "9" * 5000,
-}
-
-
-@pytest.mark.parametrize("line", OVERRIDES.values(), ids=OVERRIDES)
-def test_an_override_that_cannot_be_read_is_not_repeated(run, line):
-    write_overrides(run, line)
-    with pytest.raises(InputError, match="which is not repeated from a file"):
-        former_overrides(run, [])
-
-
 def test_more_overrides_than_agreed_are_not_read(run):
     write_overrides(run, "path.views=[" + "1," * 1000 + "1]")
     assert len(former_overrides(run, [])) == 1
@@ -276,7 +211,7 @@ def test_more_overrides_than_agreed_are_not_read(run):
         former_overrides(run, [])
 
 
-@pytest.mark.parametrize("value", ["x", [], {}, None, 10**400, float("inf"), float("nan"), True])
+@pytest.mark.parametrize("value", ["x", [], None, 10**400, float("nan")])
 def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
     """The note is anybody's; a training that goes on in its folder writes its own numbers there at the end."""
     note = {"fingerprint": "0", "seconds": value, "finished_at_step": value}

@@ -17,7 +17,6 @@ from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.key_meanings import (
     CHOSEN_GROUPS,
     ROWS,
-    THE_REST,
     Trust,
     meaning_of,
     names_a_class,
@@ -60,29 +59,19 @@ def nested(section, content):
     return nested_config
 
 
-def test_no_entry_stands_twice_and_each_is_a_key():
+def test_no_entry_stands_twice_and_each_is_of_a_key():
     entries = Counter(key for _, keys in ROWS for key in keys.split())
     assert [key for key, count in entries.items() if count > 1] == []
-    assert [key for key in [*entries, *THE_REST] if not OF_A_KEY.fullmatch(key)] == []
-
-
-def test_every_key_of_every_config_has_a_meaning():
-    """Whoever adds a setting says in config/key_meanings.py what it means, and whether a stranger may choose it."""
-    assert len(keys_of_conf()) > 250
-    assert [key for key in keys_of_conf() if not names_a_class(key) and row_of(key) is None] == []
-
-
-def test_every_entry_is_of_a_key():
+    assert [key for key in entries if not OF_A_KEY.fullmatch(key)] == []
     used = {row_of(key) for key in keys_of_conf()}
-    named = [key for _, keys in ROWS for key in keys.split() if not key.startswith("hydra.")]
     # What a constructor has and its yaml leaves out, or Lightning's Trainer has.
-    unseen = {"model", "scene", "scene.skip.train", "trainer.lightning.fast_dev_run"} | {
-        key for key in named if key.startswith("callbacks.")
-    }
-    unseen |= {
-        f"scene.{name}" for name in ("variant", "variants", "unseen", "gain", "gamma")
-    }  # of an extension's readers
-    assert set(named) - used - unseen == set()
+    unseen = {"model", "scene", "trainer.lightning.fast_dev_run", "callbacks.checkpoints.monitor"}
+    assert {key for key in entries if not key.startswith("hydra.")} - used - unseen == set()
+
+
+def test_every_setting_of_a_run_is_in_a_group_that_is_decided_about():
+    settings = {key for key in flatten(composed("train")) if not names_a_class(key)}
+    assert [key for key in settings if row_of(key) is None] == []
 
 
 def test_a_room_that_is_trusted_as_a_whole_has_no_texts_but_words():
@@ -113,15 +102,15 @@ def test_every_group_is_one_that_a_file_may_choose_from_or_decidedly_none():
         assert meaning_of(group).trust in (Trust.ONE_START, Trust.NOTHING), group
 
 
-@pytest.mark.parametrize("key", ["unheard_of", "scene.unheard_of", "trainer.unheard_of", "callbacks.mine.port"])
-def test_of_an_unheard_setting_nothing_is_taken(key):
-    assert row_of(key) is None
-    assert meaning_of(key).trust is Trust.NOTHING
+def test_a_new_reader_part_or_callback_has_the_row_of_its_group():
+    assert meaning_of("scene.of_a_new_reader").trust is Trust.PLAIN
+    assert meaning_of("scene.of_a_new_reader").learnt
+    for key in ("field.of_a_new_field", "loss.terms.of_a_new_loss", "callbacks.mine.port", "trainer.unheard_of"):
+        assert meaning_of(key).trust in (Trust.WORDS, Trust.PLAIN)
+    assert meaning_of("unheard_of").trust is Trust.NOTHING
 
 
-@pytest.mark.parametrize(
-    "key", ["model._target_", "scene._target_", "model.levels.fine._args_", "hydra.launcher._target_", "_target_.x"]
-)
+@pytest.mark.parametrize("key", ["model._target_", "scene._target_", "model.levels.fine._args_", "_target_.x"])
 def test_of_the_name_of_a_class_nothing_is_taken(key):
     assert meaning_of(key).trust is Trust.NOTHING
     assert meaning_of(key).in_sweep is None

@@ -2,12 +2,10 @@
 
 import copy
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from support.altered import Altered
 from support.running import FAST, start
 
 from nerf_lightning.commands.train_job.build import assemble_job
@@ -40,11 +38,6 @@ class Resumed:
         self.system.trainer = parts.settings.build(folder, 25, parts.callbacks, [])
         self.file = folder / "last.ckpt"
         self.sound: dict[str, Any] = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-
-    @cached_property
-    def whole(self) -> Altered:
-        """The sound checkpoint, to be altered."""
-        return Altered("nothing", self.sound)
 
     def take(self, change: Callable[[dict[str, Any]], object]) -> None:
         """Take the sound checkpoint, changed, and update the weights once: compiled optimizers look at no shapes."""

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.trust import Mismatch
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
-from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT
+from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
-from nerf_lightning.nerf.types.scene import Background
+from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 """What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
@@ -191,3 +192,78 @@ def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
             "camera poses again."
         )
     return pose[:3]
+
+
+def check_scene(scene: SceneRecord, where: str) -> None:
+    """Refuse numbers that are no scene's, whether a reader or a checkpoint says them.
+
+    Args:
+        scene: of annotated shapes and kinds, and finite.
+        where: the file, for messages.
+
+    Raises:
+        Mismatch: cameras that are none, content that ends before it begins, a box without inside, a frame that is no
+            similarity, or views that are not there.
+        InputError: more than the budgets allow, or a name that cannot be shown.
+    """
+    names, views = scene.view_names, len(scene.view_names)
+    require_within("views", views, where, "views")
+    require_within(
+        "name_characters", max(map(len, (scene.name, *names, *scene.captures))), where, "characters in a name"
+    )
+    for name in (scene.name, *names, *scene.captures):
+        require_printable(name, where)
+    if len(set(names)) < views or not names:  # files and tables are written by it
+        raise Mismatch("scene.view_names", "names two views alike, or none")
+    check_cameras(scene.cameras, "scene.cameras", where)
+    reach = torch.cat([scene.near, scene.far, scene.aabb.flatten()]).abs().max()
+    if not bool(((scene.near >= 0) & (scene.near < scene.far)).all()):
+        raise Mismatch("scene.near", "is not everywhere from 0 to below far")
+    if not bool((scene.aabb[0] < scene.aabb[1]).all()) or float(reach) > FARTHEST:
+        raise Mismatch("scene.aabb", f"has no inside, or the content reaches beyond {FARTHEST:g}")
+    _check_similarity(scene.to_user.double())
+    if scene.metres_per_unit is not None and not LEAST_UNIT <= scene.metres_per_unit <= LARGEST_UNIT:
+        raise Mismatch("scene.metres_per_unit", "is no length")
+    _check_splits(scene, views)
+
+
+def _check_splits(scene: SceneRecord, views: int) -> None:
+    for split, numbers in scene.splits.items():
+        if split not in ("train", "val", "test", "sources") or not set(numbers) <= set(range(views)):
+            raise Mismatch(f"scene.splits.{split}", f"names views that are not among the {views}")
+        if len(set(numbers)) < len(numbers):
+            raise Mismatch(f"scene.splits.{split}", "names a view twice")
+    if not scene.splits.get("train"):
+        raise Mismatch("scene.splits", "has no views to train on")
+    of = scene.capture_of
+    if of is not None and not (len(of) == views and set(of) <= set(range(len(scene.captures)))):
+        raise Mismatch("scene.capture_of", f"is not one of {len(scene.captures)} captures for each view")
+
+
+def check_cameras(cameras: Cameras, place: str, where: str) -> None:
+    """Refuse numbers that are no cameras; see `check_scene`.
+
+    Raises:
+        Mismatch: a pose that is no rotation with a centre, or a size or a lens that none has.
+        InputError: a picture of more than `budgets.view_pixels`.
+    """
+    if not bool(is_rigid(cameras.c2w).all()):
+        raise Mismatch(f"{place}.c2w", "holds a pose that is not a rotation and a centre")
+    sizes = torch.stack([cameras.width, cameras.height]).double()
+    if float(sizes.min()) < 1:
+        raise Mismatch(f"{place}.width", "is not above 0")
+    require_within("view_pixels", int(sizes.prod(dim=0).max()), where, "pixels in one picture")
+    for name in ("c2w", "focal", "center", "lens", "ndc"):
+        numbers = getattr(cameras, name)
+        if numbers is not None and float(numbers.abs().max()) > FARTHEST:
+            raise Mismatch(f"{place}.{name}", f"has numbers beyond {FARTHEST:g}")
+    if float(cameras.focal.min()) < LEAST_FOCAL or (cameras.ndc is not None and float(cameras.ndc.min()) <= 0):
+        raise Mismatch(f"{place}.focal", f"is not at least {LEAST_FOCAL:g}")
+
+
+def _check_similarity(to_user: Float[Tensor, "4 4"]) -> None:
+    unit = unit_of(to_user)
+    rotation = torch.cat([to_user[:3, :3] / unit, to_user[:3, 3:]], dim=1)
+    last = to_user[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    if not (LEAST_UNIT <= unit <= LARGEST_UNIT and last and bool(is_rigid(rotation))):
+        raise Mismatch("scene.to_user", "is not a rotation, a scale and a shift")

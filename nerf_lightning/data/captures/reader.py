@@ -21,6 +21,7 @@ from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, downscaled_siz
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.files.links import is_there, require_inside
+from nerf_lightning.files.trust import reading
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
@@ -93,7 +94,9 @@ class CaptureReader(Reader):
             InputError: a setting that makes no sense, or anything wrong with the files.
         """
         self._check_settings()
-        capture = usable(self._wanted(self.capture()))
+        with reading(self.root):
+            capture = self.capture()
+        capture = usable(self._wanted(capture))
         splits = self._splits(capture)
         if self.masks_keep == "black" and not any(view.photograph.mask for view in capture.views):
             raise InputError(

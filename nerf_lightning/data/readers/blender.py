@@ -22,6 +22,7 @@ from nerf_lightning.data.readers.base import GivenFrameReader
 from nerf_lightning.data.readers.frames import focal_of_angle, list_of_frames, path_of
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import is_there, require_inside
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
@@ -65,7 +66,9 @@ class BlenderReader(GivenFrameReader):
             if split not in SPLITS:
                 raise InputError(f"scene.skip names the split {split!r}; the splits are {listed(SPLITS)}.")
             check_step(f"skip.{split}", step)
-        capture = usable(self._capture())
+        with reading(self.root):
+            capture = self._capture()
+        capture = usable(capture)
         assert capture.splits is not None
         paths = [view.photograph.path for view in capture.views]
         width, height = _one_size(capture)

@@ -24,6 +24,7 @@ from nerf_lightning.files.download import fetch
 from nerf_lightning.files.links import is_there
 from nerf_lightning.files.numpy_files import ArrayHeader, archive_headers, check_unpacked, read_member
 from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, resized
@@ -66,7 +67,8 @@ class NpzReader(GivenFrameReader):
         path = Path(self.path)
         if self.download and not path.exists():
             fetch(self.download["url"], path, self.download["bytes"], self.download["sha256"])
-        images, poses, focal = _load(path, self.max_gigabytes)
+        with reading(path):
+            images, poses, focal = _load(path, self.max_gigabytes)
         count, height, width, _ = images.shape
         self.check_divisible(width, height)
         views = [

@@ -4,13 +4,12 @@ The `last.ckpt` before stays as `previous.ckpt`.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.checkpoints.reading import BEST, LAST
-from nerf_lightning.files.schema import Maybe, Number, Record
 from nerf_lightning.messages.errors import InputError, require_positive
 from nerf_lightning.training.launch.checkpoint_io import AtomicCheckpointIO
 
@@ -25,7 +24,7 @@ class Checkpoints(Callback):
         monitor: the logged value whose maximum is the best.
     """
 
-    STATE = Record({"best": Maybe(Number())})
+    STATE: ClassVar = {"best": float | None}
     needs_state = True
 
     def __init__(self, every_steps: int = 500, monitor: str = "val/psnr"):

@@ -1,14 +1,13 @@
 """The collapse guard: a run that renders a constant picture is noticed early and begun anew."""
 
 import logging
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.files.schema import Record, Whole
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.training.callbacks.watcher import tensorboard_writers
 from nerf_lightning.training.step_output import StepOutput
@@ -35,7 +34,7 @@ class CollapseGuard(Callback):
         InputError: `every_steps` or `patience` is below 1.
     """
 
-    STATE = Record({"failed": Whole()})
+    STATE: ClassVar = {"failed": int}
     needs_state = True
 
     def __init__(

@@ -1,13 +1,12 @@
 """The article's picture of an epoch: render, depth, and the loss so far."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.files.schema import Many, Number, Record, Whole
 from nerf_lightning.messages.errors import require_positive
 from nerf_lightning.training.callbacks.watcher import render_validation_view
 from nerf_lightning.visualization.figures import epoch_figure, loss_curve
@@ -23,7 +22,7 @@ class EpochFigures(Callback):
         view: which view of the validation split is shown.
     """
 
-    STATE = Record({"steps": Many(Whole(), 1 << 20), "losses": Many(Number(), 1 << 20)})
+    STATE: ClassVar = {"steps": list[int], "losses": list[float]}
 
     def __init__(self, every_epochs: int = 1, every_steps: int = 25, view: int = 0):
         require_positive(every_epochs=every_epochs, every_steps=every_steps)

@@ -3,13 +3,12 @@
 import signal
 import time
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.files.schema import Number, Record
 from nerf_lightning.messages.errors import InputError
 
 
@@ -25,7 +24,7 @@ class TimeBudget(Callback):
         every_steps: steps between two estimates of the run's length.
     """
 
-    STATE = Record({"used": Number(low=0.0)})
+    STATE: ClassVar = {"used": float}
     needs_state = True
 
     def __init__(self, seconds: float, every_steps: int = 10):

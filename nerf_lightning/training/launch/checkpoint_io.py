@@ -10,7 +10,7 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 from torch import Tensor
 
-from nerf_lightning.checkpoints.reading import read_content
+from nerf_lightning.checkpoints.reading import content_to_resume
 from nerf_lightning.checkpoints.writing import write_checkpoint
 
 # Copies in memory: one being written, one that waits for it (`last` and `best` fall due at the same step).
@@ -52,7 +52,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         Raises:
             InputError: it cannot be read, or is not as `checkpoints.format` says.
         """
-        return read_content(Path(path), resumable=True)
+        return content_to_resume(Path(path))
 
     def raise_failure(self) -> None:
         """Return at once.

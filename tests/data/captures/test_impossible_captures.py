@@ -34,7 +34,7 @@ def test_a_jpeg_of_fewer_bits_than_blocks_was_cut_short(tmp_path):
         assert image_size(tmp_path / "b.jpg") == (4000, 3000)
 
 
-@pytest.mark.parametrize("unit", ["[],", "{},", '{"":1},', "[1],"])
+@pytest.mark.parametrize("unit", ["[],", '{"":1},'])
 def test_a_json_of_brackets_is_refused_before_they_fill_the_memory(tmp_path, unit):
     path = tmp_path / "transforms.json"
     path.write_text(f"[{unit * 3_000_000}0]")

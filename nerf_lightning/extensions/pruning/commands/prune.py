@@ -77,7 +77,7 @@ def run(config: DictConfig) -> float | None:
 def _require_own(target: Path) -> None:
     """Refuse to write over what is no checkpoint that was made smaller: one of a run has more than weights."""
     try:
-        is_own = not target.exists() or "optimizer_states" not in read_content(target, resumable=False)
+        is_own = not target.exists() or "optimizer_states" not in read_content(target)
     except InputError:
         is_own = False
     if not is_own:
