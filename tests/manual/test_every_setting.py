@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 from hydra.utils import get_object
-from support.configs import composed, groups
+from support.configs import composed, groups, yaml_files
 
 from nerf_lightning.cli.main import find_commands
 from nerf_lightning.config.overrides import flatten
@@ -73,7 +73,7 @@ def test_every_setting_and_every_option_has_a_page(command):
 
 def targets():
     """Return what yamls of ours build, by its dotted name."""
-    entries = [entry for file in conf_folder().rglob("*.yaml") for entry in read_commented(file).entries.items()]
+    entries = [entry for file in yaml_files() for entry in read_commented(file).entries.items()]
     named = {entry.text for key, entry in entries if key.endswith("_target_")}
     return sorted(target for target in named if target.startswith("nerf_lightning."))
 
