@@ -14,10 +14,7 @@ TOLERANCE = 1.5
 def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:
     """Tell which matches the poses explain: rays that meet, to `TOLERANCE`, in front of both cameras.
 
-    Args:
-        matches: places in both pictures.
-        c2w: the poses to judge.
-        zoom: what the focal lengths are multiplied by.
+    Focal lengths are multiplied by `zoom`.
     """
     ahead = (_nearest(*rays_of(matches, c2w, zoom)) > 0).all(dim=-1)
     return ahead & (line_distances(matches, c2w, zoom) < TOLERANCE).all(dim=-1)

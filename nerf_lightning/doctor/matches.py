@@ -65,13 +65,9 @@ class Proof:
 def strongest_proof(
     matches: Matches, against: Bool[Tensor, "matches"], fits: Cameras | None, view: int | None = None
 ) -> tuple[Proof, ...]:
-    """Return the pair of photographs with most matches that speak against the cameras; none where none does.
+    """Return the pair of photographs (with `view` first, if given) with most of the matches that speak `against`.
 
-    Args:
-        matches: all of them.
-        against: those that speak against the cameras.
-        fits: the cameras that they speak for.
-        view: which view must be the first of the two; by default, any.
+    There may be none; `fits` are the cameras that they speak for.
     """
     matches = matches.where(against) if view is None else matches.where(against).with_first(view)
     if not len(matches.view):
@@ -83,14 +79,7 @@ def strongest_proof(
 def matched_pairs(
     cameras: Cameras, corners: Mapping[int, Corners], pairs: Sequence[tuple[int, int]], shown: bool = False
 ) -> Matches:
-    """Return places that are matched between the two views of each pair.
-
-    Args:
-        cameras: of all views, at the size of the shrunk pictures.
-        corners: of the views to look at.
-        pairs: of them, such as `likely_pairs`.
-        shown: whether to show a progress bar.
-    """
+    """Return places that are matched between the two views of each pair; cameras are of the shrunk pictures' size."""
 
     def matched(number: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         both = list(pairs[number])

@@ -101,12 +101,7 @@ def _write_verdicts(axes: "Axes", checks: Sequence[Check]) -> None:
 
 
 def proof_picture(scene: Scene, proofs: Sequence[Proof]) -> UInt8[Tensor, "height width 3"]:
-    """Return a row for each proof: details of one photograph, their lines in another, and the lines as they should be.
-
-    Args:
-        scene: the capture.
-        proofs: what the checks found; the first few are drawn.
-    """
+    """Return a row for each of the first proofs: details of one photograph, their lines in another, given and right."""
     shown = proofs[:MOST_PROOFS]
     figure = new_figure(3 * PANEL, PANEL * len(shown) + 40)
     panels = figure.subplots(len(shown), 3, squeeze=False)

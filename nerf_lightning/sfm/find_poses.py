@@ -24,16 +24,7 @@ UNFINISHED = ".poses.part"
 
 
 def require_new_capture(folder: Path, source: Path, is_video: bool) -> None:
-    """Refuse to write over poses, or over pictures that are not those that the poses are of.
-
-    Args:
-        folder: to write.
-        source: the photographs, or the video.
-        is_video: which of the two.
-
-    Raises:
-        InputError: there are poses in the folder already, or other pictures; or a link leads to where they would go.
-    """
+    """Refuse to write over poses, or over pictures that are not those of `source`, through links either."""
     if below(folder, "sparse", "0").exists():
         raise InputError(
             f"{folder} has camera poses already (sparse/0). Remove them to find them again, or give another folder "
@@ -62,16 +53,9 @@ def _unfinished(folder: Path) -> Iterator[Path]:
 
 
 def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_outside: bool) -> tuple[SparseModel, str]:
-    """Find the cameras of a folder of photographs, and write a capture.
+    """Find the cameras of photographs, and write a capture; return what was found, and how photographs were paired.
 
-    Args:
-        source: the photographs.
-        folder: to write; it may be the one that holds them, in `images`.
-        settings: of the reconstruction.
-        allow_outside: follow links out of the folder.
-
-    Returns:
-        What was found, and how photographs were paired.
+    The folder to write may be the one that holds the photographs, in `images`.
 
     Raises:
         InputError: photographs that cannot be used, or whose cameras cannot be found.

@@ -113,11 +113,7 @@ def files_in(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
-    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew.
-
-    Raises:
-        InputError: it cannot be decoded.
-    """
+    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew."""
     target = folder / photograph.path.name
     if not photograph.upright:
         _write_turned(photograph.path, target)
@@ -129,11 +125,7 @@ def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
 
 
 def check_pixels(photograph: FoundPhotograph) -> None:
-    """Decode a photograph once, so that a damaged one is named before hours are spent on the others.
-
-    Raises:
-        InputError: it is truncated, or of a mode that cannot be read as 8-bit colour.
-    """
+    """Decode a photograph once, so that a damaged one is named before hours are spent on the others."""
     if photograph.upright:
         read_rgba(photograph.path)
 

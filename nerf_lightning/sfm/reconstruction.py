@@ -47,11 +47,7 @@ class SparseModel:
 
 
 def require_pycolmap() -> Any:
-    """Return pycolmap.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return pycolmap, or say how it is installed."""
     try:
         return import_module("pycolmap")
     except ImportError as error:
@@ -84,7 +80,6 @@ def reconstruct(
     Raises:
         InputError: no pycolmap, or photographs of several sizes for one camera.
         NothingFoundError: nothing can be reconstructed.
-        OSError: the disk is full.
     """
     colmap = require_pycolmap()
     names = [photograph.path.name for photograph in photographs]

@@ -11,15 +11,7 @@ ENOUGH = 0.8
 
 
 def summary_lines(model: SparseModel, matching: str, is_video: bool, folder: Path, seconds: float) -> list[str]:
-    """Return what was found, line by line, with advice where it is little.
-
-    Args:
-        model: the cameras.
-        matching: how photographs were paired.
-        is_video: whether they are frames of a video.
-        folder: where the capture was written.
-        seconds: how long it took.
-    """
+    """Return what was found and written to `folder`, line by line, with advice where it is little."""
     found, total = len(model.registered), len(model.registered) + len(model.left_out)
     what = "frames" if is_video else "photographs"
     cameras = "one camera" if model.num_cameras == 1 else f"{model.num_cameras} cameras"

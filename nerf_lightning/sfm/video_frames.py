@@ -55,11 +55,7 @@ def _roughness(grey: Image.Image) -> float:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames a video has.
-
-    Raises:
-        InputError: no such file, or not a video.
-    """
+    """Return how many frames a video has; refuse what is no video."""
     import imageio_ffmpeg
 
     if not path.is_file():
@@ -84,11 +80,7 @@ def frame_stride(num_frames: int, every: int | None) -> int:
 def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[int], None] = lambda count: None) -> int:
     """Write the sharpest of every `every` frames as frame_000123.jpg, by its number in the video; return how many.
 
-    Args:
-        video: any format that ffmpeg reads; frames come upright.
-        folder: where to; it exists.
-        every: length of the groups in frames; a shorter last group counts as one.
-        seen: called with the number of frames read so far.
+    Frames come upright; a shorter last group counts as one; `seen` is called with the number of frames read so far.
 
     Raises:
         InputError: not a video, or one without frames.
@@ -140,11 +132,7 @@ SYNC = 0x47
 
 
 def require_video(path: Path) -> None:
-    """Refuse what is no container of video.
-
-    Raises:
-        InputError: with what is read.
-    """
+    """Refuse what is no container of video, and say what is read."""
     # However large: a few frames of it are in memory at a time.
     with explained(path), open_regular(path, None) as file:
         start = file.read(600)

@@ -73,13 +73,6 @@ def test_opencv_axes_are_printed_with_their_cure(corner, doctor, tmp_path):
     assert "wrong; 10 views examined" in result.out
 
 
-@pytest.mark.exhaustive  # of the checks themselves: tests/doctor/test_doctor_poses.py; one through the command: above
-def test_world_to_camera_is_named(corner, doctor):
-    _, checks = doctor(corner(np.linalg.inv))
-    assert checks["axes"]["verdict"] == "wrong"
-    assert "world-to-camera rather than camera-to-world" in checks["axes"]["message"]
-
-
 def test_photographs_without_pose_reach_the_doctor(corner, doctor):
     folder = corner()
     Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / "spare.png")

@@ -158,11 +158,7 @@ def check_metres(metres_per_unit: float | None) -> None:
 
 
 def known_background(name: str) -> Background:
-    """Return `name` as a background.
-
-    Raises:
-        InputError: there is no such background.
-    """
+    """Return `name` as a background, or refuse one that there is none of."""
     for known in get_args(Background):
         if name == known:
             return known
@@ -170,15 +166,7 @@ def known_background(name: str) -> Background:
 
 
 def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
-    """Return a nested list or array of 3 x 4 numbers as a pose (float64), without the last row that it may have.
-
-    Args:
-        matrix: what the file holds.
-        where: the file and frame, for the message.
-
-    Raises:
-        InputError: no such matrix, or a last row that is not 0 0 0 1.
-    """
+    """Return a nested list or array of 3 x 4 numbers as a pose (float64), without a last row, which must be 0 0 0 1."""
     try:
         pose = torch.as_tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):

@@ -55,11 +55,7 @@ IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
 def choose_space(
     asked: Space | Literal["auto"], cameras: Cameras, capture: Capture, has_transparency: bool
 ) -> tuple[Space, str]:
-    """Return the space, and why.
-
-    Raises:
-        InputError: NDC was asked for and cannot work.
-    """
+    """Return the space, and why; NDC is refused where it cannot work."""
     cosine, ahead = least_agreement(cameras.c2w), least_ahead(cameras) > LEAST_AHEAD
     if asked == "ndc" and not ahead:
         raise InputError(
@@ -100,12 +96,8 @@ class Extent:
 def extent_of(capture: Capture, cameras: Cameras, space: Space, near: float | None, far: float | None) -> Extent:
     """Return the frame and the extent that suit a space.
 
-    Args:
-        capture: in the user's frame, as are `cameras`.
-        cameras: at the size of the pixels.
-        space: which one.
-        near: in the user's units, where the user knows better.
-        far: likewise.
+    Capture and cameras (at the size of the pixels) are in the user's frame, `near` and `far` in the user's units, where
+    the user knows better.
 
     Raises:
         InputError: all cameras stand at one place, near and far leave nothing, or the space does not suit the cameras.

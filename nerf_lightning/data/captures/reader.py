@@ -123,6 +123,12 @@ class CaptureReader(Reader):
             log.warning(
                 "%d photographs have no pose and are left out: %s", len(capture.left_out), listed(capture.left_out, 5)
             )
+        protocol = {
+            "downscale": str(self.downscale),
+            "filter": "none" if self.downscale == 1 else "area, premultiplied",
+            "hold_every": str(self.hold_every),
+            "frames": self.frames or "all",
+        }
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
         extent = extent_of(capture, cameras, space, self.near, self.far)
         to_user = (capture.undo @ extent.to_user).float()
@@ -141,17 +147,13 @@ class CaptureReader(Reader):
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
             metres_per_unit=self.metres_per_unit,
-            protocol=self._protocol() | protocol_of(color) | remembered,
+            protocol=protocol | protocol_of(color) | remembered,
             truth=None,
             left_out=capture.left_out,
         )
 
     def folder(self) -> Path:
-        """Return the capture's folder.
-
-        Raises:
-            InputError: it does not exist.
-        """
+        """Return the capture's folder, which must exist."""
         try:
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
@@ -162,20 +164,12 @@ class CaptureReader(Reader):
         return folder
 
     def require_inside(self, path: Path, setting: str | None = None) -> None:
-        """Refuse what is really outside of the capture's folder, and of the one that a setting names, unless allowed.
-
-        Raises:
-            InputError: with where it leads, and the cure.
-        """
+        """Refuse what is really outside of the capture's folder and of the one that a setting names, unless allowed."""
         if not self.allow_outside:
             require_inside(path, self.folder(), setting)
 
     def mask_of(self, name: str) -> Path | None:
-        """Return the mask of the photograph `name`, where masks are used.
-
-        Raises:
-            InputError: there is none.
-        """
+        """Return the mask of the photograph `name`, where masks are used; then each must have one."""
         if self.masks is None:
             return None
         beside = self.folder() / self.masks / name
@@ -232,23 +226,12 @@ class CaptureReader(Reader):
             )
         return {"train": splits["train"], "val": held, "test": splits["test"] or held}
 
-    def _protocol(self) -> dict[str, str]:
-        return {
-            "downscale": str(self.downscale),
-            "filter": "none" if self.downscale == 1 else "area, premultiplied",
-            "hold_every": str(self.hold_every),
-            "frames": self.frames or "all",
-        }
-
 
 def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
     """Return the cameras at the size of the pixels that were read.
 
-    Args:
-        capture: intrinsics for the sizes that the format names.
-        files: (width, height) of each picture file.
-        pixels: what was read of them.
-        downscale: whole factor between the two; what it leaves over was cropped at the right and the bottom.
+    The intrinsics hold for the sizes that the format names, `files` are (width, height) of each picture file, and what
+    `downscale` leaves over was cropped at the right and the bottom.
 
     Raises:
         InputError: a picture is not a shrunk copy of what its camera describes, or the pixels are another capture's.

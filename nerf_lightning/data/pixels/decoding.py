@@ -98,11 +98,7 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
 
 
 def identity_of(path: Path) -> tuple[str, int, int]:
-    """Return name, size and time of change, by which a file is taken for the one that it was.
-
-    Raises:
-        InputError: it cannot be looked at.
-    """
+    """Return name, size and time of change, by which a file is taken for the one that it was."""
     try:
         state = path.stat()
     except OSError as error:

@@ -109,11 +109,7 @@ def stored(base: Path, contents: str | None, make: Callable[[Path], Header]) -> 
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
-    """Refuse to start what the disk cannot hold.
-
-    Raises:
-        InputError: with what is needed and what is free.
-    """
+    """Refuse to start what the disk cannot hold."""
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
         raise InputError(

@@ -44,9 +44,6 @@ def cut_out(pixels: PixelStore, name: str, wanted: bool) -> tuple[PixelStore, Co
         pixels: of one scene.
         name: of the scene, for messages.
         wanted: false returns the photographs as they are.
-
-    Raises:
-        InputError: the cache folder has no room.
     """
     color = plain_color(pixels) if wanted else None
     if color is None:
@@ -87,9 +84,6 @@ def background_for(asked: str | None, color: Color | None, otherwise: Background
 
     Before one colour throughout, sheets of that colour may grow before the content until nothing else is left; drawn
     anew for each ray, backgrounds forbid them.
-
-    Raises:
-        InputError: there is no such background.
     """
     if asked is not None:
         return known_background(asked)

@@ -49,14 +49,7 @@ def empty_store(sizes: Sequence[tuple[int, int]]) -> PixelStore:
 
 
 def in_threads(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
-    """Return work(0), work(1), ... up to `count`, done by a few threads under a progress bar.
-
-    Args:
-        work: takes the number of a picture.
-        count: how many there are.
-        label: what is done, for the bar.
-        shown: whether there is a bar at all.
-    """
+    """Return work(0), work(1), ... up to `count`, done by a few threads under a progress bar where one is `shown`."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     threads = min(MAX_THREADS, num_cores())
     with progress_bar(*columns, shown=shown) as bar, ThreadPoolExecutor(threads) as pool:
@@ -64,17 +57,7 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
 
 
 def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:
-    """Return the pictures, each shrunk by `downscale`.
-
-    Args:
-        paths: the files, in the order of the views.
-        sizes: (width, height) of each file, multiples of `downscale`.
-        downscale: whole factor of the area filter; 1 keeps the pixels as they are.
-        label: what is read, for the progress bar.
-
-    Raises:
-        InputError: a file cannot be decoded.
-    """
+    """Return the pictures, in memory, each shrunk by `downscale`, which divides all `sizes` (width, height)."""
     store = empty_store([(width // downscale, height // downscale) for width, height in sizes])
 
     def decode(index: int) -> bool:

@@ -144,11 +144,7 @@ def _lens_model(used: set[str], folder: Path) -> LensModel:
 
 
 def find_model(root: Path) -> Path:
-    """Return the folder of the model in a capture: `sparse/0`, `sparse`, or the folder itself.
-
-    Raises:
-        InputError: none of them holds one.
-    """
+    """Return the folder of the model in a capture, which must be `sparse/0`, `sparse`, or the folder itself."""
     for folder in (root / "sparse" / "0", root / "sparse", root):
         if any((folder / f"cameras{ending}").is_file() for ending in KINDS):
             return folder
@@ -159,11 +155,7 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model, binary or text.
-
-    Raises:
-        InputError: a file is missing, cut short, of an unknown kind, or disagrees with another.
-    """
+    """Read a model, binary or text; refuse one that is not whole, or two that disagree."""
     models = [_read_kind(folder, ending) for ending in KINDS if (folder / f"cameras{ending}").is_file()]
     if len(models) == 2 and not _agree(*models):
         raise InputError(

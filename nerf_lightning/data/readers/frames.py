@@ -27,11 +27,7 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def list_of_frames(frames: object, path: Path) -> list[Any]:
-    """Return the frames of a file.
-
-    Raises:
-        InputError: they are no list, or more than a person has agreed to.
-    """
+    """Return the frames of a file; refuse no list, and more than a person has agreed to."""
     if not isinstance(frames, list):
         raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
     require_within("views", len(frames), str(path), "views")
@@ -39,11 +35,7 @@ def list_of_frames(frames: object, path: Path) -> list[Any]:
 
 
 def path_of(name: object, key: str, where: str) -> str:
-    """Return a path as the file has it.
-
-    Raises:
-        InputError: it is no text, or a name that cannot be shown.
-    """
+    """Return a path as the file has it; refuse what is no text, or cannot be shown."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: {key} is {name!r}, but it must be the picture's path as text.")
     require_printable(name, where)
@@ -51,11 +43,7 @@ def path_of(name: object, key: str, where: str) -> str:
 
 
 def number_of(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return a number.
-
-    Raises:
-        InputError: it is missing without a default, or no number.
-    """
+    """Return a number; refuse anything else, and one that is missing without a default."""
     value = settings.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {key} is {value!r}, but it must be a number. Export the file again.")
@@ -74,11 +62,7 @@ def positive_of(settings: dict[str, Any], key: str, where: str, default: float |
 
 
 def focal_of_angle(settings: dict[str, Any], side: str, length: float, where: str) -> float:
-    """Return the focal length in pixels of a field of view of `camera_angle_x` or `_y` radians.
-
-    Raises:
-        InputError: it is no angle between 0 and pi.
-    """
+    """Return the focal length in pixels of a field of view of `camera_angle_x` or `_y` radians, between 0 and pi."""
     angle = number_of(settings, f"camera_angle_{side}", where)
     if not 0.0 < angle < math.pi:
         raise InputError(f"{where}: camera_angle_{side} is {angle}, but it must lie between 0 and pi radians.")
@@ -86,11 +70,7 @@ def focal_of_angle(settings: dict[str, Any], side: str, length: float, where: st
 
 
 def focal_of(settings: dict[str, Any], width: float, height: float, where: str) -> tuple[float, float]:
-    """Return the focal lengths in pixels; one that is missing is the other one.
-
-    Raises:
-        InputError: both are missing, or one is no number.
-    """
+    """Return the focal lengths in pixels, of which one must be there; one that is missing is the other one."""
     found = []
     for side, length in (("x", width), ("y", height)):
         if f"fl_{side}" in settings:
@@ -125,11 +105,7 @@ def panorama_focal_of(settings: dict[str, Any], width: float, height: float, whe
 
 
 def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[float, float, float, float, float, float]]:
-    """Return the kind of lens, and k1, k2, k3, k4, p1, p2.
-
-    Raises:
-        InputError: a kind that is not known, or a pinhole with distortion.
-    """
+    """Return the kind of lens, and k1, k2, k3, k4, p1, p2; refuse unknown kinds, and pinholes with distortion."""
     k1, k2, k3, k4, p1, p2 = (number_of(settings, key, where, 0.0) for key in COEFFICIENTS)
     lens = (k1, k2, k3, k4, p1, p2)
     model = settings.get("camera_model", "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV")

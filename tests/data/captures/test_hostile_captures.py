@@ -1,25 +1,37 @@
-"""Captures that a stranger made to be opened: headers that no parser takes, deep folders, equal names."""
+"""Captures that a stranger made to be opened: headers that no parser takes, equal names, endless files."""
 
 import inspect
 import io
-import json
+import struct
 import sys
 
 import numpy as np
 import pytest
 from PIL import Image
+from support import malformed
 from support.budget import budget
 from support.captures import write_blender
 from support.fuzzing import harmless
+<<<<<<< HEAD
 from support.malformed import WRITERS
 from support.posed_captures import read
 from support.running import refused
 
+=======
+from support.malformed import WRITERS, edit_json
+from support.posed_captures import Known, read, ring, write_colmap, write_transforms
+from support.running import refused
+
+from nerf_lightning.data.captures import reader as capture_reader
+from nerf_lightning.data.captures.capture import Capture
+from nerf_lightning.data.captures.checks import check_step, usable
+>>>>>>> 5b5692aa (data)
 from nerf_lightning.data.captures.reader import picture_files
-from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans
+from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.photograph_folder import find_photographs
 
 
@@ -82,11 +94,17 @@ def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
         refused(find_photographs, root / "images", parts=("has 10 photographs, and more than 9 are not taken",))
 
 
+<<<<<<< HEAD
 def test_a_key_that_stands_twice_in_a_json(tmp_path):
     root = WRITERS["transforms"](tmp_path / "capture")
     path = root / "transforms.json"
     path.write_text('{"fl_x": 99.0, ' + path.read_text().lstrip("{"))
     refused(read, "transforms", root, parts=("transforms.json", "the key 'fl_x' stands twice in one object"))
+=======
+@pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
+def test_a_step_that_is_none(step):
+    refused(check_step, "skip.train", step, parts=(f"scene.skip.train is {step}, but it must be 1",))
+>>>>>>> 5b5692aa (data)
 
 
 def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
@@ -96,6 +114,7 @@ def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
     assert harmless(read_json, tmp_path / "many.json") is None
 
 
+<<<<<<< HEAD
 def blender(root, change):
     write_blender(root, {"train": 3, "val": 2, "test": 2})
     path = root / "transforms_train.json"
@@ -110,6 +129,8 @@ def test_a_frame_that_is_listed_twice(tmp_path):
     refused(reader.read, parts=("lists train/train/r_1 more than once",))
 
 
+=======
+>>>>>>> 5b5692aa (data)
 def test_a_tiff_with_the_cameras_settings(tmp_path):
     exif = Image.Exif()
     exif[0x0110] = "X100"
@@ -163,3 +184,74 @@ def test_a_jpeg_that_goes_over_its_pixels_without_end(tmp_path, kind):
     with Image.open(tmp_path / "a.jpg") as image:
         assert image.format == kind
     refused(image_size, tmp_path / "a.jpg", parts=("a.jpg draws its pixels in 110 passes",))
+
+
+def test_a_jpeg_of_fewer_bits_than_blocks_was_cut_short(tmp_path):
+    """A decoder makes up the rest, and 1000 bytes become hundreds of megapixels of grey."""
+    stream = io.BytesIO()
+    Image.fromarray(np.zeros((12, 16), np.uint8)).save(stream, "JPEG")
+    small = stream.getvalue()
+    (tmp_path / "a.jpg").write_bytes(small.replace(struct.pack(">HH", 12, 16), struct.pack(">HH", 9000, 9000), 1))
+    for read_picture in (image_size, read_rgba):
+        with pytest.raises(InputError, match=r"a.jpg announces 9000 x 9000 pixels, and has .* bytes.*cut short"):
+            read_picture(tmp_path / "a.jpg")
+    for progressive in (False, True):
+        Image.fromarray(np.zeros((3000, 4000, 3), np.uint8)).save(tmp_path / "b.jpg", progressive=progressive)
+        assert image_size(tmp_path / "b.jpg") == (4000, 3000)
+
+
+@pytest.mark.parametrize("unit", ["[],", "{},", '{"":1},', "[1],"])
+def test_a_json_of_brackets_is_refused_before_they_fill_the_memory(tmp_path, unit):
+    path = tmp_path / "transforms.json"
+    path.write_text(f"[{unit * 3_000_000}0]")
+    with pytest.raises(InputError, match=r"has 3,000,001 lists and objects, .* add budgets\.json_lists=3000001"):
+        read_json(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "record", "count", "said"),
+    [
+        ("points3D", 51, 3 * 10**7, "30,000,000 points, and more than 10,000,000"),
+        ("cameras", 48, 10**7, "10,000,000 views, and more than 200,000 .* add budgets.views=10000000"),
+        ("images", 73, 10**7, "10,000,000 views, and more than 200,000"),
+    ],
+)
+def test_millions_of_records_of_colmap(tmp_path, name, record, count, said):
+    """What the records hold costs nothing on the disk."""
+    root = write_colmap(tmp_path / "capture", Known())
+    with (root / "sparse" / "0" / f"{name}.bin").open("wb") as file:
+        file.write(struct.pack("<Q", count))
+        file.truncate(8 + record * count)
+    malformed.refused("colmap", root, rf"{name}\.bin has {said}")
+
+
+def test_ten_million_cameras_in_other_files(tmp_path):
+    root = WRITERS["llff"](tmp_path / "llff")
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**7, 17)})
+    with (root / "poses_bounds.npy").open("wb") as file:
+        file.write(header.getvalue())
+        file.truncate(len(header.getvalue()) + 4 * 17 * 10**7)
+    malformed.refused("llff", root, r"poses_bounds\.npy has .* bytes, and more than")
+    with budget(views=8):
+        malformed.refused("transforms", WRITERS["transforms"](tmp_path / "transforms"), r"transforms\.json has 9 views")
+        malformed.refused("llff", WRITERS["llff"](tmp_path / "nine"), r"poses_bounds\.npy has 9 views")
+        malformed.refused("text", WRITERS["text"](tmp_path / "text"), r"cameras\.txt has more than 8 views")
+        write_blender(tmp_path / "blender", {"train": 9, "val": 1, "test": 1})
+        with pytest.raises(InputError, match=r"transforms_train\.json has 9 views"):
+            BlenderReader(str(tmp_path / "blender")).read()
+        with pytest.raises(InputError, match=r"a\.npz has 10 views"):
+            NpzReader(str(write_npz(tmp_path / "a.npz"))).read()
+
+
+def test_kept_pixels_of_other_sizes_than_the_photographs(tmp_path, monkeypatch):
+    """As many numbers, in rows of another length: a cache that somebody else wrote."""
+    real = capture_reader.read_photographs
+
+    def turned(*arguments, **options):
+        pixels = real(*arguments, **options)
+        return replace(pixels, width=pixels.height, height=pixels.width)
+
+    root = WRITERS["transforms"](tmp_path / "capture")
+    monkeypatch.setattr(capture_reader, "read_photographs", turned)
+    malformed.refused("transforms", root, "pixels that were kept of .* have other sizes than its photographs")

@@ -62,6 +62,8 @@ def test_names_what_a_wrong_folder_holds(tmp_path):
         ([], r"transforms_val.json must be a json object with the keys .*, but it is list"),
         ({"camera_angle_x": 4, "frames": [FRAME]}, r"camera_angle_x is 4.0, but it must lie between 0 and pi radians"),
         ({"camera_angle_x": "1", "frames": [FRAME]}, r"camera_angle_x is '1', but it must be a number"),
+        ({"camera_angle_x": True, "frames": [FRAME]}, r"camera_angle_x is True, but it must be a number"),
+        ({"camera_angle_x": 1, "frames": [FRAME, FRAME]}, r"scene lists val/train/r_0 more than once"),
         ({"camera_angle_x": 1, "frames": {}}, r"frames must be a list of views, but it is dict"),
         ({"camera_angle_x": 1, "frames": [{}]}, r"frames\[0\] lacks file_path, transform_matrix; it has nothing"),
         ({"camera_angle_x": 1, "frames": [7]}, r"frames\[0\] must be a json object"),

@@ -81,6 +81,10 @@ TRANSFORMS = {
         text(JSON, lambda _: b'{"fl_x": 1' + b"0" * 10_000 + b"}"),
         r"is not usable json: .*digits",
     ),
+    "a key twice": (
+        text(JSON, lambda old: b'{"fl_x": 9.0, ' + old.lstrip(b"{")),
+        r"key 'fl_x' stands twice",
+    ),
     "a thousand digits": (top(fl_x=10**1000), r"transforms.json: frames\[0\] .*: fl_x has too many digits"),
     "digits in a pose": (frame(0, transform_matrix=[[10**400] * 4] * 4), r"frames\[0\].* is not a 4 x 4 matrix of num"),
     "a camera path": (content(lambda _: PATH), r"lacks frames; it has camera_type, .* A transforms.json of"),
