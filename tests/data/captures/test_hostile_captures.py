@@ -4,20 +4,16 @@ import inspect
 import io
 import struct
 import sys
+import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 from support import malformed
 from support.budget import budget
-from support.captures import write_blender
+from support.captures import write_blender, write_npz
 from support.fuzzing import harmless
-<<<<<<< HEAD
-from support.malformed import WRITERS
-from support.posed_captures import read
-from support.running import refused
-
-=======
 from support.malformed import WRITERS, edit_json
 from support.posed_captures import Known, read, ring, write_colmap, write_transforms
 from support.running import refused
@@ -25,14 +21,47 @@ from support.running import refused
 from nerf_lightning.data.captures import reader as capture_reader
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import check_step, usable
->>>>>>> 5b5692aa (data)
 from nerf_lightning.data.captures.reader import picture_files
 from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans, read_rgba
 from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.sfm.photograph_folder import find_photographs
+
+HEADERS = {
+    "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-9, -17)}",
+    "beyond": "{'descr': '<f8', 'fortran_order': False, 'shape': (0, 10000000000000000000000)}",
+    "flag": "{'descr': '<f8', 'fortran_order': False, 'shape': (True, 17)}",
+    "deep": "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "-" * 9000 + "1,)}",
+    "open": "{'descr': '<f8', 'fortran_order': False, 'shape': (1,",
+    "indented": "   {\n x",
+}
+
+
+def npy(header):
+    start = header.encode() + b"\n"
+    return b"\x93NUMPY\1\0" + len(start).to_bytes(2, "little") + start + bytes(9 * 17 * 8)
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_headers_of_arrays_that_no_parser_takes(tmp_path, name):
+    for key in ("images", "focal"):
+        path = write_npz(tmp_path / f"{key}.npz", **{key: None})
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(f"{key}.npy", npy(HEADERS[name]))
+        refused(NpzReader(str(path)).read, parts=(f"{key}.npz", "damaged"))
+    root = WRITERS["llff"](tmp_path / "llff")
+    (root / "poses_bounds.npy").write_bytes(npy(HEADERS[name]))
+    refused(read, "llff", root, parts=("poses_bounds.npy", "damaged"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a file that can be opened and not read lies in /proc")
+def test_an_archive_that_cannot_be_read(tmp_path):
+    (tmp_path / "a.npz").symlink_to("/proc/self/mem")
+    refused(NpzReader(str(tmp_path / "a.npz")).read, parts=("a.npz is not a numpy .npz archive, or is damaged",))
 
 
 def test_folders_within_folders_without_end(tmp_path):
@@ -85,6 +114,28 @@ def test_equal_names_are_found_in_one_pass(tmp_path):
     assert Name.compared < 5000
 
 
+def test_a_folder_whose_name_is_none(tmp_path):
+    refused(BlenderReader("x" * 5000).read, parts=("does not exist",))
+    refused(NpzReader("x" * 5000).read, parts=("does not exist",))
+
+
+@pytest.mark.parametrize("times", [1e17, 1e-1])
+def test_a_focal_length_that_is_possible_for_another_picture_alone(tmp_path, times):
+    root = WRITERS["transforms"](tmp_path / "capture")
+    focal = 1.0 if times > 1 else 5e8
+    size = {key: times * value for key, value in {"w": 16, "h": 12, "cx": 8, "cy": 6}.items()}
+    edit_json(root, lambda content: content | size | {"fl_x": focal, "fl_y": focal})
+    refused(read, "transforms", root, parts=("the view images/p_0.png has a focal length of", "lens has"))
+
+
+def test_points_of_a_text_are_counted_too(tmp_path):
+    root = WRITERS["text"](tmp_path / "capture")
+    with budget(points=50):
+        refused(read, "colmap", root, parts=("points3D.txt has more than 50 points", "add budgets.points=N"))
+    with budget(points=60):
+        assert len(read("colmap", root).points) == 60
+
+
 def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
     root = WRITERS["llff"](tmp_path / "capture")
     (tmp_path / "elsewhere.png").touch()
@@ -94,17 +145,9 @@ def test_photographs_are_counted_before_each_is_looked_at(tmp_path):
         refused(find_photographs, root / "images", parts=("has 10 photographs, and more than 9 are not taken",))
 
 
-<<<<<<< HEAD
-def test_a_key_that_stands_twice_in_a_json(tmp_path):
-    root = WRITERS["transforms"](tmp_path / "capture")
-    path = root / "transforms.json"
-    path.write_text('{"fl_x": 99.0, ' + path.read_text().lstrip("{"))
-    refused(read, "transforms", root, parts=("transforms.json", "the key 'fl_x' stands twice in one object"))
-=======
 @pytest.mark.parametrize("step", [0, 1.5, None, "x", True])
 def test_a_step_that_is_none(step):
     refused(check_step, "skip.train", step, parts=(f"scene.skip.train is {step}, but it must be 1",))
->>>>>>> 5b5692aa (data)
 
 
 def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
@@ -114,23 +157,6 @@ def test_one_of_many_keys_that_stands_twice_is_found_at_once(tmp_path):
     assert harmless(read_json, tmp_path / "many.json") is None
 
 
-<<<<<<< HEAD
-def blender(root, change):
-    write_blender(root, {"train": 3, "val": 2, "test": 2})
-    path = root / "transforms_train.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-    return BlenderReader(str(root))
-
-
-def test_a_frame_that_is_listed_twice(tmp_path):
-    reader = blender(tmp_path / "a", lambda content: content["frames"].append(content["frames"][1]))
-    refused(reader.read, parts=("lists train/train/r_1 more than once",))
-
-
-=======
->>>>>>> 5b5692aa (data)
 def test_a_tiff_with_the_cameras_settings(tmp_path):
     exif = Image.Exif()
     exif[0x0110] = "X100"
@@ -167,6 +193,9 @@ def endless(hidden=b""):
 
 
 # TEM, RST1 and, to decoders, all below SOF0 have no length: two bytes of 255 behind them skip nothing.
+@pytest.mark.parametrize("marker", [0x01, 0xD1, 0x02, 0xBF])
+def test_passes_behind_markers_without_a_length_are_counted(marker):
+    assert jpeg_scans(endless(bytes([0xFF, marker, 0xFF]))) == 10 + MOST_SCANS
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "MPO"])
