@@ -74,7 +74,7 @@ def require_like(found: object, template: object, place: str) -> None:
         table = _dict(found, place)
         for key in [key for key in (*template, *table) if key not in table or key not in template]:
             problem = "is missing" if key in template else "belongs to no part of this run"
-            raise Mismatch(f"{place}.{shown(key)}", problem)
+            raise Mismatch(f"{place}.{_name(key)}", problem)
         for key, entry in template.items():
             require_like(table[key], entry, f"{place}.{key}")
     elif isinstance(template, (list, tuple)):
@@ -120,7 +120,7 @@ def require_fit(value: object, kind: Any, place: str, optional: Mapping[str, Any
     elif origin is dict:
         for key, entry in _dict(value, place).items():
             require_fit(key, parts[0], f"a key of {place}")
-            require_fit(entry, parts[1], f"{place}.{shown(key)}")
+            require_fit(entry, parts[1], f"{place}.{_name(key)}")
     elif origin in (list, tuple):
         _require_kind(value, origin, place)
         for number, entry in enumerate(value):  # type: ignore[arg-type]
@@ -174,9 +174,13 @@ def _require_kind(value: object, kind: type, place: str) -> None:
 
 
 def _dict(value: object, place: str) -> dict[Any, Any]:
-    _require_kind(value, dict, place)
-    assert isinstance(value, dict)
+    if not isinstance(value, dict):
+        raise Mismatch(place, f"is {shown(value)}, not a dict")
     return value
+
+
+def _name(key: object) -> str:
+    return ascii(str(key)[:200])[1:-1]
 
 
 def _annotated(kind: Any) -> str:

@@ -54,7 +54,7 @@ CASES = {
     "many threads": (at(OURS, "num_threads", value=10**6), "num_threads is 1000000"),
     "no progress": (lambda c: c[OURS].pop("progress"), "lacks progress"),
     "an unknown key": (at("stranger", value={"x": 1}), "holds 'stranger'"),
-    "no loops": (at("loops", value={}), "loops.'fit_loop' is missing"),
+    "no loops": (at("loops", value={}), "loops.fit_loop is missing"),
     "a loop of words": (at("loops", "fit_loop", "epoch_progress", value="x"), "epoch_progress is 'x', not a dict"),
     "other steps": (at("global_step", value=3), "has not taken the 3 steps"),
     "no callbacks": (at("callbacks", value={}), "is missing"),

@@ -26,7 +26,7 @@ def test_what_is_like_its_template_passes():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"more": 1}, "file.'more' belongs to no part of this run"),
+        ({"more": 1}, "file.more belongs to no part of this run"),
         ({"w": torch.ones(3, 2)}, r"file.w holds torch.float32 in the shape \(3, 2\), and the run's"),
         ({"w": torch.ones(2, 3).double()}, "file.w holds torch.float64"),
         ({"w": torch.full((2, 3), float("nan"))}, "file.w holds NaN or infinity"),
@@ -88,7 +88,7 @@ def test_nothing_but_a_mismatch_comes_of_anything(value: object, kind: Any):
             check()
         except Mismatch as problem:
             message = str(problem)
-        assert len(message) < 400
+        assert len(message) < 3000
         assert not message or message.isprintable()
     assert len(shown(value)) < 300
 

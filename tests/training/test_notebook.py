@@ -307,7 +307,7 @@ def test_a_checkpoint_of_another_run_is_refused(run, trainer):
     first = trainer(max_steps=2)
     first.fit(one.system, one.data)
     goes_on = trainer(max_steps=4)
-    with pytest.raises(InputError, match="Training cannot go on: state_dict"):
+    with pytest.raises(InputError, match=r"state_dict\..*Training cannot go on"):
         goes_on.fit(other.system, other.data, ckpt_path=kept(first))
 
 
