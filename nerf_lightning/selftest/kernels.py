@@ -57,8 +57,10 @@ def checks(device: torch.device, precisions: Sequence[Products]) -> list[Check]:
 
 
 def _loads(twin: str) -> float:
-    if backends.twin(twin) is None:
-        raise CannotRun(f"{backends.why_not(twin)}: plain torch does its work, many times slower")
+    if backends.twin(f"{backends.KERNELS}.{twin}") is None:
+        raise CannotRun(
+            f"{backends.why_not(f'{backends.KERNELS}.{twin}')}: plain torch does its work, many times slower"
+        )
     return 0.0
 
 

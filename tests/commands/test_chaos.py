@@ -86,7 +86,7 @@ PHASES = {
 # that its files exceed.
 QUICK = {
     "evaluating": ("PIL.Image:Image.save", 2500),
-    "filming": ("nerf_lightning.video.encoding:_chain", 1000),
+    "filming": ("nerf_lightning.video.encoding:_counted", 1000),
     "exporting images": ("nerf_lightning.export.images:write_json", 1000),
     "decoding": ("nerf_lightning.data.pixels.mapped_store:_spots", 2500),
 }

@@ -91,7 +91,7 @@ def test_a_held_camera_sees_the_same_shape_in_another_light(last, rendered):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["outputs=[rgb,color]"], ["outputs=['rgb', 'color']", "rgb, depth, opacity, normals, levels"]),
+        (["outputs=[rgb,color]"], ["this model shows no color", "rgb, depth, opacity, normals, levels"]),
         (["outputs=[]"], ["outputs=[]"]),
         (["mosaic=maybe"], ["mosaic=maybe", "true or false"]),
         (["format=gif"], ["format=gif", "animation (WebP"]),

@@ -176,6 +176,7 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.geometry.cameras.pinhole_cameras": {"focal": 19.3, "width": 12, "height": 12},
     "video.paths.base.frame_of": {"up": (0.1, 0.2, 0.97)},
     "video.paths.base.PathFrame.direction": {"given": (0.31, 0.17, -0.93)},
+    "video.paths.base.PathFrame.point": {"otherwise": None},
     "video.paths.base.PathFrame.size": {"width": 24, "height": None},
     "nerf.geometry.panoramas.panorama_cameras": {"width": 24, "height": 12},
     "nerf.geometry.cones.pixel_side": {"view": torch.ones(RAYS, dtype=torch.int64)},

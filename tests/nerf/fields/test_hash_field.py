@@ -53,7 +53,7 @@ def test_the_exponential_and_its_gradient_stay_finite():
 
 
 def test_colours_have_the_slope_of_the_logistic_function_and_a_way_back_from_its_ends():
-    raw = torch.tensor([-90.0, -3.0, 0.0, 2.0, 60.0], requires_grad=True)
+    raw = torch.tensor([[-90.0, -3.0, 0.0], [2.0, 60.0, 0.0]], requires_grad=True)
     color = color_from(raw, 0.003)
     slope = (color * (1 - color)).detach()
     torch.testing.assert_close(color.detach(), torch.sigmoid(raw.detach()))

@@ -6,6 +6,7 @@ import pytest
 from support.configs import composed
 from support.static_models import MODELS, fast_model
 
+from nerf_lightning.compute import xla_device
 from nerf_lightning.compute.devices import choose_precision
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.packed_level import PackedLevel
@@ -16,7 +17,7 @@ from nerf_lightning.training.launch.trainer import TrainerSettings
 
 @pytest.fixture
 def tpu(monkeypatch):
-    monkeypatch.setattr(xla, "require_device", lambda: "TPU")
+    monkeypatch.setattr(xla_device, "require_device", lambda: "TPU")
 
 
 def test_a_missing_torch_xla_is_named_with_the_way_to_install_it(monkeypatch):
@@ -27,7 +28,7 @@ def test_a_missing_torch_xla_is_named_with_the_way_to_install_it(monkeypatch):
 
 def test_a_machine_without_tpu_is_refused(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
-    monkeypatch.setattr(xla, "ACCELERATOR", type("None", (), {"is_available": staticmethod(lambda: False)}))
+    monkeypatch.setattr(xla_device, "ACCELERATOR", type("None", (), {"is_available": staticmethod(lambda: False)}))
     with pytest.raises(InputError, match="finds no TPU on this machine"):
         TrainerSettings(accelerator="tpu")
 
