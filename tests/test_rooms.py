@@ -14,7 +14,7 @@ MOST_ROOMS, MOST_ARROWS = 26, 140
 
 
 def room_of(file: Path) -> str:
-    return file.relative_to(PACKAGE).parts[0]
+    return file.relative_to(PACKAGE).parts[0].replace(".pyi", ".py")
 
 
 def files() -> list[Path]:
@@ -48,11 +48,11 @@ def drawn() -> tuple[set[str], dict[tuple[str, str], set[str]]]:
     for file in files():
         if file.name == "__init__.py" and not defines(file):
             continue
-        rooms.add(room_of(file).removesuffix("i"))
+        rooms.add(room_of(file))
         for other in imported(file, known):
             if room_of(other) != room_of(file):
                 where = file.relative_to(PACKAGE), other.relative_to(PACKAGE)
-                arrows[room_of(file).removesuffix("i"), room_of(other)].add(f"{where[0]} -> {where[1]}")
+                arrows[room_of(file), room_of(other)].add(f"{where[0]} -> {where[1]}")
     return rooms, arrows
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 COMMON = ("--help", "--version", "--verbose", "--multirun", "--cfg", "--resolve", "--config-dir", "--hydra-help")

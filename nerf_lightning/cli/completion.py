@@ -6,8 +6,8 @@ our commands nor what a setting takes.
 
 from pathlib import Path
 
-from nerf_lightning.manual.candidates import SHELLS, candidates
-from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.config.manual.candidates import SHELLS, candidates
+from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 SCRIPTS = Path(__file__).parent / "completions"

@@ -2,9 +2,9 @@
 
 import shutil
 
-from nerf_lightning.manual.catalogue import Command, command_named, known_names
-from nerf_lightning.manual.pages import command_page, page_of
-from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
+from nerf_lightning.config.manual.pages import command_page, page_of
+from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 FLAGS = ("-h", "--help")

@@ -19,9 +19,9 @@ from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.cli.process import ends_quietly
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.cli.working_directory import require_no_settings_here
+from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow, allow_as_typed
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
-from nerf_lightning.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 

@@ -2,10 +2,10 @@
 
 import re
 
+from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
+from nerf_lightning.config.manual.suggestions import did_you_mean, near
 from nerf_lightning.config.overrides import PLAIN
 from nerf_lightning.files.folders import option_names
-from nerf_lightning.manual.catalogue import Command, command_named, known_names
-from nerf_lightning.manual.suggestions import did_you_mean, near
 
 KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")
 DELETED = re.compile(r"Could not delete(?: from config\.)? '(?P<key>[^']+)'(?P<value>)")

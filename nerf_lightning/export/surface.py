@@ -7,7 +7,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.checkpoints.reading import SceneRecord
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
 from nerf_lightning.nerf.models.base import Model, point_field
@@ -18,6 +17,7 @@ from nerf_lightning.nerf.rendering.ray_statistics import median_distances
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
+from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 # So many rays of the training views are asked.

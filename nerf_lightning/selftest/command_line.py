@@ -12,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.load_model import load_model
 from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.sfm.video_frames import count_frames
 from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -19,7 +20,6 @@ from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.products import Products
 from nerf_lightning.selftest.check import Check
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene, write_npz
-from nerf_lightning.sfm.video_frames import count_frames
 
 STEPS, STOP, MOST_SECONDS = 40, 20, 900
 ONE_STEP = 0.03

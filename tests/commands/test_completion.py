@@ -12,7 +12,7 @@ import pytest
 from support.running import REPOSITORY, said
 
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
-from nerf_lightning.manual.candidates import candidates
+from nerf_lightning.config.manual.candidates import candidates
 
 NAMES = [*find_commands(), *OF_ITSELF]
 PATIENCE = 30.0

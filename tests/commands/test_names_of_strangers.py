@@ -25,6 +25,7 @@ from support.scenes import ball_scene
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.commands.train_job.evaluate_and_film import metric_lines
 from nerf_lightning.data.readers.blender import BlenderReader
+from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.picture import _write_verdicts
 from nerf_lightning.evaluation.kept_views import picture_name
@@ -37,7 +38,6 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.page import Report, page
 from nerf_lightning.report.read_run import address_from
-from nerf_lightning.sfm.photograph_folder import find_photographs
 from nerf_lightning.visualization.figures import new_figure, picture_of
 from nerf_lightning.visualization.pictures import with_caption
 

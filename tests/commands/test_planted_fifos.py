@@ -16,6 +16,8 @@ from support.waiting import fifo, within
 from nerf_lightning.data.bricks.reader import BricksReader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.data.sfm.photograph_folder import find_photographs
+from nerf_lightning.data.sfm.video_frames import require_video
 from nerf_lightning.evaluation.lpips import load_lpips
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.files.yaml_files import read_plain_yaml
@@ -24,8 +26,6 @@ from nerf_lightning.report.curves import read_curves
 from nerf_lightning.report.embedding import embedded_file, embedded_video
 from nerf_lightning.runs.log_file import log_file
 from nerf_lightning.runs.sweep_job import read_records
-from nerf_lightning.sfm.photograph_folder import find_photographs
-from nerf_lightning.sfm.video_frames import require_video
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="FIFOs are posix's")
 SECONDS = 20

@@ -26,10 +26,10 @@ from nerf_lightning.data.pixels.images import MOST_SCANS, image_size, jpeg_scans
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
 from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.data.sfm.photograph_folder import find_photographs
 from nerf_lightning.files.json_files import read_json
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.photograph_folder import find_photographs
 
 HEADERS = {
     "negative": "{'descr': '<f8', 'fortran_order': False, 'shape': (-9, -17)}",

@@ -19,9 +19,9 @@ from support.posed_captures import read
 from nerf_lightning.data.bricks.cache import Rendered, cached
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.npz import NpzReader
+from nerf_lightning.data.sfm.photograph_folder import find_photographs
+from nerf_lightning.data.sfm.video_frames import count_frames
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.photograph_folder import find_photographs
-from nerf_lightning.sfm.video_frames import count_frames
 
 MEGABYTE = 2**20
 OUT = r"leads to \S+secret\S*, outside of the capture's folder .*scene.allow_outside=true"

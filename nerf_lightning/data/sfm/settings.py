@@ -5,8 +5,8 @@ from itertools import combinations, groupby
 from typing import Literal
 
 from nerf_lightning.compute.cores import num_cores
+from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
 from nerf_lightning.messages.errors import require_positive
-from nerf_lightning.sfm.photograph_folder import FoundPhotograph
 
 Matching = Literal["exhaustive", "sequential", "auto"]
 CameraMode = Literal["single", "per_image", "auto"]

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from nerf_lightning.data.sfm.reconstruction import SparseModel
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.sfm.reconstruction import SparseModel
 
 # Of the photographs: where fewer were registered, there is advice.
 ENOUGH = 0.8

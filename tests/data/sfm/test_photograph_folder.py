@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nerf_lightning.data.sfm.photograph_folder import find_photographs, put_upright
+from nerf_lightning.data.sfm.reconstruction import _camera_groups
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.photograph_folder import find_photographs, put_upright
-from nerf_lightning.sfm.reconstruction import _camera_groups
 
 MODEL, FOCAL_LENGTH, ORIENTATION, EXIF = 0x0110, 0x920A, 0x0112, 0x8769
 

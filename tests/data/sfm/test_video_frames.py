@@ -3,8 +3,8 @@ import pytest
 from PIL import Image, ImageFilter
 from support.corner import noise
 
+from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, sharpness, write_sharp_frames
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.video_frames import count_frames, frame_stride, is_blurred, sharpness, write_sharp_frames
 
 # imageio's reader of videos forgets its pipes.
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")

@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator
 from textwrap import fill
 
-from nerf_lightning.manual.catalogue import Command, Option, Setting
-from nerf_lightning.manual.suggestions import did_you_mean
+from nerf_lightning.config.manual.catalogue import Command, Option, Setting
+from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
 COLUMN = 34

@@ -13,11 +13,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
+from nerf_lightning.data.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings, image_pairs, tiles_of
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.sfm.photograph_folder import FoundPhotograph
-from nerf_lightning.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings, image_pairs, tiles_of
 
 Report = Callable[[str, float], None]
 

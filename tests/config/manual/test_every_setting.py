@@ -7,12 +7,12 @@ from hydra.utils import get_object
 from support.configs import composed, groups, yaml_files
 
 from nerf_lightning.cli.main import find_commands
+from nerf_lightning.config.manual.catalogue import command_named
+from nerf_lightning.config.manual.docstrings import constructor
+from nerf_lightning.config.manual.pages import brief, command_page, page_of
+from nerf_lightning.config.manual.yaml_comments import read_commented
 from nerf_lightning.config.overrides import flatten
 from nerf_lightning.files.folders import option_names
-from nerf_lightning.manual.catalogue import command_named
-from nerf_lightning.manual.docstrings import constructor
-from nerf_lightning.manual.pages import brief, command_page, page_of
-from nerf_lightning.manual.yaml_comments import read_commented
 
 COMMANDS = {name: command_named(name) for name in sorted(find_commands())}
 every_command = pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)

@@ -12,14 +12,14 @@ from nerf_lightning.data.pixels.decoding import identity_of
 from nerf_lightning.data.readers.auto import AutoReader
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.colmap import ColmapReader
+from nerf_lightning.data.sfm.find_poses import from_photographs, from_video
+from nerf_lightning.data.sfm.photograph_folder import files_in
+from nerf_lightning.data.sfm.reconstruction import require_pycolmap
+from nerf_lightning.data.sfm.settings import SfmSettings
+from nerf_lightning.data.sfm.summary import remarks
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm.find_poses import from_photographs, from_video
-from nerf_lightning.sfm.photograph_folder import files_in
-from nerf_lightning.sfm.reconstruction import require_pycolmap
-from nerf_lightning.sfm.settings import SfmSettings
-from nerf_lightning.sfm.summary import remarks
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from PIL import Image
 from support.captures import real_capture
 from support.posed_captures import Known, write_colmap
 
+from nerf_lightning.data.sfm import reader
+from nerf_lightning.data.sfm.reader import PhotosReader
+from nerf_lightning.data.sfm.reconstruction import SparseModel
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.sfm import reader
-from nerf_lightning.sfm.reader import PhotosReader
-from nerf_lightning.sfm.reconstruction import SparseModel
 
 
 @pytest.fixture

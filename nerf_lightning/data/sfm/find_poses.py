@@ -5,16 +5,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
+from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel, reconstruct
+from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching, stage_costs
+from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
-from nerf_lightning.sfm.reconstruction import NothingFoundError, SparseModel, reconstruct
-from nerf_lightning.sfm.settings import SfmSettings, chosen_matching, stage_costs
-from nerf_lightning.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 
 READING, FRAMES = "reading photographs", "choosing frames"
 READING_COST, FRAME_COST = 0.1, 0.02

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from functools import cache, cached_property
 from typing import NamedTuple
 
+from nerf_lightning.config.manual.docstrings import Constructor, constructor
+from nerf_lightning.config.manual.yaml_comments import CommentedYaml, Entry, read_commented
 from nerf_lightning.files.folders import conf_file, option_names
-from nerf_lightning.manual.docstrings import Constructor, constructor
-from nerf_lightning.manual.yaml_comments import CommentedYaml, Entry, read_commented
 
 OF_SWEEPS = ("hydra/launcher", "hydra/sweeper")
 """Groups of Hydra to which conf/ adds options: any command may be swept with -m."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf_lightning.sfm.photograph_folder import find_photographs
-from nerf_lightning.sfm.reconstruction import NothingFoundError, reconstruct
-from nerf_lightning.sfm.settings import SfmSettings
+from nerf_lightning.data.sfm.photograph_folder import find_photographs
+from nerf_lightning.data.sfm.reconstruction import NothingFoundError, reconstruct
+from nerf_lightning.data.sfm.settings import SfmSettings
 
 pycolmap = pytest.importorskip("pycolmap")
 

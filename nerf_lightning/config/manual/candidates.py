@@ -5,8 +5,8 @@ import re
 from collections.abc import Iterable, Iterator
 from glob import escape, glob
 
+from nerf_lightning.config.manual.catalogue import Command, command_named
 from nerf_lightning.files.folders import option_names
-from nerf_lightning.manual.catalogue import Command, command_named
 
 SHELLS = ("bash", "zsh", "fish")
 FLAGS = ("--help", "--multirun", "--cfg", "--config-dir", "--hydra-help")

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 from support.running import refused
 
-from nerf_lightning.sfm import find_poses, reconstruction
-from nerf_lightning.sfm.find_poses import UNFINISHED, from_photographs, require_new_capture
-from nerf_lightning.sfm.reconstruction import SparseModel
-from nerf_lightning.sfm.settings import SfmSettings
+from nerf_lightning.data.sfm import find_poses, reconstruction
+from nerf_lightning.data.sfm.find_poses import UNFINISHED, from_photographs, require_new_capture
+from nerf_lightning.data.sfm.reconstruction import SparseModel
+from nerf_lightning.data.sfm.settings import SfmSettings
 
 links = pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
 
