@@ -98,7 +98,7 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
         (("data.sample_budget=100", "data.crop_steps=5"), ("data.sample_budget=100", "no crop")),
         (("encoder.log2_table_size=34",), ("log2_table_size=34",)),
         (("encoder@direction_encoder=hash_grid",), ("directions do not lie in the unit cube",)),
-        (("field=nerf_mlp", "~field.width"), ("field=hash",)),
+        (("field=nerf_mlp", "~field.width"), ("field=ngp",)),
     ],
 )
 def test_what_cannot_be_is_said_in_one_paragraph(nerf, capture, tmp_path, overrides, parts):

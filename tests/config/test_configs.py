@@ -105,9 +105,9 @@ def test_every_model_takes_another_encoder(model, part):
 @pytest.mark.parametrize(
     ("model", "parts"),
     [
-        ("nerf", ["field=hash", "encoder=hash_grid"]),
-        ("nerf_tiny", ["field=hash", "encoder=hash_grid_small"]),
-        ("nerf_occupancy", ["field=hash"]),
+        ("nerf", ["field=ngp", "encoder=hash_grid"]),
+        ("nerf_tiny", ["field=ngp", "encoder=hash_grid_small"]),
+        ("nerf_occupancy", ["field=ngp"]),
         ("fast", ["field=nerf_mlp_small", "encoder=frequency"]),
         ("fast_proposal", ["field=nerf_mlp_tiny", "encoder=frequency_small"]),
     ],

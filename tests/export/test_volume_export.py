@@ -17,7 +17,7 @@ from nerf_lightning.export.surface import PAIRS, looks_from_facing, looks_from_n
 from nerf_lightning.export.volume import BYTES_PER_POINT, VolumeExport
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
@@ -56,7 +56,7 @@ def test_what_rays_pass_by_has_no_density(kind):
     torch.manual_seed(0)
 
     encoder = HashGridEncoder(num_levels=2, log2_table_size=8, min_resolution=4, max_resolution=8)
-    field = HashField(encoder, SphericalHarmonicsEncoder(), density_bias=3.0)
+    field = NGPField(encoder, SphericalHarmonicsEncoder(), density_bias=3.0)
     level = kind(OccupancySampler(resolution=8), field)
     model, points = RadianceModel({"fine": level}).eval(), some_rays(500).origins / 4
     with torch.no_grad():

@@ -34,7 +34,7 @@ SMALL_GRID = ["encoder.first.log2_table_size=10", "encoder.second.num_frequencie
 ADDED = {
     "an encoder that joins two": ["model=fast_small", "encoder=joined", *SMALL_GRID],
     "an encoder that joins two, in an MLP": [
-        "model=nerf_tiny", "encoder=joined", "field=hash", *SMALL_GRID, "field.width=16"
+        "model=nerf_tiny", "encoder=joined", "field=ngp", *SMALL_GRID, "field.width=16"
     ],
     "a packed sampler without a grid": ["model=fast_small", "sampler@model.levels.fine.sampler=box"],
     "a packed sampler without a grid, over an MLP": [

@@ -6,7 +6,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
@@ -20,7 +20,7 @@ def a_level(opaque_below=0.0, width=32, features=4, products="float32", **settin
     torch.manual_seed(1)
     grid = HashGridEncoder(num_levels=16 // features, features_per_level=features, log2_table_size=8, max_resolution=32)
     torch.nn.init.uniform_(grid.table, -1.0, 1.0)
-    field = HashField(grid, SphericalHarmonicsEncoder(4), width=width, **settings)
+    field = NGPField(grid, SphericalHarmonicsEncoder(4), width=width, **settings)
     sampler = OccupancySampler(resolution=32, num_steps=100, opaque_below=opaque_below)
     level = PackedLevel(sampler, field)
     level.fit_to(ball_scene(num_views=12))

@@ -7,7 +7,7 @@ from support.steps import rays_of
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -31,7 +31,7 @@ def fast_model(level=MaskedLevel, encoder: Encoder | None = None, **sampler) -> 
     torch.manual_seed(1)
     if encoder is None:
         encoder = HashGridEncoder(num_levels=4, features_per_level=2, log2_table_size=10, min_resolution=4)
-    field = HashField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
+    field = NGPField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
     settings = {"resolution": 16, "num_steps": 48, "update_every": 4, "warmup_steps": 4} | sampler
     return RadianceModel({"fine": level(OccupancySampler(**settings), field)})
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.checkpoints.packing import NumberType, pack_rows, pack_switches
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.models.base import Model
@@ -74,7 +74,7 @@ def reached_entries(level: Level) -> Bool[Tensor, "entries"] | None:
     It can where a field sees the box of the occupancy grid that its rays march through, and nothing else.
     """
     sampler, field = level.sampler, level.field
-    if not (isinstance(sampler, OccupancySampler) and isinstance(field, HashField)):
+    if not (isinstance(sampler, OccupancySampler) and isinstance(field, NGPField)):
         return None
     encoder, grid = field.position_encoder, sampler.grid
     if not isinstance(encoder, HashGridEncoder) or field.contracted.is_on() or grid.num_cascades > 1:

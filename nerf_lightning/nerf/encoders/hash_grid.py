@@ -26,7 +26,7 @@ FINEST = 1 << 24
 class HashGridEncoder(Encoder):
     """Concatenate the features that trilinear interpolation finds in grids of growing resolution.
 
-    Points lie in the unit cube; a field that maps its positions there is needed (`field=hash`). A level whose
+    Points lie in the unit cube; a field that maps its positions there is needed (`field=ngp`). A level whose
     vertices fit into its table is dense; a finer one shares entries by a hash, and training sorts out the collisions.
 
     Finer levels may be blended in one after the other, from coarse to fine, over a first share of the run (Sec. 3.3,

@@ -64,7 +64,7 @@ class NerfMLP(Field):
         if skip is not None and not 0 < skip < depth:
             raise ValueError(f"skip={skip} names no layer between 1 and {depth - 1}")
         if position_encoder.needs_unit_cube:
-            raise ValueError(f"{type(position_encoder).__name__} needs a field that knows the scene's box: field=hash")
+            raise ValueError(f"{type(position_encoder).__name__} needs a field that knows the scene's box: field=ngp")
         require_direction_encoder(direction_encoder)
         self.position_encoder = position_encoder
         self.direction_encoder = direction_encoder

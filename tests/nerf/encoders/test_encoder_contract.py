@@ -58,11 +58,11 @@ def test_it_can_be_drawn_anew_and_told_apart_only_by_its_parameters(encoder):
 def test_a_model_learns_with_it(encoder):
     """One step with this encoder in the field changes the loss's gradient for every parameter."""
     from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
-    from nerf_lightning.nerf.fields.hash_field import HashField
     from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
+    from nerf_lightning.nerf.fields.ngp_field import NGPField
 
     if encoder.needs_unit_cube:
-        field = HashField(encoder, FrequencyEncoder(2), width=8)
+        field = NGPField(encoder, FrequencyEncoder(2), width=8)
     else:
         field = NerfMLP(encoder, encoder, depth=2, width=8, skip=None, density_activation="softplus")
     directions = torch.nn.functional.normalize(torch.rand(5, 1, 3), dim=-1)

@@ -37,7 +37,7 @@ def test_known_features_have_the_gradients_of_computed_ones(blend_in, levels_on)
 def test_an_mlp_that_knows_no_box_refuses_it():
     from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
 
-    with pytest.raises(ValueError, match="field=hash"):
+    with pytest.raises(ValueError, match="field=ngp"):
         NerfMLP(HashGridEncoder(num_levels=1, log2_table_size=6), FrequencyEncoder(2))
 
 

@@ -10,7 +10,7 @@ from support.gpu_targets import DEVICES, OutOfResources, compiled_for
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.hash_grid import cuda as hash_grid
 from nerf_lightning.nerf.kernels.mlp import cuda as mlp
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp as any_mlp
@@ -30,7 +30,7 @@ def reachable():
     sizes, grids = set(), {}
     for model in options("model"):
         for part in build(composed("train", f"model={model}").model).modules():
-            if isinstance(part, HashField):
+            if isinstance(part, NGPField):
                 for weights in (part.density_mlp, part.color_mlp):
                     sizes.add((weights[0].shape[1], *(weight.shape[0] for weight in weights)))
             if isinstance(part, HashGridEncoder):

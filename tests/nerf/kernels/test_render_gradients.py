@@ -7,7 +7,7 @@ import torch
 from support.packed_levels import a_level, needs_bfloat16
 from support.scenes import some_rays
 
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import gradients as kernels
 from nerf_lightning.nerf.randomness import batch_random
@@ -98,7 +98,7 @@ def test_it_goes_the_other_way_where_something_else_is_wanted():
         assert isinstance(level(rays, None, [], batch_random(0, 50)), PackedRendering)
     turned = replace(rays, origins=rays.origins.clone().requires_grad_())
     assert isinstance(level(turned, None, [], None), PackedRendering)
-    level.field.__class__ = type("Other", (HashField,), {})
+    level.field.__class__ = type("Other", (NGPField,), {})
     assert level.field.parts() is None
 
 

@@ -9,8 +9,8 @@ from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.proposal import ProposalLoss
 from nerf_lightning.nerf.models.dense_level import DenseLevel
@@ -39,7 +39,7 @@ UNIT_CUBE = {"hash_grid"}
 DIRECTIONS = {"frequency": lambda: FrequencyEncoder(2), "spherical_harmonics": lambda: SphericalHarmonicsEncoder(3)}
 FIELDS = {
     "nerf_mlp": lambda p, d: NerfMLP(p, d, depth=2, width=32, skip=None, density_activation="softplus"),
-    "hash": lambda p, d: HashField(p, d, width=32, density_bias=0.0),
+    "ngp": lambda p, d: NGPField(p, d, width=32, density_bias=0.0),
 }
 MODELS = {
     "coarse and fine": lambda field: {
@@ -99,7 +99,7 @@ def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     scene, progress = ball_scene(num_views=8, size=16), Progress()
     level = PackedLevel(
         OccupancySampler(resolution=16, num_steps=48),
-        FIELDS["hash"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
+        FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
     )
     model = RadianceModel({"fine": level})
     model.fit_to(scene)

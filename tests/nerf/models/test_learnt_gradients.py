@@ -5,7 +5,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.refinements.se3 import SmallMotions
@@ -20,7 +20,7 @@ def test_a_camera_has_the_gradients_of_finite_differences():
     scene = ball_scene(size=16)
     encoder = HashGridEncoder(num_levels=2, log2_table_size=12, min_resolution=4, max_resolution=6)
     # Contracted, so that no ray has an end that moves with it.
-    field = HashField(encoder, SphericalHarmonicsEncoder(3), width=16, density_bias=0.5, contraction=True)
+    field = NGPField(encoder, SphericalHarmonicsEncoder(3), width=16, density_bias=0.5, contraction=True)
     torch.nn.init.normal_(encoder.table, std=0.5)
     level, refinement = DenseLevel(StratifiedSampler(48), field), SmallMotions()
     refinement.fit_to(scene)

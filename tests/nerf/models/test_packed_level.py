@@ -154,12 +154,12 @@ def test_leaving_out_the_colour_of_what_is_transparent_changes_no_picture():
     """Within 0.05 dB at any PSNR that matters: the largest difference is far below one of 255 steps."""
     from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
     from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-    from nerf_lightning.nerf.fields.hash_field import HashField
+    from nerf_lightning.nerf.fields.ngp_field import NGPField
 
     level = a_level(opaque_below=1e-3)
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=16)
     torch.nn.init.normal_(encoder.table, std=2.0)
-    level.field = HashField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=-1.0)
+    level.field = NGPField(encoder, SphericalHarmonicsEncoder(2), width=16, density_bias=-1.0)
     rays, background = some_rays(200), torch.rand(200, 3)
     whole = level(rays, background, [], None)
     with torch.no_grad():

@@ -9,7 +9,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
@@ -29,7 +29,7 @@ def test_a_camera_before_packed_samples_has_the_gradient_of_the_reference_in_flo
     encoder = HashGridEncoder(
         num_levels=3, log2_table_size=10, min_resolution=4, max_resolution=16, blend_in=0.0 if blended == 1.0 else 0.5
     )
-    field = HashField(encoder, SphericalHarmonicsEncoder(3), width=16)
+    field = NGPField(encoder, SphericalHarmonicsEncoder(3), width=16)
     level = PackedLevel(OccupancySampler(resolution=8, num_steps=32, opaque_below=0.1), field)
     level.sampler.fit_to(scene)
     field.fit_to(scene)

@@ -11,7 +11,7 @@ from nerf_lightning.extensions.hybrid.encoder import CONE_OCTAVES, HybridEncoder
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.packed_level import PackedLevel
@@ -63,7 +63,7 @@ def test_known_features_have_the_gradients_of_computed_ones(settings):
 
 @pytest.mark.parametrize("kind", [PackedLevel, MaskedLevel, DenseLevel])
 def test_every_level_tells_the_factor_of_the_cones(kind):
-    field = HashField(an_encoder(cones=True), SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
+    field = NGPField(an_encoder(cones=True), SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
     sampler = StratifiedSampler(12) if kind is DenseLevel else OccupancySampler(resolution=8, num_steps=64)
     level = kind(sampler, field).eval()
     level.fit_to(ball_scene(num_views=12))

@@ -54,7 +54,7 @@ from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
-"""The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.hash_field`)."""
+"""The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.ngp_field`)."""
 SLOTS = 64
 """So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
 asked about in vain."""

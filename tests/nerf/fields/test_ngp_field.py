@@ -8,7 +8,7 @@ from nerf_lightning.nerf.activations import color_from, density_from
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
-from nerf_lightning.nerf.fields.hash_field import HashField
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.types.points import Points
 
 
@@ -16,7 +16,7 @@ def a_field(**settings):
     torch.manual_seed(2)
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40)
     torch.nn.init.normal_(encoder.table)
-    return HashField(encoder, SphericalHarmonicsEncoder(3), width=16, **settings)
+    return NGPField(encoder, SphericalHarmonicsEncoder(3), width=16, **settings)
 
 
 def without_alpha(scene):
@@ -81,7 +81,7 @@ def test_a_little_colour_among_much_black_is_learnt():
 
 @pytest.mark.parametrize("encoder", [FrequencyEncoder(3), HashGridEncoder(num_levels=2, log2_table_size=8)])
 def test_features_that_are_known_give_the_same_result(encoder):
-    field = HashField(encoder, SphericalHarmonicsEncoder(2), width=8)
+    field = NGPField(encoder, SphericalHarmonicsEncoder(2), width=8)
     positions = 2 * torch.rand(30, 3) - 1
     directions = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
     with torch.no_grad():

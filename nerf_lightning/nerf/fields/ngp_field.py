@@ -26,7 +26,7 @@ from nerf_lightning.nerf.types.scene import Scene
 THICK, THIN = 3.0, -1.0
 
 
-class HashField(Field):
+class NGPField(Field):
     """Density from one hidden layer, colour from more that see the direction; exponential density.
 
     Positions are mapped from the scene's box, or from contracted space, to the unit cube. Outside of the box (without
@@ -151,7 +151,7 @@ class HashField(Field):
     def parts(self) -> FieldParts | None:
         """Return table and weights, of a field over a box whose colours are the same for all photographs."""
         grid, directions = self.position_encoder.grid(), self.direction_encoder
-        if type(self) is not HashField:  # which may compute something else
+        if type(self) is not NGPField:  # which may compute something else
             return None
         if grid is None or self.contracted.is_on() or self.appearance or list(directions.parameters()):
             return None
