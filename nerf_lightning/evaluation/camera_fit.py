@@ -15,7 +15,7 @@ from torch import Tensor
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.refinements.se3 import SmallMotions
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import PixelIndex
@@ -27,7 +27,7 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-4
 
 
 @torch.enable_grad()
-@own_precision
+@disable_autocast
 def fitted_camera(model: Model, scene: Scene, view: int, background: Background, tile_points: int) -> Cameras:
     """Return the scene's cameras, of which one has been fitted to its photograph.
 

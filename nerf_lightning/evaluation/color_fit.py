@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.nerf.bands import bands
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 
@@ -13,7 +13,7 @@ FEWEST = 8
 """Pixels from which twelve numbers are not fitted."""
 
 
-@own_precision
+@disable_autocast
 def color_corrected(
     render: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],

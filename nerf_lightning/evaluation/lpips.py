@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 
 LPIPS_HINT = (
     "it needs the weights of a backbone: where torchvision is installed, run "
@@ -56,7 +56,7 @@ class LPIPS(nn.Module):
             self.register_buffer(f"channels{level}", weight, persistent=False)
         self.requires_grad_(False)
 
-    @own_precision
+    @disable_autocast
     def forward(
         self, render: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
     ) -> Float[Tensor, ""]:

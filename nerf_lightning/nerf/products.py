@@ -3,7 +3,7 @@
 torch lowers every float32 product inside `torch.autocast`, and on NVIDIA GPUs wherever TensorFloat-32 is allowed. A
 pose that is multiplied in bfloat16 is wrong by half a percent. So this program opens neither: a field is given the
 precision of the products with its weights (`Field.multiply_in`), and every other function that multiplies matrices is
-marked `own_precision`, which holds even where somebody else has opened autocast around it.
+marked `disable_autocast`, which holds even where somebody else has opened autocast around it.
 """
 
 import functools
@@ -27,10 +27,10 @@ Products = Literal["float32", "tf32", "bfloat16"]
 """What the factors of a product are rounded to: not at all, to 10 bits of mantissa, to 7. Sums are float32."""
 
 
-def own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def disable_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Let a function compute in the precision that its tensors have, inside of somebody's autocast too.
 
-    >>> @own_precision
+    >>> @disable_autocast
     ... def dot(left, right):
     ...     return left @ right
     >>> with torch.autocast("cpu", torch.bfloat16):
@@ -49,7 +49,7 @@ def own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, 
     return exact
 
 
-@own_precision
+@disable_autocast
 def linear(
     features: Float[Tensor, "*points inputs"],
     weight: Float[Tensor, "outputs inputs"],
@@ -98,7 +98,7 @@ class _LinearInTiles(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    @own_precision
+    @disable_autocast
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         points, weight = ctx.saved_tensors
         grad = grad.flatten(0, -2)

@@ -10,7 +10,7 @@ from support.running import start_code
 from torch.nn import functional
 
 from nerf_lightning.nerf import products
-from nerf_lightning.nerf.products import ROUND_ROWS, TILE_ROWS, few_sizes, linear, own_precision
+from nerf_lightning.nerf.products import ROUND_ROWS, TILE_ROWS, disable_autocast, few_sizes, linear
 
 # A factor that is rounded to bfloat16 (7 bits behind the leading one) is wrong by 2^-8 of itself at most; a product of
 # two, summed over many terms of either sign, by less than twice that of the sum's own size.
@@ -148,7 +148,7 @@ def test_a_layer_compiles_in_one_piece():
 
 
 def test_a_function_of_its_own_precision_is_left_alone_by_autocast_and_leaves_it_as_it_was():
-    @own_precision
+    @disable_autocast
     def product(left, right):
         return left @ right
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.nerf.products import Linear, own_precision
+from nerf_lightning.nerf.products import Linear, disable_autocast
 
 NARROWER = 8
 """The weights of views come out of a layer so many times narrower than the states."""
@@ -101,7 +101,7 @@ class RayAttention(nn.Module):
         self.norm = nn.LayerNorm(width, eps=1e-6)
         self.query_key_value, self.out = Linear(width, 3 * width, bias=False), Linear(width, width)
 
-    @own_precision
+    @disable_autocast
     def forward(
         self, states: Float[Tensor, "rays samples width"], with_weights: bool
     ) -> tuple[Float[Tensor, "rays samples width"], Float[Tensor, "rays samples"] | None]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.extensions.view_transformer.attention import FeedForward
-from nerf_lightning.nerf.products import Linear, own_precision
+from nerf_lightning.nerf.products import Linear, disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
@@ -56,7 +56,7 @@ class Gate(nn.Module):
         nn.init.normal_(self.vectors)
         nn.init.constant_(self.log_temperature, math.log(FIRST_TEMPERATURE))
 
-    @own_precision
+    @disable_autocast
     def forward(self, states: Float[Tensor, "*points width"], noise: Float[Tensor, "*points experts"] | None) -> Gates:
         """Return the gates.
 
@@ -114,7 +114,7 @@ class Experts(nn.Module):
         of_chosen = self.out((wide * gates.chosen[..., None]).flatten(-2)) + self._biases(gates.chosen)
         return states + 0.5 * (self.permanent.change(normed) + of_chosen), gates
 
-    @own_precision
+    @disable_autocast
     def _biases(self, chosen: Tensor) -> Tensor:
         return chosen @ self.out_bias
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 
 ImageNorm = Literal["none", "instance", "neurn"]
 PATCH = 3
@@ -78,7 +78,7 @@ class ImageNetwork(Part):
         self.join = nn.Sequential(_convolve(widths[-1] + widths[-2], widths[-2]), nn.ReLU(inplace=True))
         self.out = nn.Conv2d(widths[-2], features, 1)
 
-    @own_precision
+    @disable_autocast
     def forward(self, pictures: Float[Tensor, "views 3 height width"]) -> Float[Tensor, "views features rows columns"]:
         """Return the features of pictures of one size, rows and columns a `scale`th of it, rounded up."""
         height, width = pictures.shape[-2:]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
@@ -36,7 +36,7 @@ class Projected(TensorStruct):
     product."""
 
 
-@own_precision
+@disable_autocast
 def project_samples(
     cameras: Cameras,
     least_cosine: Float[Tensor, "views"],
@@ -73,7 +73,7 @@ def project_samples(
     return Projected(torch.where(visible[..., None], at, 0.0), visible, turned)
 
 
-@own_precision
+@disable_autocast
 def seen_cosines(cameras: Cameras) -> Float[Tensor, "views"]:
     """Return the cosine of the widest angle from the axis at which each camera's picture shows anything.
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.extensions.view_transformer.attention import NARROWER
-from nerf_lightning.nerf.products import Linear, own_precision
+from nerf_lightning.nerf.products import Linear, disable_autocast
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 
@@ -54,7 +54,7 @@ class Spread(Largest):
         super().__init__(width)
         self.of_colors, self.of_states = nn.Linear(6, width), nn.Linear(width, width)
 
-    @own_precision
+    @disable_autocast
     def forward(self, views: Views) -> Float[Tensor, "rays samples width"]:
         """Return the states."""
         share = views.visible / views.visible.sum(dim=-1, keepdim=True).clamp(min=1)
@@ -84,7 +84,7 @@ class PooledColor(nn.Module):
         super().__init__()
         self.norm, self.color = nn.LayerNorm(width), nn.Linear(width, 3)
 
-    @own_precision
+    @disable_autocast
     def forward(
         self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:
@@ -117,7 +117,7 @@ class BlendedColor(nn.Module):
         nn.init.zeros_(self.color.weight)
         nn.init.zeros_(self.color.bias)
 
-    @own_precision
+    @disable_autocast
     def forward(
         self, states: Float[Tensor, "rays samples width"], views: Views, weights: Float[Tensor, "rays samples"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays samples"]]:

@@ -5,13 +5,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 
 LEAST_SPREAD = 1e-6
 """Of the cameras' centres, as a share of their distance from the origin; below it they stand in one place."""
 
 
-@own_precision
+@disable_autocast
 def similarity_between(one: Float[Tensor, "views 3 4"], other: Float[Tensor, "views 3 4"]) -> Float[Tensor, "4 4"]:
     """Return the similarity that takes the poses of `one` to those of `other`, by least squares, in float64.
 
@@ -35,7 +35,7 @@ def similarity_between(one: Float[Tensor, "views 3 4"], other: Float[Tensor, "vi
     return similarity(rotation, goal - scale * rotation @ middle, scale)
 
 
-@own_precision
+@disable_autocast
 def carried(c2w: Float[Tensor, "views 3 4"], by: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
     """Return where a similarity (float64) takes poses."""
     return poses_from_user(c2w.double(), torch.linalg.inv(by)).to(c2w)

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cones import pixel_side
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 
@@ -67,7 +67,7 @@ def resized(cameras: Cameras, width: Int[Tensor, "*views"], height: Int[Tensor, 
     return replace(cameras, focal=cameras.focal * scale, center=cameras.center * scale, width=width, height=height)
 
 
-@own_precision
+@disable_autocast
 def rays_through_pixels(
     cameras: Cameras,
     pixels: PixelIndex,
@@ -131,7 +131,7 @@ def coarse_pixels(cameras: Cameras, per_side: int = 9) -> PixelIndex:
     return PixelIndex(view=view, x=x.round().long(), y=y.round().long())
 
 
-@own_precision
+@disable_autocast
 def camera_coordinates(cameras: Cameras, view: int, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
     """Return world points in the axes of one camera: right, up, back."""
     c2w = cameras.c2w[view]

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import share_at_distance
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 
 # Farther than any light that a finite number of samples tells from infinity.
@@ -37,7 +37,7 @@ class CropBox:
         axes = to_user[:3, :3].double() / unit
         return cls(corner.float(), axes.float(), ((corners[1] - corners[0]) / unit).float())
 
-    @own_precision
+    @disable_autocast
     def distances(self, rays: RayBundle) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"]]:
         """Return where each ray enters and leaves the box, within its near and far; on a miss the second is smaller."""
         inside = replace(rays, origins=self._in_box(rays.origins), directions=rays.directions @ self.axes.mT)
@@ -48,7 +48,7 @@ class CropBox:
         place = self._in_box(points)
         return ((place > 0) & (place < self.size)).all(dim=-1)
 
-    @own_precision
+    @disable_autocast
     def _in_box(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         return (points - self.corner) @ self.axes.mT
 

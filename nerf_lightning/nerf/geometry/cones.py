@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.lenses import stretches
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 
 ROWS, COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
@@ -69,7 +69,7 @@ def scaled_covariance(covariance: Float[Tensor, "*points 6"], scale: Float[Tenso
     return covariance * (scale[ROWS] * scale[COLUMNS])
 
 
-@own_precision
+@disable_autocast
 def contracted_covariance(
     covariance: Float[Tensor, "*points 6"], positions: Float[Tensor, "*points 3"]
 ) -> Float[Tensor, "*points 6"]:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
 FORWARD_FACING = 0.82
@@ -18,7 +18,7 @@ LEAST_UNIT, LARGEST_UNIT = 1e-12, 1e12
 """Scene units in the user's own: from atoms to planets."""
 
 
-@own_precision
+@disable_autocast
 def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     """Return the point that is nearest to all optical axes, by least squares.
 
@@ -36,7 +36,7 @@ def focus_point(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     return torch.linalg.solve(across.mean(dim=0) + weak, target)
 
 
-@own_precision
+@disable_autocast
 def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
     """Return what the cameras are said to be around: where their axes meet, or where they stand.
 
@@ -47,7 +47,7 @@ def middle_of_cameras(cameras: Cameras) -> Float[Tensor, "3"]:
     return focus_point(cameras.c2w)
 
 
-@own_precision
+@disable_autocast
 def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
     """Return the cosine between the mean direction of the cameras and the camera that is farthest from it.
 
@@ -58,7 +58,7 @@ def least_agreement(c2w: Float[Tensor, "views 3 4"]) -> float:
     return float((back @ functional.normalize(back.mean(dim=0), dim=0)).min())
 
 
-@own_precision
+@disable_autocast
 def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     """Return the unit vector that points up in the world, as the photographer held the camera.
 
@@ -81,7 +81,7 @@ def up_direction(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3"]:
     return axis if sign >= 0 else -axis
 
 
-@own_precision
+@disable_autocast
 def upright_rotation(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Return the smallest rotation that takes `up` (unit) to +z.
 
@@ -128,7 +128,7 @@ def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit:
     return matrix
 
 
-@own_precision
+@disable_autocast
 def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "views 3 4"]:
     """Return poses given in the user's frame as the working frame sees them."""
     centers = points_from_user(c2w[:, :, 3], to_user)
@@ -136,20 +136,20 @@ def poses_from_user(c2w: Float[Tensor, "views 3 4"], to_user: Float[Tensor, "4 4
     return torch.cat([rotation.mT @ c2w[:, :, :3], centers[:, :, None]], dim=-1)
 
 
-@own_precision
+@disable_autocast
 def points_from_user(points: Float[Tensor, "points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "points 3"]:
     """Return points given in the user's frame as the working frame sees them."""
     rotation = to_user[:3, :3] / unit_of(to_user)
     return (points - to_user[:3, 3]) @ rotation / unit_of(to_user)
 
 
-@own_precision
+@disable_autocast
 def points_to_user(points: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]) -> Float[Tensor, "*points 3"]:
     """Return points of the working frame in the user's frame."""
     return points @ to_user[:3, :3].mT + to_user[:3, 3]
 
 
-@own_precision
+@disable_autocast
 def directions_to_user(
     directions: Float[Tensor, "*points 3"], to_user: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*points 3"]:

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 
 
-@own_precision
+@disable_autocast
 def is_rigid(c2w: Float[Tensor, "*views 3 4"], tolerance: float = 1e-3) -> Bool[Tensor, "*views"]:
     """Tell which poses are a rotation (orthonormal, determinant +1) and a finite centre."""
     rotation = c2w[..., :3]
@@ -36,7 +36,7 @@ SMALL_ANGLE = 0.1
 """Below it (radians) the coefficients of the exponential map are their series, to 1e-14."""
 
 
-@own_precision
+@disable_autocast
 def rotation_from_vector(vector: Float[Tensor, "*views 3"]) -> Float[Tensor, "*views 3 3"]:
     """Return the rotation about an axis by its length in radians: the exponential map of SO(3).
 

@@ -12,7 +12,7 @@ from nerf_lightning.nerf.geometry.cameras import which_camera
 from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
 from nerf_lightning.nerf.part import StepContext
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.scene import Cameras, Scene
@@ -115,7 +115,7 @@ class SmallMotions(Refinement):
         if self.lens:
             self.radial = nn.Parameter(torch.zeros(int(camera.max()) + 1, 2))
 
-    @own_precision
+    @disable_autocast
     def forward(self, cameras: Cameras) -> Cameras:
         """Return the cameras as they have been learnt so far."""
         if self.is_held:

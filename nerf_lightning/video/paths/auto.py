@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.frames import gaps_around
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.video.paths.orbit import Orbit
@@ -35,7 +35,7 @@ class AutoPath(CameraPath):
         super().__post_init__()
         check_setting("longest", self.longest, self.longest >= 1, "at least 1 pixel")
 
-    @own_precision
+    @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the path that was chosen."""
         width = self.width
@@ -50,7 +50,7 @@ class AutoPath(CameraPath):
         return Orbit(self.num_frames, elevation, width=width, height=self.height, fov=self.fov).cameras(around)
 
 
-@own_precision
+@disable_autocast
 def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:
     """Return the widest angle in degrees between neighbouring views, as seen from above.
 

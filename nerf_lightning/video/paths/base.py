@@ -19,7 +19,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 
 # What a camera in front of a scene looks at, in units of the near plane's distance.
@@ -68,7 +68,7 @@ class PathFrame:
         point = torch.tensor([[float(number) for number in given]], dtype=torch.float64)
         return points_from_user(point, self.to_user.double())[0].to(self.center)
 
-    @own_precision
+    @disable_autocast
     def direction(self, given: Sequence[float]) -> Float[Tensor, "3"]:
         """Return a direction that the user gave as a unit vector of the scene."""
         user = torch.tensor([float(number) for number in given], dtype=torch.float64)
@@ -123,7 +123,7 @@ def check_turns(turns: float, start: float = 0.0) -> None:
     check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
 
 
-@own_precision
+@disable_autocast
 def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
     axis = torch.zeros_like(up)

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.frames import focus_point
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 
@@ -48,7 +48,7 @@ class Ellipse(CameraPath):
         check_setting("rise", self.rise, math.isfinite(self.rise), "a finite share")
         check_turns(self.turns, self.start)
 
-    @own_precision
+    @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the ellipse."""
         focus = focus_point(around.poses)
@@ -76,7 +76,7 @@ class Ellipse(CameraPath):
         return torch.from_numpy(np.interp((begin + share) % 1.0, length / length[-1], angle))
 
 
-@own_precision
+@disable_autocast
 def _axes(flat: Float[Tensor, "views 2"]) -> Float[Tensor, "2 2"]:
     """Return the long and the short axis as columns, the second a quarter turn anticlockwise from the first."""
     long = torch.linalg.eigh(flat.mT @ flat)[1][:, 1]

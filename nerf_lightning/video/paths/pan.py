@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.photograph_path import find_views
@@ -37,7 +37,7 @@ class Pan(CameraPath):
         check_setting("sweep", self.sweep, good, "a finite angle in degrees, not 0")
         check_setting("tilt", self.tilt, -180 < self.tilt < 180, "between -180 and 180 degrees")
 
-    @own_precision
+    @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras that turn."""
         pose = around.poses[find_views("view", [self.view], around.view_names, len(around.poses))[0]]

@@ -8,7 +8,7 @@ import torch
 
 from nerf_lightning.nerf.geometry.frames import average_pose
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns
 
@@ -33,7 +33,7 @@ class Spiral(CameraPath):
         check_setting("reach", self.reach, 0 < self.reach < math.inf, "a positive share")
         check_turns(self.turns)
 
-    @own_precision
+    @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the spiral, the last of which precedes the first."""
         target = around.point("target", self.target)

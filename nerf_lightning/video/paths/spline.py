@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
-from nerf_lightning.nerf.products import own_precision
+from nerf_lightning.nerf.products import disable_autocast
 
 # The shortest leg as a share of the mean one: keys that coincide are a pause.
 SHORTEST_LEG = 1e-2
@@ -75,7 +75,7 @@ def along(
     )
 
 
-@own_precision
+@disable_autocast
 def rotations_along(
     knots: Float[Tensor, "knots"], rotations: Float[Tensor, "keys 3 3"], at: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames 3 3"]:

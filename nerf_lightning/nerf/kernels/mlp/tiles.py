@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.threads import in_parallel
-from nerf_lightning.nerf.products import TILE_ROWS, few_sizes, multiply, own_precision, tiles_of_rows
+from nerf_lightning.nerf.products import TILE_ROWS, disable_autocast, few_sizes, multiply, tiles_of_rows
 
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 
 
-@own_precision
+@disable_autocast
 def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tensor, list[list[Tensor]]]:
     """Return the outputs in float32, and each tile's inputs of every layer where they are to be kept."""
     out = points.new_empty(points.shape[0], weights[-1].shape[0])
@@ -33,7 +33,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     return out, in_parallel(tile, tiles_of_rows(points.shape[0]))
 
 
-@own_precision
+@disable_autocast
 def backward(
     grad: Tensor, weights: Sequence[Tensor], activations: list[list[Tensor]], wants_points: bool
 ) -> tuple[Tensor | None, list[Tensor]]:

@@ -241,9 +241,11 @@ def require_same_bits(name: str, call: Any) -> None:
             lowered = tensors_of(call())
     assert len(plain) == len(lowered)
     for alone, within in zip(plain, lowered, strict=True):
-        assert alone.dtype == within.dtype, f"{name}: autocast around it changes the dtype. Mark it @own_precision."
+        assert alone.dtype == within.dtype, f"{name}: autocast around it changes the dtype. Mark it @disable_autocast."
         same = (alone == within) | (alone != alone) & (within != within)
-        assert bool(same.all()), f"{name}: autocast around it changes the result. Mark it @own_precision (products.py)."
+        assert bool(same.all()), (
+            f"{name}: autocast around it changes the result. Mark it @disable_autocast (products.py)."
+        )
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -347,13 +349,13 @@ def test_who_multiplies_matrices_says_in_which_precision():
                 inner
                 for outer in ast.walk(tree)
                 if isinstance(outer, ast.FunctionDef)
-                and any(getattr(mark, "id", "") == "own_precision" for mark in outer.decorator_list)
+                and any(getattr(mark, "id", "") == "disable_autocast" for mark in outer.decorator_list)
                 for inner in ast.walk(outer)
             }
             for node in ast.walk(tree):
                 assert not multiplies(node) or node in marked, (
                     f"{file.relative_to(PACKAGE)}:{node.lineno} multiplies matrices in a function that is not marked "
-                    "@own_precision"
+                    "@disable_autocast"
                 )
 
 
