@@ -80,7 +80,7 @@ class Linear(nn.Linear):
 
 
 class _LinearInTiles(torch.autograd.Function):
-    """features W^T + b with bfloat16 products on the CPU, in tiles of few sizes (`few_sizes`)."""
+    """features W^T + b with bfloat16 products on the CPU, in tiles of few sizes (`pad_rows`)."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -90,7 +90,7 @@ class _LinearInTiles(torch.autograd.Function):
         out = points.new_empty(*features.shape[:-1], weight.shape[0])
         flat = out.flatten(0, -2)
         for rows in tiles_of_rows(points.shape[0]):
-            part = multiply(few_sizes(points[rows], torch.bfloat16), lowered.t(), added)
+            part = multiply(pad_rows(points[rows], torch.bfloat16), lowered.t(), added)
             flat[rows] = part[: rows.stop - rows.start]
         ctx.save_for_backward(points, lowered)
         ctx.shape = features.shape
@@ -105,11 +105,11 @@ class _LinearInTiles(torch.autograd.Function):
         of_points = torch.empty_like(points) if ctx.needs_input_grad[0] else None
         of_weight = torch.zeros(weight.shape) if ctx.needs_input_grad[1] else None
         for rows in tiles_of_rows(points.shape[0]):
-            part = few_sizes(grad[rows], torch.bfloat16)
+            part = pad_rows(grad[rows], torch.bfloat16)
             if of_points is not None:
                 of_points[rows] = multiply(part, weight)[: rows.stop - rows.start]
             if of_weight is not None:
-                of_weight += multiply(part.t(), few_sizes(points[rows], torch.bfloat16))
+                of_weight += multiply(part.t(), pad_rows(points[rows], torch.bfloat16))
         of_bias = grad.sum(dim=0, dtype=torch.float32) if ctx.needs_input_grad[2] else None
         return None if of_points is None else of_points.view(ctx.shape), of_weight, of_bias
 
@@ -161,13 +161,13 @@ def tiles_of_rows(rows: int) -> list[slice]:
     return [slice(start, min(rows, start + TILE_ROWS)) for start in range(0, rows, TILE_ROWS)]
 
 
-def few_sizes(rows: Float[Tensor, "rows any"], dtype: torch.dtype) -> Float[Tensor, "padded any"]:
+def pad_rows(rows: Float[Tensor, "rows any"], dtype: torch.dtype) -> Float[Tensor, "padded any"]:
     """Return rows in a dtype; in bfloat16 with rows of zeros behind them, up to one of a dozen sizes.
 
     The CPU's bfloat16 product is compiled anew for every number of rows and kept: 0.7 MB each, and packed samples come
     in another number each time. Without this, training held 2 GB more.
 
-    >>> few_sizes(torch.ones(3, 2), torch.bfloat16).shape, few_sizes(torch.ones(600, 2), torch.bfloat16).shape
+    >>> pad_rows(torch.ones(3, 2), torch.bfloat16).shape, pad_rows(torch.ones(600, 2), torch.bfloat16).shape
     (torch.Size([64, 2]), torch.Size([1024, 2]))
     """
     count = rows.shape[0]

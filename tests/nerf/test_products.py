@@ -10,7 +10,7 @@ from support.running import start_code
 from torch.nn import functional
 
 from nerf_lightning.nerf import products
-from nerf_lightning.nerf.products import ROUND_ROWS, TILE_ROWS, disable_autocast, few_sizes, linear
+from nerf_lightning.nerf.products import ROUND_ROWS, TILE_ROWS, disable_autocast, linear, pad_rows
 
 # A factor that is rounded to bfloat16 (7 bits behind the leading one) is wrong by 2^-8 of itself at most; a product of
 # two, summed over many terms of either sign, by less than twice that of the sum's own size.
@@ -79,11 +79,11 @@ def test_float32_is_torchs_own_to_the_bit():
 
 
 def test_rows_come_in_few_sizes_and_what_is_added_is_zero():
-    sizes = {few_sizes(torch.ones(count, 2), torch.bfloat16).shape[0] for count in range(1, TILE_ROWS + 1)}
+    sizes = {pad_rows(torch.ones(count, 2), torch.bfloat16).shape[0] for count in range(1, TILE_ROWS + 1)}
     assert len(sizes) == TILE_ROWS // ROUND_ROWS + 3
-    padded = few_sizes(torch.ones(70, 2), torch.bfloat16)
+    padded = pad_rows(torch.ones(70, 2), torch.bfloat16)
     assert torch.equal(padded, torch.cat([torch.ones(70, 2), torch.zeros(58, 2)]).bfloat16())
-    assert few_sizes(torch.ones(70, 2), torch.float32).shape == (70, 2)
+    assert pad_rows(torch.ones(70, 2), torch.float32).shape == (70, 2)
 
 
 @pytest.mark.parametrize("asked", ["float32", "tf32", "bfloat16"])

@@ -19,7 +19,7 @@ from nerf_lightning.training.step import TrainStep
 # Each thread has a heap of its own, and what one has freed no other takes: two threads leave twice as much.
 GAPS, MOST_HEAPS = 0.25, 2
 # A CPU's products in bfloat16 are compiled for each matrix, three ways (forward, two backward) and for two numbers of
-# rows as a rule (products.py: few_sizes), and kept: 0.7 MB each.
+# rows as a rule (products.py: pad_rows), and kept: 0.7 MB each.
 COMPILED_PER_MATRIX = 3 * 2 * 700_000
 # Smaller shortages are within what a plan can know.
 NOTICEABLE = 1.05

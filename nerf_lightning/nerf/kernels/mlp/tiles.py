@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.threads import in_parallel
-from nerf_lightning.nerf.products import TILE_ROWS, disable_autocast, few_sizes, multiply, tiles_of_rows
+from nerf_lightning.nerf.products import TILE_ROWS, disable_autocast, multiply, pad_rows, tiles_of_rows
 
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 
@@ -21,7 +21,7 @@ def forward(points: Tensor, weights: Sequence[Tensor], keep: bool) -> tuple[Tens
     out = points.new_empty(points.shape[0], weights[-1].shape[0])
 
     def tile(rows: slice) -> list[Tensor]:
-        hidden = few_sizes(points[rows], weights[0].dtype)
+        hidden = pad_rows(points[rows], weights[0].dtype)
         kept = [hidden]
         for weight in weights[:-1]:
             hidden = multiply(hidden, weight.t()).relu_()
@@ -42,7 +42,7 @@ def backward(
 
     def tile(rows: slice) -> list[Tensor]:
         kept = activations[rows.start // TILE_ROWS]
-        flowing = few_sizes(grad[rows], weights[0].dtype)
+        flowing = pad_rows(grad[rows], weights[0].dtype)
         grads: list[Tensor] = []
         for layer in reversed(range(len(weights))):
             grads.insert(0, multiply(flowing.t(), kept[layer]))
