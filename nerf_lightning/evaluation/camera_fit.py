@@ -16,7 +16,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.products import disable_autocast
-from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.nerf.types.scene import Background, Cameras, Scene
@@ -39,7 +39,7 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
         tile_points: most points that go through a field at once.
     """
     device = next(model.parameters()).device
-    motion = SmallMotions(weight=0.0)
+    motion = SE3Delta(weight=0.0)
     motion.learn(scene.cameras[view : view + 1], scene.aabb, photographs=1)
     near, far = scene.near[view : view + 1], scene.far[view : view + 1]
     rays_of = RayGenerator(scene.cameras[view : view + 1], near, far, motion).to(device)

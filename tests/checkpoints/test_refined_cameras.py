@@ -12,10 +12,12 @@ from nerf_lightning.checkpoints.recorded_frame import as_trained
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
-from nerf_lightning.nerf.refinements.carry import carry_along
+from nerf_lightning.nerf.refinements.displacements import align_untrained_cameras
 
 SCENE = ball_scene()
-LEARNT = carry_along(SCENE.cameras, with_noise(SCENE, 1.0, 0.01, views=(0, 1, 2)).cameras, SCENE.splits["train"])
+LEARNT = align_untrained_cameras(
+    SCENE.cameras, with_noise(SCENE, 1.0, 0.01, views=(0, 1, 2)).cameras, SCENE.splits["train"]
+)
 LENS = torch.tensor([[0.05, -0.01, 0.0, 0.0, 0.0, 0.0]] * 6)
 LEARNT = replace(LEARNT, focal=1.05 * SCENE.cameras.focal, lens=LENS, lens_model="radial_tangential")
 
@@ -69,7 +71,7 @@ def test_a_scene_that_is_read_again_gets_them_in_whatever_frame_and_size(tmp_pat
 def test_photographs_of_another_capture_go_where_the_cameras_went_as_a_whole(tmp_path):
     checkpoint = read_checkpoint(saved(tmp_path))
     other = with_noise(SCENE, 20.0, 0.1)  # of the same names
-    expected = carry_along(replace(SCENE.cameras, c2w=SCENE.cameras.c2w), LEARNT, SCENE.splits["train"])
+    expected = align_untrained_cameras(replace(SCENE.cameras, c2w=SCENE.cameras.c2w), LEARNT, SCENE.splits["train"])
     found = as_trained(other, checkpoint)
     assert torch.equal(found.cameras.focal, other.cameras.focal)
     assert float((found.cameras.c2w - other.cameras.c2w).abs().max()) < 0.1

@@ -20,7 +20,7 @@ from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
-from nerf_lightning.nerf.refinements.carry import motions, moved_far
+from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -115,11 +115,11 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
     if learnt is None:
         return scene, []
     extent = float((scene.aabb[1] - scene.aabb[0]).norm()) / 2.0
-    motion = motions(scene.cameras, learnt, trained, extent)
+    motion = camera_displacements(scene.cameras, learnt, trained, extent)
     lines = [
         f"cameras      refined: half of them moved by more than {float(motion.median()):.2%} of the scene's extent"
     ]
-    far = moved_far(motion)
+    far = far_displaced(motion)
     if far:
         names = [f"{scene.view_names[trained[place]]} ({float(motion[place]):.1%})" for place in far[:MOST_NAMED]]
         more = f" and {len(far) - MOST_NAMED} more" if len(far) > MOST_NAMED else ""

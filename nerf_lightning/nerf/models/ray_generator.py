@@ -12,7 +12,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.refinements.base import Refinement
-from nerf_lightning.nerf.refinements.carry import carry_along
+from nerf_lightning.nerf.refinements.displacements import align_untrained_cameras
 from nerf_lightning.nerf.refinements.none import NoRefinement
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
@@ -109,7 +109,7 @@ class RayGenerator(Part):
         self.refinement.reset_parameters()
 
     def refined(self, trained: Sequence[int]) -> Cameras | None:
-        """Return the cameras as learnt, on the CPU, the others carried along (`carry_along`); None where none learns.
+        """Return the cameras as learnt, on the CPU, the others carried along (`align_untrained_cameras`); None where none learns.
 
         Args:
             trained: numbers of the views that are trained on.
@@ -117,7 +117,7 @@ class RayGenerator(Part):
         if not self.refinement.moves():
             return None
         with torch.no_grad():
-            return carry_along(self.given.to("cpu"), self.cameras.to("cpu"), trained)
+            return align_untrained_cameras(self.given.to("cpu"), self.cameras.to("cpu"), trained)
 
     def through_world(self, pixels: PixelIndex, place: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
         """Return the rays through the world, wherever those of `forward` run."""

@@ -1,4 +1,4 @@
-"""Small motions of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
+"""Small camera_displacements of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from nerf_lightning.nerf.types.scene import Cameras, Scene
 FEWEST_PHOTOGRAPHS = 2
 
 
-class SmallMotions(Refinement):
+class SE3Delta(Refinement):
     """Shift and turn each camera by a little: SO(3) x R^3, by the exponential map.
 
     R' = R exp(w + (-s_y, s_x, 0) / d), c' = c + R s with s = e t, f' = f exp(g), k1' = k1 + h1, k2' = k2 + h2. The

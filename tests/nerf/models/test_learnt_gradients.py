@@ -8,7 +8,7 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
-from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.rays import PixelIndex
 
@@ -22,7 +22,7 @@ def test_a_camera_has_the_gradients_of_finite_differences():
     # Contracted, so that no ray has an end that moves with it.
     field = NGPField(encoder, SphericalHarmonicsEncoder(3), width=16, density_bias=0.5, contraction=True)
     torch.nn.init.normal_(encoder.table, std=0.5)
-    level, refinement = DenseLevel(StratifiedSampler(48), field), SmallMotions()
+    level, refinement = DenseLevel(StratifiedSampler(48), field), SE3Delta()
     refinement.fit_to(scene)
     rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
     y, x = torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij")

@@ -15,7 +15,7 @@ from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.part import StepContext
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.rendering.packed import composite_packed
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 from nerf_lightning.nerf.samplers.early_termination import visible_samples
@@ -35,7 +35,7 @@ def test_a_camera_before_packed_samples_has_the_gradient_of_the_reference_in_flo
     field.fit_to(scene)
     torch.nn.init.normal_(encoder.table, std=0.3)
     encoder.on_step(StepContext(0.5 * blended, 0, 0))
-    motion = SmallMotions()
+    motion = SE3Delta()
     motion.fit_to(scene)
     rays = RayGenerator(scene.cameras, scene.near, scene.far, motion)
     pixels = all_pixels(scene.cameras, 1).map(torch.Tensor.flatten)

@@ -16,9 +16,9 @@ from nerf_lightning.nerf.geometry.cameras import project
 from nerf_lightning.nerf.geometry.lenses import unproject
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
-from nerf_lightning.nerf.refinements.carry import motions, moved_far
+from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.refinements.none import NoRefinement
-from nerf_lightning.nerf.refinements.se3 import SmallMotions
+from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.types.rays import PixelIndex
 
 
@@ -31,7 +31,7 @@ def a_step(scene, refinement, model=None):
 
 
 @pytest.mark.parametrize("refinement", [
-    NoRefinement(), SmallMotions(), SmallMotions(poses=False, focal=True), SmallMotions(poses=False, lens=True),
+    NoRefinement(), SE3Delta(), SE3Delta(poses=False, focal=True), SE3Delta(poses=False, lens=True),
 ])  # fmt: skip
 def test_at_first_every_ray_is_as_it_was_to_the_bit(refinement):
     scene = ball_scene()
@@ -52,7 +52,7 @@ def test_without_a_refinement_nothing_learns_and_nothing_is_kept():
 
 def test_only_photographs_that_are_trained_on_move():
     scene = ball_scene()
-    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=1.0))
+    step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.0, weight=1.0))
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
     for _ in range(3):
@@ -64,7 +64,7 @@ def test_only_photographs_that_are_trained_on_move():
 
 def test_cameras_are_held_until_there_is_a_scene():
     scene = ball_scene()
-    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
+    step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.02))  # two of the hundred steps
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
     loader, optimizer, moved = RayBatches(scene, step.progress, 0, 64), step.new_optimizer(), []
     for _ in range(3):
@@ -77,7 +77,7 @@ def test_cameras_are_held_until_there_is_a_scene():
 def test_wrong_cameras_before_a_known_scene_find_their_place():
     true, model = photographed_ball()
     scene = with_noise(true, degrees=1.0, share=0.01)
-    step = a_step(scene, SmallMotions(learning_rate=1e-2, hold=0.0, weight=0.0), model)
+    step = a_step(scene, SE3Delta(learning_rate=1e-2, hold=0.0, weight=0.0), model)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     step.schedule, step.num_steps = ExponentialDecay(decay_rate=0.01), 80
     loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
@@ -93,7 +93,7 @@ def test_photographs_of_one_camera_share_its_focal_length():
     scene = ball_scene()
     scene = replace(scene, cameras=replace(scene.cameras, focal=scene.cameras.focal.clone()))
     scene.cameras.focal[4:] *= 2.0
-    refinement = SmallMotions(poses=False, focal=True)
+    refinement = SE3Delta(poses=False, focal=True)
     refinement.fit_to(scene)
     assert refinement.log_focal.shape == (2,)
     torch.nn.init.constant_(refinement.log_focal, 0.1)
@@ -103,7 +103,7 @@ def test_photographs_of_one_camera_share_its_focal_length():
 def test_a_wrong_focal_length_is_found_before_a_known_scene():
     true, model = photographed_ball()
     scene = replace(true, cameras=replace(true.cameras, focal=1.03 * true.cameras.focal))
-    step = a_step(scene, SmallMotions(poses=False, focal=True, learning_rate=3e-3, hold=0.0, weight=0.0), model)
+    step = a_step(scene, SE3Delta(poses=False, focal=True, learning_rate=3e-3, hold=0.0, weight=0.0), model)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
     for _ in range(30):
@@ -117,7 +117,7 @@ def test_a_wrong_lens_is_found_before_a_known_scene(model):
     true, known = photographed_ball(lens=bent, lens_model=model)
     given = torch.zeros(8, 6) if model == "fisheye" else torch.tensor([[0.2, *bent[1:]]] * 8)
     scene = replace(true, cameras=replace(true.cameras, lens=given))
-    step = a_step(scene, SmallMotions(poses=False, lens=True, learning_rate=3e-2, hold=0.0, weight=0.0), known)
+    step = a_step(scene, SE3Delta(poses=False, lens=True, learning_rate=3e-2, hold=0.0, weight=0.0), known)
     step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-30)
     step.schedule, step.num_steps = ExponentialDecay(decay_rate=0.01), 60
     loader, optimizer = RayBatches(scene, step.progress, 0, 768), step.new_optimizer()
@@ -137,7 +137,7 @@ def test_a_wrong_lens_is_found_before_a_known_scene(model):
 
 def test_a_pinhole_may_turn_out_to_have_a_lens():
     scene = ball_scene()
-    refinement = SmallMotions(poses=False, lens=True)
+    refinement = SE3Delta(poses=False, lens=True)
     refinement.fit_to(scene)
     assert refinement(scene.cameras).lens_model == "radial_tangential"
     with torch.no_grad():
@@ -148,27 +148,27 @@ def test_a_pinhole_may_turn_out_to_have_a_lens():
 def test_panoramas_have_no_lens_to_learn():
     scene = ball_scene()
     panoramas = replace(scene, cameras=replace(scene.cameras, lens_model="equirectangular"))
-    refused(SmallMotions(focal=True).fit_to, panoramas, parts=("has panoramas", "refinement=se3", "refinement=none"))
-    SmallMotions().fit_to(panoramas)
+    refused(SE3Delta(focal=True).fit_to, panoramas, parts=("has panoramas", "refinement=se3", "refinement=none"))
+    SE3Delta().fit_to(panoramas)
 
 
 def test_the_penalty_is_the_mean_square_of_what_has_moved():
-    refinement = SmallMotions(weight=0.5)
+    refinement = SE3Delta(weight=0.5)
     refinement.fit_to(ball_scene())  # three photographs
     torch.nn.init.constant_(refinement.rotation[:1], 0.1)
     assert float(refinement.penalty().detach()) == pytest.approx(0.5 * 3 * 0.01 / 3)
-    assert SmallMotions(weight=0.0).penalty() is None
+    assert SE3Delta(weight=0.0).penalty() is None
 
 
 def test_cameras_in_normalised_device_coordinates_are_refused():
     scene = ball_scene()
     bent = replace(scene, cameras=replace(scene.cameras, ndc=torch.ones(6, 2)), space="ndc")
-    refused(SmallMotions().fit_to, bent, parts=("scene.space=ndc", "scene.space=contracted", "refinement=none"))
+    refused(SE3Delta().fit_to, bent, parts=("scene.space=ndc", "scene.space=contracted", "refinement=none"))
 
 
 def test_one_photograph_is_refused():
     alone = replace(ball_scene(), splits={"train": (2,)})
-    refused(SmallMotions().fit_to, alone, parts=("trains on 1 photograph", "refinement=none"))
+    refused(SE3Delta().fit_to, alone, parts=("trains on 1 photograph", "refinement=none"))
 
 
 @pytest.mark.parametrize(("settings", "said"), [
@@ -177,12 +177,12 @@ def test_one_photograph_is_refused():
 ])  # fmt: skip
 def test_settings_that_make_no_sense_are_refused(settings, said):
     with pytest.raises(ValueError, match=said):
-        SmallMotions(**settings)
+        SE3Delta(**settings)
 
 
 def test_views_that_are_not_trained_on_follow_the_others():
     scene = ball_scene(num_views=8)
-    refinement = SmallMotions()
+    refinement = SE3Delta()
     refinement.fit_to(scene)
     rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
     with torch.no_grad():
@@ -196,7 +196,7 @@ def test_views_that_are_not_trained_on_follow_the_others():
 
 def test_a_shifted_camera_turns_back_to_the_middle_of_the_scene():
     scene = ball_scene()
-    refinement = SmallMotions()
+    refinement = SE3Delta()
     refinement.fit_to(scene)
     with torch.no_grad():
         refinement.shift[:] = torch.tensor([0.01, -0.02, 0.0])
@@ -213,15 +213,15 @@ def test_who_moved_far_is_told_from_what_all_did():
     drifted = replace(scene.cameras, c2w=1.0 * scene.cameras.c2w)
     drifted.c2w[:, :, 3] *= 1.2
     wrong = with_noise(with_noise(replace(scene, cameras=drifted), 0.1, 0.001), 6.0, 0.02, views=[4], seed=3)
-    motion = motions(scene.cameras, wrong.cameras, trained, extent=3**0.5)
-    assert moved_far(motion) == [4]
+    motion = camera_displacements(scene.cameras, wrong.cameras, trained, extent=3**0.5)
+    assert far_displaced(motion) == [4]
     assert float(motion[4]) == pytest.approx(0.105 + 0.02 * 4.1 / 3**0.5, rel=0.2)
-    assert moved_far(motions(scene.cameras, drifted, trained, extent=1.0)) == []
+    assert far_displaced(camera_displacements(scene.cameras, drifted, trained, extent=1.0)) == []
 
 
 def test_a_restart_puts_the_cameras_back():
     scene = ball_scene()
-    step = a_step(scene, SmallMotions(), tiny_model(density_bias=0.5))
+    step = a_step(scene, SE3Delta(), tiny_model(density_bias=0.5))
     torch.nn.init.normal_(step.rays.refinement.rotation)
     step.restart(torch.optim.SGD(step.rays.parameters(), lr=1.0))
     assert torch.equal(step.rays.cameras.c2w, scene.cameras.c2w)

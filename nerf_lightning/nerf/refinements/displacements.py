@@ -16,7 +16,7 @@ LEAST_FAR = 5e-3
 """What is less is never far: radians, or shares of the scene's extent."""
 
 
-def carry_along(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
+def align_untrained_cameras(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Cameras:
     """Return the cameras as learnt, and those that were not trained on where the trained ones have gone as a whole.
 
     Nothing in the photographs says where the scene is, how large, or turned how, so all trained cameras may have
@@ -28,7 +28,9 @@ def carry_along(given: Cameras, learnt: Cameras, trained: Sequence[int]) -> Came
     return replace(learnt, c2w=c2w)
 
 
-def motions(given: Cameras, learnt: Cameras, trained: Sequence[int], extent: float) -> Float[Tensor, "trained"]:
+def camera_displacements(
+    given: Cameras, learnt: Cameras, trained: Sequence[int], extent: float
+) -> Float[Tensor, "trained"]:
     """Return how far each trained camera has moved, beside what all have moved as one.
 
     It is the angle that it has turned by (radians) plus its shift over the scene's extent.
@@ -42,10 +44,10 @@ def motions(given: Cameras, learnt: Cameras, trained: Sequence[int], extent: flo
     return angle + (before[:, :, 3] - after[:, :, 3]).norm(dim=1) / extent
 
 
-def moved_far(motion: Float[Tensor, "trained"]) -> list[int]:
+def far_displaced(motion: Float[Tensor, "trained"]) -> list[int]:
     """Return the places of those that moved several times as far as most, the farthest first.
 
-    >>> moved_far(torch.tensor([0.01, 0.012, 0.2, 0.009]))
+    >>> far_displaced(torch.tensor([0.01, 0.012, 0.2, 0.009]))
     [2]
     """
     far = (motion > FAR * motion.median()) & (motion > LEAST_FAR)
