@@ -84,7 +84,7 @@ def test_a_model_writes_no_size_into_the_parts_that_it_chose(model):
     yaml = OmegaConf.to_container(loaded("model", model))
     assert not {"encoder", "direction_encoder", "field"} & yaml.keys()
     for level in yaml.get("model", {}).get("levels", {}).values():
-        assert level.keys() <= {"_target_", "field", "learn_every", "whole_gradients_from"}
+        assert level.keys() <= {"_target_", "field", "learn_every", "gradient_scaling_distance"}
         assert level.get("field", "${field}") == "${field}"
 
 

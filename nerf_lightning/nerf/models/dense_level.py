@@ -23,7 +23,7 @@ class DenseLevel(Level):
     Args:
         sampler: where the field is asked.
         field: density and colour.
-        whole_gradients_from: from this distance on (scene units) gradients are whole, nearer to the camera they are
+        gradient_scaling_distance: from this distance on (scene units) gradients are whole, nearer to the camera they are
             smaller, against floaters (`soften_near_gradients`); 0: whole everywhere, as where rays are normalised
             device coordinates, in which no distance is one.
     """
@@ -31,10 +31,10 @@ class DenseLevel(Level):
     sampler: DenseSampler
     sampler_kind = DenseSampler
 
-    def __init__(self, sampler: Sampler, field: Field, whole_gradients_from: float = 0.0):
+    def __init__(self, sampler: Sampler, field: Field, gradient_scaling_distance: float = 0.0):
         super().__init__(sampler, field)
-        require_ranges(locals(), {"whole_gradients_from": (0, float("inf"))})
-        self.whole_gradients_from = whole_gradients_from
+        require_ranges(locals(), {"gradient_scaling_distance": (0, float("inf"))})
+        self.gradient_scaling_distance = gradient_scaling_distance
 
     def points_per_ray(self, before: float, training: bool) -> float:
         """As the sampler says."""
@@ -44,7 +44,7 @@ class DenseLevel(Level):
         """Take note of where the scene's content lies, and whether its distances are any."""
         super().fit_to(scene)
         if scene.cameras.ndc is not None:
-            self.whole_gradients_from = 0.0
+            self.gradient_scaling_distance = 0.0
 
     def compile_field(self) -> bool:
         """Compile the field, for static shapes: dynamic ones may be specialised otherwise after a resume."""
@@ -63,7 +63,7 @@ class DenseLevel(Level):
         samples = self.sampler(rays, history, random)
         seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
         if random is not None:
-            seen = soften_near_gradients(seen, samples.midpoints, self.whole_gradients_from)
+            seen = soften_near_gradients(seen, samples.midpoints, self.gradient_scaling_distance)
         return composite(seen, samples, rays, background)
 
     def field_output(self, points: Points) -> FieldOutput:

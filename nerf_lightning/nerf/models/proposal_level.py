@@ -25,7 +25,7 @@ class ProposalLevel(DenseLevel):
         field: its density is all that is used.
         learn_every: steps from one in which it learns to the next.
         learn_always: so many steps at first, it learns in each.
-        whole_gradients_from: from this distance on (scene units) gradients are whole, nearer to the camera they are
+        gradient_scaling_distance: from this distance on (scene units) gradients are whole, nearer to the camera they are
             smaller, against floaters; 0: whole everywhere, as in `DenseLevel`.
     """
 
@@ -37,9 +37,9 @@ class ProposalLevel(DenseLevel):
         field: Field,
         learn_every: int = 1,
         learn_always: int = 100,
-        whole_gradients_from: float = 0.0,
+        gradient_scaling_distance: float = 0.0,
     ):
-        super().__init__(sampler, field, whole_gradients_from)
+        super().__init__(sampler, field, gradient_scaling_distance)
         require_ranges(locals(), {"learn_every": (1, 1 << 20), "learn_always": (0, 1 << 31)})
         self.learn_every, self.learn_always = learn_every, learn_always
         self._learns = True

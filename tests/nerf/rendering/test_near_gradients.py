@@ -43,4 +43,4 @@ def test_in_normalised_device_coordinates_no_distance_is_one(ndc):
     scale = torch.ones(len(scene.cameras.c2w), 2) if ndc else None
     level = DenseLevel(StratifiedSampler(8), tiny_field(), 2.0)
     level.fit_to(replace(scene, cameras=replace(scene.cameras, ndc=scale)))
-    assert level.whole_gradients_from == (0.0 if ndc else 2.0)
+    assert level.gradient_scaling_distance == (0.0 if ndc else 2.0)
