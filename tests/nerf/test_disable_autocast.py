@@ -133,7 +133,7 @@ def known() -> dict[str, Any]:
         "u": torch.rand(RAYS, 6, generator=drawn),
         "floor": 1e-5, "density": 2 * torch.rand(RAYS, 8, generator=drawn), "deltas": dense.deltas,
         "output": output(RAYS, 8), "samples": dense, "packed output": output(2 * RAYS), "packed samples": packed,
-        "counts": torch.full((RAYS,), 2), "bins": 16, "endless": False,
+        "counts": torch.full((RAYS,), 2), "bins": 16, "contracted_spacing": False,
         "rendering": composite(output(RAYS, 8), dense, rays, background),
         "packed rendering": composite_packed(output(2 * RAYS), packed, rays, background),
         "depth": depth, "opacity": torch.rand(RAYS, generator=drawn), "truth_depth": depth + 0.1,

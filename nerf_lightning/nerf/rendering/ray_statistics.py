@@ -22,7 +22,7 @@ def effective_samples(rendering: DenseRendering | PackedRendering, rays: RayBund
 
 
 def weight_along(
-    rendering: DenseRendering | PackedRendering, rays: RayBundle, bins: int, endless: bool = False
+    rendering: DenseRendering | PackedRendering, rays: RayBundle, bins: int, contracted_spacing: bool = False
 ) -> Float[Tensor, "bins"]:
     """Return how much weight lies in each of `bins` equal parts of the way from near to far, as a mean over rays.
 
@@ -30,11 +30,11 @@ def weight_along(
         rendering: what a level saw.
         rays: along what.
         bins: number of parts.
-        endless: whether the parts are equal in the spacing of space without bounds (`geometry.spacing`).
+        contracted_spacing: whether the parts are equal in the spacing of space without bounds (`geometry.spacing`).
     """
     ray, distance, weights = _samples_of(rendering)
     near, far = rays.near.reshape(-1), rays.far.reshape(-1)
-    if endless:
+    if contracted_spacing:
         near, far, distance = normalized_distance(near), normalized_distance(far), normalized_distance(distance)
     share = (distance - near[ray]) / (far - near).clamp(min=torch.finfo(torch.float32).tiny)[ray]
     place = (bins * share).long().clamp(0, bins - 1)

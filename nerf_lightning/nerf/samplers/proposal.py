@@ -33,10 +33,10 @@ class ProposalSampler(DenseSampler):
         strata = torch.arange(count, device=edges.device, dtype=edges.dtype)
         within = 0.5 if random is None else random.uniform("proposal", count)
         u = ((strata + within) / count).expand(*edges.shape[:-1], -1)
-        if not history[-1].samples.endless:
+        if not history[-1].samples.contracted_spacing:
             return RaySamples(edges=sample_histogram(edges, weights, u, floor=self.padding))
         shares = sample_histogram(normalized_distance(edges), weights, u, floor=self.padding)
-        return RaySamples(edges=from_normalized_distance(shares), endless=True)
+        return RaySamples(edges=from_normalized_distance(shares), contracted_spacing=True)
 
     def num_samples_after(self, before: int) -> int:
         """Always `num_samples`.

@@ -42,7 +42,7 @@ class StratifiedSampler(DenseSampler):
         near, far = rays.near[..., None], rays.far[..., None]
         if self.contracted.is_on():
             low, high = normalized_distance(near), normalized_distance(far)
-            return RaySamples(edges=from_normalized_distance(low + s * (high - low)), endless=True)
+            return RaySamples(edges=from_normalized_distance(low + s * (high - low)), contracted_spacing=True)
         return RaySamples(edges=near + s * (far - near))
 
     def num_samples_after(self, before: int) -> int:

@@ -38,7 +38,7 @@ class RaySamples(TensorStruct):
 
     edges: Float[Tensor, "*rays edges"]
     """Increasing distances; one more than there are samples."""
-    endless: bool = False
+    contracted_spacing: bool = False
     """Whether even steps are those of `geometry.spacing`, for space without bounds, and not of the distance."""
 
     @property

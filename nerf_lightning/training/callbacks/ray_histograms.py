@@ -40,8 +40,8 @@ class RayHistograms(Watcher):
         writers = tensorboard_writers(trainer.loggers)
         if not writers:
             return
-        step, endless = trainer.global_step, trainer.datamodule.scene.space == "contracted"
-        seen = look_along(system.step, outputs["step"].pixels[: self.num_rays], step, endless)
+        step, contracted_spacing = trainer.global_step, trainer.datamodule.scene.space == "contracted"
+        seen = look_along(system.step, outputs["step"].pixels[: self.num_rays], step, contracted_spacing)
         for name, (along, samples) in seen.items():
             lit = samples[samples > 0]  # many rays meet nothing at all
             for writer in writers:
@@ -53,7 +53,7 @@ class RayHistograms(Watcher):
 
 @torch.no_grad()
 def look_along(
-    training: TrainStep, pixels: PixelIndex, step: int, endless: bool
+    training: TrainStep, pixels: PixelIndex, step: int, contracted_spacing: bool
 ) -> dict[str, tuple[Float[Tensor, "parts"], Float[Tensor, "rays"]]]:
     """Return for each level the mean weight in equal parts of the way, and each ray's effective samples."""
     model, rays = training.model, training.rays(pixels)
@@ -64,7 +64,7 @@ def look_along(
     model.eval()
     for part, renderings in weighted_renderings(model, rays, training.background, key, tile_points):
         for name, rendering in zip(names, renderings, strict=True):
-            along = weight_along(rendering, part, PARTS, endless) * part.near.numel() / num_rays
+            along = weight_along(rendering, part, PARTS, contracted_spacing) * part.near.numel() / num_rays
             seen[name].append((along.cpu(), effective_samples(rendering, part).cpu()))
     model.train()
     return {

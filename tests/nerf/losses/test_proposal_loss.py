@@ -91,7 +91,7 @@ def test_a_ray_without_weight_teaches_no_level_anything():
 
 def test_without_an_end_distortion_is_measured_in_the_spacing():
     seen, _ = rendering(20.0 * random_edges(6, 9), torch.rand(6, 8))
-    endless = replace(seen, samples=RaySamples(seen.samples.edges, endless=True))
+    contracted_spacing = replace(seen, samples=RaySamples(seen.samples.edges, contracted_spacing=True))
     in_spacing = replace(seen, samples=RaySamples(normalized_distance(seen.samples.edges)))
-    torch.testing.assert_close(distortion_loss(endless), distortion_loss(in_spacing))
-    assert not torch.allclose(distortion_loss(endless), distortion_loss(seen), rtol=0.05)
+    torch.testing.assert_close(distortion_loss(contracted_spacing), distortion_loss(in_spacing))
+    assert not torch.allclose(distortion_loss(contracted_spacing), distortion_loss(seen), rtol=0.05)

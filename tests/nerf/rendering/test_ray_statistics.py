@@ -98,4 +98,4 @@ def test_without_bounds_the_parts_are_those_of_the_spacing():
     weights[0, 0] = 1.0
     rendering, rays = dense(weights, near=0.0, far=1000.0)
     assert weight_along(rendering, rays, bins=4).tolist() == [0.0, 1.0, 0.0, 0.0]
-    assert weight_along(rendering, rays, bins=4, endless=True).tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert weight_along(rendering, rays, bins=4, contracted_spacing=True).tolist() == [0.0, 0.0, 0.0, 1.0]

@@ -48,7 +48,7 @@ def test_without_an_end_it_spreads_its_samples_in_disparity():
     samples = stratified(rays, [], None)
     seen = composite(FieldOutput(torch.zeros(30, 64), torch.zeros(30, 64, 3)), samples, rays, torch.ones(3))
     found = ProposalSampler(32)(rays, [seen], None)
-    assert found.endless
+    assert found.contracted_spacing
     # A proposal that saw nothing asks for even steps of the spacing, of which half lie within distance 1.
     steps = normalized_distance(found.edges).diff(dim=-1)
     torch.testing.assert_close(steps, steps.mean().expand_as(steps), rtol=0.02, atol=0)

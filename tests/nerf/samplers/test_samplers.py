@@ -103,7 +103,7 @@ def test_in_contracted_scenes_samples_are_even_in_disparity(random):
     sampler, rays = StratifiedSampler(32), endless_rays(20)
     sampler.fit_to(replace(ball_scene(), space="contracted"))
     samples = sampler(rays, [], random)
-    assert samples.endless
+    assert samples.contracted_spacing
     torch.testing.assert_close(samples.edges[:, 0], rays.near)
     torch.testing.assert_close(samples.edges[:, -1], rays.far)
     even = (
@@ -120,7 +120,7 @@ def test_in_other_scenes_samples_are_even_in_distance(space):
     sampler, rays = StratifiedSampler(8), endless_rays(2)
     sampler.fit_to(replace(ball_scene(), space=space))
     samples = sampler(rays, [], None)
-    assert not samples.endless
+    assert not samples.contracted_spacing
     torch.testing.assert_close(samples.deltas, torch.full((2, 8), 15.9 / 8))
 
 
@@ -129,4 +129,4 @@ def test_importance_samples_remember_that_space_has_no_end():
     sampler.fit_to(replace(ball_scene(), space="contracted"))
     samples = sampler(rays, [], None)
     seen = composite(FieldOutput(torch.rand(4, 16), torch.rand(4, 16, 3)), samples, rays, torch.ones(3))
-    assert ImportanceSampler(8)(rays, [seen], None).endless
+    assert ImportanceSampler(8)(rays, [seen], None).contracted_spacing

@@ -27,7 +27,7 @@ def test_looking_changes_nothing_that_training_reads(name):
     before = copy.deepcopy(step.model.state_dict())
     gradients = [parameter.grad.clone() for parameter in step.model.parameters()]
     generator = torch.get_rng_state()
-    look_along(step, batch.pixels, 7, endless=False)
+    look_along(step, batch.pixels, 7, contracted_spacing=False)
     assert step.model.training
     for key, value in step.model.state_dict().items():
         assert torch.equal(value, before[key]), key
@@ -39,9 +39,9 @@ def test_looking_changes_nothing_that_training_reads(name):
 @pytest.mark.parametrize("name", ["nerf", "fast_dense"])
 def test_tiles_do_not_show(name):
     step, batch = a_system(name)
-    whole = look_along(step, batch.pixels, 7, endless=False)
+    whole = look_along(step, batch.pixels, 7, contracted_spacing=False)
     step.tile_points = 300
-    parts = look_along(step, batch.pixels, 7, endless=False)
+    parts = look_along(step, batch.pixels, 7, contracted_spacing=False)
     assert list(whole) == list(step.model.level_names)
     for level in whole:
         torch.testing.assert_close(parts[level], whole[level])
