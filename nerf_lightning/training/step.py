@@ -128,7 +128,7 @@ class TrainStep:
         self.start_weights = start_weights
         self.guard = StepGuard()
         self._recorded: RecordedGradients | None = None
-        model.keep_weights(loss.needs_weights)
+        model.set_returns_weights(loss.needs_weights)
         for part in model.modules():
             if isinstance(part, PackedSampler) and sample_budget is not None:
                 part.sample_budget = -(-sample_budget // ranks.world_size())
@@ -334,7 +334,7 @@ class TrainStep:
             part.zero_grad(set_to_none=True)
         self.model.forget_measurements()
 
-    def is_sound(self) -> bool:
+    def all_finite(self) -> bool:
         """Tell whether the run is one to come back to: the last step was taken, and the weights are finite."""
         return self.guard.in_row == 0 and not self.broken_weights()
 

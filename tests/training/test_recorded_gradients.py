@@ -33,7 +33,7 @@ def as_on_a_gpu(monkeypatch):
 def trained(sizes, record, model="fast_small"):
     """Take a step of each size, and return the run."""
     run = step_by_step(model, CPU)
-    run.training.model.keep_weights(True)  # so that no kernel takes whole rays
+    run.training.model.set_returns_weights(True)  # so that no kernel takes whole rays
     if record:
         run.training.record_gradients(record=tape)
     for size in sizes:

@@ -73,7 +73,7 @@ def test_gradients_that_stay_not_finite_are_counted_and_their_module_is_named():
     gradients(step, ball_scene(), steps=7)
     assert step.guard.in_row == 7
     assert step.guard.first_module.startswith("levels.fine.field.")
-    assert not step.is_sound()
+    assert not step.all_finite()
     assert step.broken_weights() == "levels.fine.field.color_head"
 
 

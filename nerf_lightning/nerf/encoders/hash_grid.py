@@ -102,7 +102,7 @@ class HashGridEncoder(Encoder):
         if self.blend_in:
             self._set_weights(blending_weights(len(self.layout.resolutions), context.progress / self.blend_in))
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Look at what was loaded.
 
         Raises:

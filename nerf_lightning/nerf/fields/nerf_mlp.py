@@ -92,7 +92,7 @@ class NerfMLP(Field):
         self.contracted.fit_to(scene)
         self.aabb.copy_(scene.aabb)
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Look at what was loaded.
 
         Raises:

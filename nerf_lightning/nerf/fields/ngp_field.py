@@ -110,7 +110,7 @@ class NGPField(Field):
         if self.density_bias is None:
             self.bias.fill_(THICK if scene.pixels.has_transparency else THIN)
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Look at what was loaded.
 
         Raises:

@@ -89,7 +89,7 @@ class Model(nn.Module, ABC):
     def multiply_in(self, products: Products) -> None:
         """Set the precision of the products with the fields' weights; everything else is float32 always."""
 
-    def keep_weights(self, wanted: bool) -> None:
+    def set_returns_weights(self, wanted: bool) -> None:
         """Set whether renderings in training have weights and samples where they could do without (`Loss`)."""
 
     def update(self, step: int, key: int) -> None:
@@ -158,6 +158,6 @@ def _look_at_what_was_loaded(model: Model, _: Any) -> None:
         InputError: a part holds what it never can.
     """
     for part in model.modules():
-        look = getattr(part, "require_sound_state", None)
+        look = getattr(part, "validate_state", None)
         if look is not None:
             look()

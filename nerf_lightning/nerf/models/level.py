@@ -31,7 +31,7 @@ class Level(nn.Module):
     sampler_kind: type[Sampler] = Sampler
     """What it can sample with."""
 
-    keeps_weights: bool = True
+    returns_weights: bool = True
     """Whether renderings in training have weights and samples, for a loss that looks at them (`Loss.needs_weights`)."""
 
     has_static_shapes: bool = True

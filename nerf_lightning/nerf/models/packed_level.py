@@ -60,7 +60,7 @@ class PackedLevel(Level):
     def _trains_whole(self, rays: RayBundle) -> bool:
         # The kernel keeps no weights and knows no gradients of rays; off the CPU the field's parts would be read.
         return torch.is_grad_enabled() and not (
-            self.keeps_weights or rays.origins.requires_grad or rays.near.device.type != "cpu"
+            self.returns_weights or rays.origins.requires_grad or rays.near.device.type != "cpu"
         )
 
     def _whole_rays(

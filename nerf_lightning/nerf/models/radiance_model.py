@@ -124,10 +124,10 @@ class RadianceModel(PointField):
                 module.is_on()  # read from its buffer in a compiled field, it would cut the program in pieces
         return [name for name, level in zip(self.levels, self._in_order(), strict=True) if level.compile_field()]
 
-    def keep_weights(self, wanted: bool) -> None:
+    def set_returns_weights(self, wanted: bool) -> None:
         """Set whether renderings in training have weights and samples where they could do without."""
         for level in self._in_order():
-            level.keeps_weights = wanted
+            level.returns_weights = wanted
 
     def update(self, step: int, key: int) -> None:
         """Do what the levels do between steps of training."""

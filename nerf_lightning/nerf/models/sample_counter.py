@@ -59,7 +59,7 @@ class SampleCounter(nn.Module):
         self.mean.fill_(-1.0)
         self._per_ray = None
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Check what was loaded.
 
         Raises:

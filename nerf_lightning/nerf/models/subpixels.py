@@ -68,7 +68,7 @@ class Subpixels(Part):
         """Begin with one ray through each pixel's centre, for a new attempt."""
         self._set(1)
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Look at what was loaded.
 
         Raises:

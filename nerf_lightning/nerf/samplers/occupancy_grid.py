@@ -46,7 +46,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("blocks", torch.ones(blocks, dtype=torch.uint8, device=device))
         self.register_buffer("leaps", None, persistent=False)
 
-    def require_sound_state(self) -> None:
+    def validate_state(self) -> None:
         """Look at what was loaded.
 
         Raises:

@@ -47,7 +47,7 @@ class Checkpoints(Callback):
             InputError: an earlier one could not be written.
         """
         writer(trainer, self).raise_failure()
-        if trainer.global_step % self.every_steps == 0 and pl_module.step.is_sound():
+        if trainer.global_step % self.every_steps == 0 and pl_module.step.all_finite():
             trainer.save_checkpoint(self.folder(trainer) / LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
@@ -55,7 +55,7 @@ class Checkpoints(Callback):
         value = trainer.callback_metrics.get(self.monitor)
         if trainer.sanity_checking or value is None:
             return
-        if (self.best is None or float(value) > self.best) and pl_module.step.is_sound():
+        if (self.best is None or float(value) > self.best) and pl_module.step.all_finite():
             self.best = float(value)
             trainer.save_checkpoint(self.folder(trainer) / BEST)
 

@@ -37,7 +37,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
     jitter, products, most, features, color_layers, opaque_below, bias
 ):
     level = a_level(opaque_below, 32, features, products, density_bias=bias, color_layers=color_layers)
-    level.keeps_weights = False
+    level.returns_weights = False
     rays, random = some_rays(700), batch_random(3, 700) if jitter else None
     weight, background = torch.randn(700, 8), torch.rand(700, 3)
     seen, gradients = learnt(level, rays, random, weight, background)
@@ -56,7 +56,7 @@ def test_it_sees_and_learns_what_the_single_kernels_do(
 
 def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):
     level, rays = a_level(density_bias=3.0), some_rays(300)
-    level.keeps_weights = False
+    level.returns_weights = False
     weight = torch.randn(300, 8)
     seen, gradients = learnt(level, rays, None, weight)
     monkeypatch.setattr(kernels, "_spare", [])
@@ -70,7 +70,7 @@ def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_many_rays_are_shared_out_and_nothing_changes(threads):
     level, rays = a_level(density_bias=3.0), some_rays(600)
-    level.keeps_weights = False
+    level.returns_weights = False
     weight, before = torch.randn(600, 8), torch.get_num_threads()
     try:
         torch.set_num_threads(threads)
@@ -91,7 +91,7 @@ def test_it_goes_the_other_way_where_something_else_is_wanted():
     level, rays = a_level(density_bias=3.0), some_rays(50)
     assert isinstance(level(rays, None, [], None), PackedRendering)  # as a notebook wants it
     assert not level.takes_whole_rays(rays)
-    level.keeps_weights = False
+    level.returns_weights = False
     assert level.takes_whole_rays(rays)
     assert not isinstance(level(rays, None, [], None), PackedRendering)
     with torch.no_grad():
@@ -104,7 +104,7 @@ def test_it_goes_the_other_way_where_something_else_is_wanted():
 
 def test_colours_have_a_way_back_from_black():
     level, rays = a_level(density_bias=4.0), some_rays(200)
-    level.keeps_weights, level.field.least_slope = False, 0.1
+    level.returns_weights, level.field.least_slope = False, 0.1
     with torch.no_grad():
         level.field.color_mlp[-1].mul_(1000.0)
     weight = torch.randn(200, 8)
