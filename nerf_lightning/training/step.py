@@ -328,11 +328,11 @@ class TrainStep:
         error = (rgb - target).square().mean(dim=-1)
         return (error * batch.weight).sum() / batch.weight.sum().clamp(min=1.0)
 
-    def forget_measurements(self) -> None:
+    def reset_statistics(self) -> None:
         """Undo what trial steps have left behind: gradients and counts, no weights."""
         for part in self.parts.values():
             part.zero_grad(set_to_none=True)
-        self.model.forget_measurements()
+        self.model.reset_statistics()
 
     def all_finite(self) -> bool:
         """Tell whether the run is one to come back to: the last step was taken, and the weights are finite."""

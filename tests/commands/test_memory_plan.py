@@ -72,7 +72,7 @@ def warm(step, batches):
     with torch.no_grad():
         step.model(step.rays(few.pixels), None, None)
         image_metrics(torch.rand(16, 16, 3), torch.rand(16, 16, 3))
-    step.forget_measurements()
+    step.reset_statistics()
     step.model.update(0, 0)
 
 

@@ -77,7 +77,7 @@ def _untouched(step: TrainStep) -> Iterator[None]:
         yield
     finally:
         step.tile_points = tile
-        step.forget_measurements()
+        step.reset_statistics()
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
 

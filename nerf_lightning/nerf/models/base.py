@@ -103,7 +103,7 @@ class Model(nn.Module, ABC):
         """Return the buffers that hold means over rays, which the processes of a run must agree on."""
         return []
 
-    def forget_measurements(self) -> None:
+    def reset_statistics(self) -> None:
         """Forget what was counted while rendering."""
 
     def statistics(self) -> dict[str, float]:

@@ -97,11 +97,11 @@ class Level(nn.Module):
         """Return what is worth watching while training."""
         return self.sampler.statistics()
 
-    def forget_measurements(self) -> None:
+    def reset_statistics(self) -> None:
         """Forget what was counted while rendering."""
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
         self.field.reset_parameters()
         self.sampler.reset()
-        self.forget_measurements()
+        self.reset_statistics()

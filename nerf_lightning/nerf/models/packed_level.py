@@ -103,7 +103,7 @@ class PackedLevel(Level):
         self.counter.reread()
         return [self.counter.mean]
 
-    def forget_measurements(self) -> None:
+    def reset_statistics(self) -> None:
         """Forget how many samples rays have."""
         self.counter.reset()
 

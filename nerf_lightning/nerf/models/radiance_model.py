@@ -142,10 +142,10 @@ class RadianceModel(PointField):
         """Return the Euclidean norm of the gradients of each level."""
         return {name: norm_of_gradients(level) for name, level in zip(self.levels, self._in_order(), strict=True)}
 
-    def forget_measurements(self) -> None:
+    def reset_statistics(self) -> None:
         """Forget what was counted while rendering."""
         for level in self._in_order():
-            level.forget_measurements()
+            level.reset_statistics()
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -132,7 +132,7 @@ def test_samples_per_ray_are_measured_kept_and_loaded():
     other.load_state_dict(model.state_dict())
     assert other.points_per_ray(training=True) == counted
     assert model.statistics()["speed/samples_per_ray"] == pytest.approx(counted)
-    model.forget_measurements()
+    model.reset_statistics()
     assert model.points_per_ray(training=True) == 200
 
 
