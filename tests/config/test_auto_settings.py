@@ -60,8 +60,8 @@ def test_photographs_alone_are_examined_trained_for_minutes_and_reported():
     assert (other.doctor, other.final.report, other.budget.seconds) == (False, False, None)
     given, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "doctor=off", "final.report=false", "budget.seconds=60")
     assert (given.doctor, given.final.report, given.budget.seconds) == (False, False, 60)
-    contracted_spacing, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "budget.seconds=null")
-    assert contracted_spacing.budget.seconds is None
+    unbounded, _ = chosen_for(PHOTOGRAPHS, "scene=photos", "budget.seconds=null")
+    assert unbounded.budget.seconds is None
 
 
 def test_what_is_neither_a_switch_nor_auto_is_refused():

@@ -23,7 +23,7 @@ class DenseLevel(Level):
     Args:
         sampler: where the field is asked.
         field: density and colour.
-        gradient_scaling_distance: from this distance on (scene units) gradients are whole, nearer to the camera they are
+        gradient_scaling_distance: from here on (scene units) gradients are whole, nearer to the camera they are
             smaller, against floaters (`soften_near_gradients`); 0: whole everywhere, as where rays are normalised
             device coordinates, in which no distance is one.
     """

@@ -25,7 +25,7 @@ class ProposalLevel(DenseLevel):
         field: its density is all that is used.
         learn_every: steps from one in which it learns to the next.
         learn_always: so many steps at first, it learns in each.
-        gradient_scaling_distance: from this distance on (scene units) gradients are whole, nearer to the camera they are
+        gradient_scaling_distance: from here on (scene units) gradients are whole, nearer to the camera they are
             smaller, against floaters; 0: whole everywhere, as in `DenseLevel`.
     """
 

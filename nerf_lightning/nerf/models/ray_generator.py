@@ -109,7 +109,7 @@ class RayGenerator(Part):
         self.refinement.reset_parameters()
 
     def refined(self, trained: Sequence[int]) -> Cameras | None:
-        """Return the cameras as learnt, on the CPU, the others carried along (`align_untrained_cameras`); None where none learns.
+        """Return the cameras as learnt, the others aligned with them, on the CPU; None where none learns.
 
         Args:
             trained: numbers of the views that are trained on.

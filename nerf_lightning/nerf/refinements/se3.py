@@ -1,4 +1,4 @@
-"""Small camera_displacements of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
+"""Small motions of cameras, one per photograph, and their focal lengths and lenses, one per camera."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Captures that a stranger made to be opened: headers that no parser takes, equal names, contracted_spacing files."""
+"""Captures that a stranger made to be opened: headers that no parser takes, equal names, endless files."""
 
 import inspect
 import io
