@@ -10,7 +10,7 @@ from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
-from nerf_lightning.nerf.products import Products, cpu_multiplies_bfloat16
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision, cpu_multiplies_bfloat16
 
 POINTS, RAY_SAMPLES = 65_536, 32
 
@@ -38,11 +38,11 @@ def _hash_grid(device: torch.device) -> dict[str, Callable[[], None]]:
     return _kinds(lambda fn: fn(table, points, layout), interpolate, interpolate_torch, [table], grad)
 
 
-def _mlp(device: torch.device, products: Products) -> dict[str, Callable[[], None]]:
+def _mlp(device: torch.device, matmul_precision: MatmulPrecision) -> dict[str, Callable[[], None]]:
     weights = [torch.randn(b, a, device=device, requires_grad=True) for a, b in ((32, 64), (64, 64), (64, 3))]
     points = torch.randn(POINTS, 32, device=device, requires_grad=True)
     leaves, grad = [points, *weights], torch.randn(POINTS, 3, device=device)
-    return _kinds(lambda fn: fn(points, weights, products), mlp, mlp_torch, leaves, grad)
+    return _kinds(lambda fn: fn(points, weights, matmul_precision), mlp, mlp_torch, leaves, grad)
 
 
 def _kinds(

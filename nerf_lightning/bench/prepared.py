@@ -86,7 +86,7 @@ class Bench:
         samplers = [level.sampler for level in model.modules() if isinstance(level, PackedLevel)]
         former = [sampler.opaque_below for sampler in samplers]
         self.step.tile_points = None
-        model.multiply_in("float32")
+        model.set_precision("float32")
         for sampler in samplers:
             sampler.opaque_below = 0.0
         self._release_gradients()

@@ -16,7 +16,7 @@ from nerf_lightning.evaluation.protocol import environment
 from nerf_lightning.files.json_files import write_json
 from nerf_lightning.messages.console import StdoutConsole, say, spoken, stderr_console
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.selftest import command_line, kernels, training
 from nerf_lightning.selftest.check import Row, carried_out, remarks, result_table
@@ -58,7 +58,7 @@ def run(config: DictConfig) -> None:
 def _rows(settings: TrainerSettings) -> list[Row]:
     """Do all checks; what is written for them vanishes at the end."""
     device, chosen = settings.device, PRODUCTS[settings.precision]
-    precisions: tuple[Products, ...] = ("float32", "bfloat16")
+    precisions: tuple[MatmulPrecision, ...] = ("float32", "bfloat16")
     if has_tf32(settings.device_type):
         precisions = ("float32", "tf32", "bfloat16")
     trainer = [f"trainer={TRAINERS[settings.device_type]}", f"trainer.precision={settings.precision}"]

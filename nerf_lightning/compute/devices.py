@@ -13,8 +13,8 @@ from torch import distributed
 from nerf_lightning.compute import xla_device
 from nerf_lightning.compute.cores import num_cores
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.matmul_precision import Linear, cpu_gains_by_bfloat16, cpu_multiplies_bfloat16
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.products import Linear, cpu_gains_by_bfloat16, cpu_multiplies_bfloat16
 
 log = logging.getLogger(__name__)
 
@@ -169,7 +169,7 @@ def prepare_machine(num_threads: int | None) -> None:
 
 
 def _keep_float32() -> None:
-    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (products.py). cuDNN would
+    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (matmul_precision.py). cuDNN would
     # lower convolutions, SSIM's among them, unless it is told not to.
     torch.set_float32_matmul_precision("highest")
     torch.backends.cudnn.allow_tf32 = False

@@ -18,11 +18,11 @@ from nerf_lightning.compute.devices import (
     working_device,
 )
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.products import Products
 
 Launcher = Literal["nerf", "torchrun", "slurm"]
-PRODUCTS: dict[str, Products] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
+PRODUCTS: dict[str, MatmulPrecision] = {"32-true": "float32", "tf32": "tf32", "bf16-mixed": "bfloat16"}
 CPU_TILE_POINTS = 8_192
 GPU_TILE_POINTS = 1 << 20
 MOST_CPU_TILE_POINTS = 1 << 18
@@ -82,7 +82,7 @@ class ComputeSettings:
     def prepare(self, model: Model) -> Model:
         """Put a model on the device, let its fields multiply in the precision that suits both, and return it."""
         self.precision, self.reason = suited(*self._chosen, self.device_type, model)
-        model.multiply_in(PRODUCTS[self.precision])
+        model.set_precision(PRODUCTS[self.precision])
         return model.to(self.device)
 
     def describe(self) -> str:

@@ -39,7 +39,7 @@ def use_cores(wanted: int | Literal["auto"]) -> int:
     """
     from torch_xla import backends, runtime
 
-    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (products.py).
+    # Else a TPU would make products of float32 numbers in bfloat16, outside of fields too (matmul_precision.py).
     backends.set_mat_mul_precision("highest")
     if wanted == 1:
         runtime.global_runtime_device_count()  # autograd must see the device before its first backward

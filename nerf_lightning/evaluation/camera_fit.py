@@ -12,10 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
-from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.rays import PixelIndex

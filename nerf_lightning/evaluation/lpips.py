@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LPIPS_HINT = (
     "it needs the weights of a backbone: where torchvision is installed, run "

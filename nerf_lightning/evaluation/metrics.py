@@ -15,7 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from nerf_lightning.compute import ranks
 from nerf_lightning.evaluation.color_fit import color_corrected
 from nerf_lightning.nerf.bands import bands
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
 
 SSIM_WINDOW = 11

@@ -9,9 +9,9 @@ from typing import Literal
 from rich.table import Table
 from torch import Tensor
 
-from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 
-UNIT: dict[Products, float] = {"float32": 2.0**-24, "tf32": 2.0**-11, "bfloat16": 2.0**-9}
+UNIT: dict[MatmulPrecision, float] = {"float32": 2.0**-24, "tf32": 2.0**-11, "bfloat16": 2.0**-9}
 """The largest relative error of rounding a number to nearest, for each kind of factor."""
 COLORS = {"ok": "green", "wrong": "bold red", "not run": "yellow"}
 log = logging.getLogger(__name__)
@@ -77,27 +77,27 @@ def norm_apart(found: Tensor, expected: Tensor) -> float:
     return float((found - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
-def value_bound(products: Products, layers: int) -> float:
+def value_bound(matmul_precision: MatmulPrecision, layers: int) -> float:
     """Return how far rounding moves the output of a perceptron of so many layers, over its norm.
 
     A layer rounds both factors of its products, and perhaps its result: 3 roundings, where float32 counts the random
     walk of a sum of 64 terms, 8. Errors of layers are independent, so they add up as sqrt(layers); 4 standard
     deviations.
     """
-    return 4.0 * layers**0.5 * _of_a_layer(products)
+    return 4.0 * layers**0.5 * _of_a_layer(matmul_precision)
 
 
-def gradient_bound(products: Products, layers: int) -> float:
+def gradient_bound(matmul_precision: MatmulPrecision, layers: int) -> float:
     """Return how far rounding moves the gradient of a perceptron with ReLUs, over its norm.
 
     An error e before a ReLU, relative to the spread of what comes there, switches the unit with probability e / pi;
     half of them are on, so a share 2 e / pi of a layer's signal comes or goes, and squares add up over the layers.
     """
-    return (layers * 2.0 * layers**0.5 * _of_a_layer(products) / math.pi) ** 0.5
+    return (layers * 2.0 * layers**0.5 * _of_a_layer(matmul_precision) / math.pi) ** 0.5
 
 
-def _of_a_layer(products: Products) -> float:
-    return (8.0 if products == "float32" else 3.0) * UNIT[products]
+def _of_a_layer(matmul_precision: MatmulPrecision) -> float:
+    return (8.0 if matmul_precision == "float32" else 3.0) * UNIT[matmul_precision]
 
 
 def result_table(rows: list[Row], title: str) -> Table:

@@ -15,9 +15,9 @@ from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.data.sfm.video_frames import count_frames
 from nerf_lightning.evaluation.metrics import psnr
 from nerf_lightning.files.tensor_files import load_tensors
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
-from nerf_lightning.nerf.products import Products
 from nerf_lightning.selftest.check import Check
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene, write_npz
 
@@ -83,7 +83,7 @@ class CommandLine:
             raise RuntimeError(f"nerf {arguments[0]} ended with exit code {done.returncode}: {said}")
 
 
-def checks(runs: CommandLine, device: torch.device, products: Products) -> list[Check]:
+def checks(runs: CommandLine, device: torch.device, matmul_precision: MatmulPrecision) -> list[Check]:
     """Return the checks of what the command line leaves on the disk."""
     resume = (0.1, "GPUs add in any order, and Adam makes whole steps of rounding where gradients are all but zero")
     if device.type == "cpu":
@@ -95,11 +95,11 @@ def checks(runs: CommandLine, device: torch.device, products: Products) -> list[
         ),
         Check(
             "checkpoint read back: PSNR of the held-out views, dB", 0.01, "only tiles and rounding differ",
-            lambda: _psnr_apart(runs.finished(), device, products),
+            lambda: _psnr_apart(runs.finished(), device, matmul_precision),
         ),
         Check(
             "film: two frames against the same pictures rendered here, levels of 255", 1.0, "colours are rounded",
-            lambda: _frames_apart(runs.finished(), device, products),
+            lambda: _frames_apart(runs.finished(), device, matmul_precision),
         ),
         Check(
             "film: frames missing from the video (mp4)", 0.0, "two were asked for",
@@ -132,27 +132,27 @@ def _state(path: Path, whole: bool) -> dict[str, Tensor]:
     return found
 
 
-def _pictures(folder: Path, device: torch.device, products: Products) -> list[Tensor]:
+def _pictures(folder: Path, device: torch.device, matmul_precision: MatmulPrecision) -> list[Tensor]:
     """Return the held-out views as the finished run's model renders them here, (height width 3) each."""
     checkpoint = read_checkpoint(folder / "whole" / "checkpoints" / "last.ckpt")
     model, scene = load_model(checkpoint).to(device), checkpoint.scene
-    model.multiply_in(products)
+    model.set_precision(matmul_precision)
     rays = RayGenerator(scene.cameras, scene.near, scene.far)
     return [render_picture(model, rays, view, scene.background, 1 << 16).rgb.cpu() for view in HELD_OUT]
 
 
-def _psnr_apart(folder: Path, device: torch.device, products: Products) -> float:
+def _psnr_apart(folder: Path, device: torch.device, matmul_precision: MatmulPrecision) -> float:
     views = [ball_scene().pixels.view(view).float() / 255.0 for view in HELD_OUT]
-    pictures = _pictures(folder, device, products)
+    pictures = _pictures(folder, device, matmul_precision)
     errors = [(seen - v[..., :3] * v[..., 3:]).square().mean() for seen, v in zip(pictures, views, strict=True)]
     measured = json.loads((folder / "whole" / "metrics.json").read_text())["psnr"]
     return abs(sum(float(psnr(error)) for error in errors) / len(errors) - measured)
 
 
-def _frames_apart(folder: Path, device: torch.device, products: Products) -> float:
+def _frames_apart(folder: Path, device: torch.device, matmul_precision: MatmulPrecision) -> float:
     files = sorted((folder / "film" / "video").glob("*.png"))
     if len(files) != len(HELD_OUT):
         raise ValueError(f"{len(files)} frames were written, and {len(HELD_OUT)} were asked for")
     written = torch.stack([torch.from_numpy(read_rgba(file)[..., :3].copy()).float() for file in files])
-    seen = torch.stack(_pictures(folder, device, products))
+    seen = torch.stack(_pictures(folder, device, matmul_precision))
     return float((255.0 * seen.clamp(0, 1) - written).abs().max())

@@ -19,7 +19,7 @@ from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
 from nerf_lightning.nerf.kernels.packed.integrate import integrate
 from nerf_lightning.nerf.kernels.packed.reference import integrate_torch
-from nerf_lightning.nerf.products import TILE_ROWS, Products
+from nerf_lightning.nerf.matmul_precision import TILE_ROWS, MatmulPrecision
 from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
 from nerf_lightning.selftest.check import UNIT, CannotRun, Check, gradient_bound, norm_apart, relative, value_bound
 
@@ -30,7 +30,7 @@ HASH_GRID_SUMS = {"features": 16, "gradient of the table": 64, "gradient of the 
 BOUNDS = {"value": value_bound, "gradients": gradient_bound}
 
 
-def checks(device: torch.device, precisions: Sequence[Products]) -> list[Check]:
+def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[Check]:
     """Return the checks of the kernels that this device uses: each compiles, and the large ones agree with torch.
 
     The others (Adam, carving, search, where rays become opaque) are part of the trainings that `training` compares.
@@ -49,10 +49,15 @@ def checks(device: torch.device, precisions: Sequence[Products]) -> list[Check]:
     for what in BOUNDS:
         compare = partial(_packed, device, what)
         found.append(Check(f"packed samples: {what}", 8 * PACKED_SAMPLES * ROUNDING, sums, compare))
-    for products in precisions:
+    for matmul_precision in precisions:
         for what, bound in BOUNDS.items():
-            compare, because = partial(_mlp, device, products, what), f"{LAYERS} layers of {products} products"
-            found.append(Check(f"perceptron, {products}: {what}", bound(products, LAYERS), because, compare))
+            compare, because = (
+                partial(_mlp, device, matmul_precision, what),
+                f"{LAYERS} layers of {matmul_precision} products",
+            )
+            found.append(
+                Check(f"perceptron, {matmul_precision}: {what}", bound(matmul_precision, LAYERS), because, compare)
+            )
     return found
 
 
@@ -139,12 +144,12 @@ def _packed(device: torch.device, what: str) -> float:
     return _largest([relative(*pair) for pair in zip(found[what], expected[what], strict=True)])
 
 
-def _mlp(device: torch.device, products: Products, what: str) -> float:
+def _mlp(device: torch.device, matmul_precision: MatmulPrecision, what: str) -> float:
     """Return how far the value or the gradients are off, over their norms."""
     random = _generator()
     points = torch.randn(2 * TILE_ROWS + 17, MLP_SIZES[0], generator=random)
     weights = [torch.randn(b, a, generator=random) / (a / 2) ** 0.5 for a, b in pairwise(MLP_SIZES)]
     given = [points, *weights]
-    found = _results(lambda p, *w: [mlp(p, list(w), products)], [each.to(device) for each in given])
+    found = _results(lambda p, *w: [mlp(p, list(w), matmul_precision)], [each.to(device) for each in given])
     expected = _results(lambda p, *w: [mlp_torch(p, list(w))], [each.double() for each in given])
     return _largest([norm_apart(*pair) for pair in zip(found[what], expected[what], strict=True)])

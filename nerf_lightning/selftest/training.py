@@ -12,7 +12,7 @@ from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
 from nerf_lightning.nerf.kernels.backends import CPU_TWINS, can_compile, without
-from nerf_lightning.nerf.products import Products
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart
 from nerf_lightning.selftest.scene import ball_scene
@@ -37,11 +37,11 @@ METHODS = {
 }
 """The settings that make models of conf/model small."""
 LAYERS = 6
-"""Products of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
+"""MatmulPrecision of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
 # Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
 # 0.5 to 0.75 dB. What rounding does to a run must be less than that: all of 0.5 dB where products have 8 bits, half
 # where they have 11, and a tenth where only the order of sums differs.
-PSNR_APART: dict[Products, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 0.5}
+PSNR_APART: dict[MatmulPrecision, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 0.5}
 LEARNT = 1e4
 """Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
 CPU = torch.device("cpu")
@@ -50,13 +50,13 @@ CPU = torch.device("cpu")
 class Training:
     """A training in the making."""
 
-    def __init__(self, method: str, device: torch.device, products: Products, tile_points: int | None):
+    def __init__(self, method: str, device: torch.device, matmul_precision: MatmulPrecision, tile_points: int | None):
         scene, progress = ball_scene(), Progress()
         config, _ = compose_config("train", [f"model={method}", f"seed={SEED}", *METHODS[method]])
         settings = TrainerSettings(max_steps=STEPS, accelerator="cpu", precision="32-true", tile_points=tile_points)
         self.step = build_step(config, settings, scene, progress).to(device)
         self.step.num_steps = STEPS
-        self.step.model.multiply_in(products)
+        self.step.model.set_precision(matmul_precision)
         self.loader = RayBatches(on_device(scene, device), progress, SEED, BATCH_RAYS)
         self.held_out = FixedRays(scene, "val", 10**6, 400)
         self.optimizer = self.step.new_optimizer()
@@ -85,24 +85,24 @@ class Training:
         return errors.summary()["val/psnr"]
 
 
-def checks(device: torch.device, precisions: Sequence[Products], compiles: bool) -> list[Check]:
+def checks(device: torch.device, precisions: Sequence[MatmulPrecision], compiles: bool) -> list[Check]:
     """Return the checks of gradients and of whole trainings; `compiles`: torch.compile is tried, too."""
     found = []
     for method in METHODS:
-        for products in precisions:
-            name = f"{method}, {products}"
+        for matmul_precision in precisions:
+            name = f"{method}, {matmul_precision}"
             found += [
                 Check(
                     f"{name}: gradients of a batch",
-                    gradient_bound(products, LAYERS),
-                    f"{LAYERS} layers of {products} products, and ReLUs within rounding of zero, which switch",
-                    partial(_gradients, method, device, products),
+                    gradient_bound(matmul_precision, LAYERS),
+                    f"{LAYERS} layers of {matmul_precision} products, and ReLUs within rounding of zero, which switch",
+                    partial(_gradients, method, device, matmul_precision),
                 ),
                 Check(
                     f"{name}: PSNR after {STEPS} steps, dB",
-                    PSNR_APART[products],
+                    PSNR_APART[matmul_precision],
                     "rounding moves a training less than another seed does, whose standard deviation is 0.5 dB",
-                    partial(_psnr, method, device, products),
+                    partial(_psnr, method, device, matmul_precision),
                 ),
             ]
     bound = gradient_bound("float32", LAYERS)
@@ -132,12 +132,14 @@ def gradients_apart(found: dict[str, Tensor], expected: dict[str, Tensor]) -> fl
     return norm_apart(ours, theirs)
 
 
-def _gradients(method: str, device: torch.device, products: Products) -> float:
-    return gradients_apart(Training(method, device, products, TILE_POINTS).gradients(), reference_gradients(method))
+def _gradients(method: str, device: torch.device, matmul_precision: MatmulPrecision) -> float:
+    return gradients_apart(
+        Training(method, device, matmul_precision, TILE_POINTS).gradients(), reference_gradients(method)
+    )
 
 
-def _psnr(method: str, device: torch.device, products: Products) -> float:
-    return abs(Training(method, device, products, TILE_POINTS).psnr() - reference_psnr(method))
+def _psnr(method: str, device: torch.device, matmul_precision: MatmulPrecision) -> float:
+    return abs(Training(method, device, matmul_precision, TILE_POINTS).psnr() - reference_psnr(method))
 
 
 def _compiled(device: torch.device, compiles: bool) -> float:

@@ -7,7 +7,7 @@ from support.scenes import tiny_model
 from nerf_lightning.compute import devices
 from nerf_lightning.compute import settings as compute_settings
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.products import Linear
+from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
@@ -88,10 +88,10 @@ def test_what_a_run_measured_is_kept_but_does_not_overrule():
 
 
 @pytest.mark.parametrize(("precision", "products"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
-def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, products):
+def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_precision):
     model = TrainerSettings(accelerator="cpu", precision=precision).prepare(tiny_model())
     layers = [module for module in model.modules() if isinstance(module, Linear)]
-    assert {layer.products for layer in layers} == {products}
+    assert {layer.matmul_precision for layer in layers} == {matmul_precision}
     assert len(layers) == 2 * 5  # three of the trunk, the feature, the colour's hidden one
     assert {parameter.dtype for parameter in model.parameters()} == {torch.float32}
 

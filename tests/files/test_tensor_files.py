@@ -93,6 +93,6 @@ def test_what_stands_before_an_archive_is_refused(tmp_path):
 
 def test_lists_in_lists_without_end_are_refused(tmp_path):
     path = write_checkpoint(tmp_path / "a.ckpt")
-    for contracted_spacing in (b"]" * 20_000 + b"a" * 19_999, b"]q\x00h\x00a"):
-        replace_pickle(path, b"\x80\x02" + contracted_spacing + b".")
+    for endless_pickle in (b"]" * 20_000 + b"a" * 19_999, b"]q\x00h\x00a"):
+        replace_pickle(path, b"\x80\x02" + endless_pickle + b".")
         refused(read_checkpoint, path, parts=("a.ckpt",))

@@ -16,8 +16,8 @@ PRODUCTS = ("float32", "tf32", "bfloat16")
 
 
 def checks(device):
-    products = PRODUCTS if device == "cuda" else ("float32", "bfloat16")
-    return {check.name: check for check in kernels.checks(torch.device(device), products)}
+    matmul_precision = PRODUCTS if device == "cuda" else ("float32", "bfloat16")
+    return {check.name: check for check in kernels.checks(torch.device(device), matmul_precision)}
 
 
 @pytest.mark.parametrize("name", checks("cuda"))

@@ -42,9 +42,9 @@ def test_every_model_follows_the_cpu(model, device):
 
 @pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_precision_learns_what_the_cpu_learns(method, products, device):
-    chosen = training.checks(device, (products,), compiles=False)
-    rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {products}: ")]
+def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, device):
+    chosen = training.checks(device, (matmul_precision,), compiles=False)
+    rows = [carried_out(check) for check in chosen if check.name.startswith(f"{method}, {matmul_precision}: ")]
     assert [row.outcome for row in rows] == ["ok", "ok"], rows
 
 
@@ -65,7 +65,7 @@ def test_replayed_steps_learn_what_steps_learn(model, cuda):
 
 
 def test_tf32_is_really_used_and_float32_is_not_lowered(cuda):
-    from nerf_lightning.nerf.products import linear
+    from nerf_lightning.nerf.matmul_precision import linear
 
     features, weight = torch.randn(512, 512, device=cuda), torch.randn(512, 512, device=cuda)
     exact = features.double() @ weight.double().t()

@@ -244,7 +244,7 @@ def require_same_bits(name: str, call: Any) -> None:
         assert alone.dtype == within.dtype, f"{name}: autocast around it changes the dtype. Mark it @disable_autocast."
         same = (alone == within) | (alone != alone) & (within != within)
         assert bool(same.all()), (
-            f"{name}: autocast around it changes the result. Mark it @disable_autocast (products.py)."
+            f"{name}: autocast around it changes the result. Mark it @disable_autocast (matmul_precision.py)."
         )
 
 

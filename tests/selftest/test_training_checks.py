@@ -10,7 +10,7 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.adam import cpu as adam_cpu
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
-from nerf_lightning.nerf.products import Linear
+from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.training import METHODS
@@ -21,7 +21,10 @@ PSNR = f"PSNR after {training.STEPS} steps, dB"
 
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients_of_every_kind_of_model_are_right(method):
-    rows = [carried_out(CHECKS[f"{method}, {products}: gradients of a batch"]) for products in ("float32", "bfloat16")]
+    rows = [
+        carried_out(CHECKS[f"{method}, {matmul_precision}: gradients of a batch"])
+        for matmul_precision in ("float32", "bfloat16")
+    ]
     assert [row.outcome for row in rows] == ["ok", "ok"]
     assert 0 < rows[0].difference < 1e-5
     assert rows[1].difference > 1e-3

@@ -55,7 +55,7 @@ def step_by_step(
     for level in training.model.modules():
         if isinstance(level, PackedLevel):
             level.sampler.opaque_below = CUT
-    training.model.multiply_in(PRODUCTS[precision])
+    training.model.set_precision(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)
     return StepByStep(training, training.new_optimizer(), RayBatches(here, progress, 0, config.data.batch_rays))
 

@@ -7,8 +7,8 @@ from support.scenes import ball_scene
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
+from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 needs_bfloat16 = pytest.mark.skipif(
@@ -16,7 +16,7 @@ needs_bfloat16 = pytest.mark.skipif(
 )
 
 
-def a_level(opaque_below=0.0, width=32, features=4, products="float32", **settings):
+def a_level(opaque_below=0.0, width=32, features=4, matmul_precision="float32", **settings):
     torch.manual_seed(1)
     grid = HashGridEncoder(num_levels=16 // features, features_per_level=features, log2_table_size=8, max_resolution=32)
     torch.nn.init.uniform_(grid.table, -1.0, 1.0)
@@ -24,6 +24,6 @@ def a_level(opaque_below=0.0, width=32, features=4, products="float32", **settin
     sampler = OccupancySampler(resolution=32, num_steps=100, opaque_below=opaque_below)
     level = PackedLevel(sampler, field)
     level.fit_to(ball_scene(num_views=12))
-    field.multiply_in(products)
+    field.set_precision(matmul_precision)
     sampler.grid.occupy(torch.rand(sampler.grid.cells.shape) < 0.05)
     return level

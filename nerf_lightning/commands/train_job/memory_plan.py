@@ -11,7 +11,7 @@ from nerf_lightning.data.pixels.placement import GIGABYTE, num_bytes
 from nerf_lightning.nerf.bands import BAND_PIXELS
 from nerf_lightning.nerf.encoders.base import matrices_of
 from nerf_lightning.nerf.kernels.threads import threads_on
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
 

@@ -116,7 +116,7 @@ class HybridEncoder(ConeEncoder):
         missing = -first.shape[1] % VECTOR
         inputs = torch.cat([*seen, fine.new_zeros(*fine.shape[:-1], missing)], dim=-1)
         weights = [functional.pad(first, (0, missing)), *others]
-        raw = mlp(inputs.reshape(-1, inputs.shape[-1]), weights, self.products)
+        raw = mlp(inputs.reshape(-1, inputs.shape[-1]), weights, self.matmul_precision)
         return torch.tanh(raw.to(fine.dtype)).view(*fine.shape[:-1], raw.shape[-1])
 
     def _encoded_cone(self, covariance: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerf_lightning.nerf.products import Linear, disable_autocast
+from nerf_lightning.nerf.matmul_precision import Linear, disable_autocast
 
 NARROWER = 8
 """The weights of views come out of a layer so many times narrower than the states."""

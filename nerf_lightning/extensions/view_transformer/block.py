@@ -8,7 +8,7 @@ from nerf_lightning.extensions.view_transformer.attention import FeedForward, Ra
 from nerf_lightning.extensions.view_transformer.experts import Experts, Gates
 from nerf_lightning.extensions.view_transformer.views import Views
 from nerf_lightning.nerf.encoders.frequency import FrequencyEncoder
-from nerf_lightning.nerf.products import Linear
+from nerf_lightning.nerf.matmul_precision import Linear
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.rays import RayBundle
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerf_lightning.extensions.view_transformer.attention import FeedForward
-from nerf_lightning.nerf.products import Linear, disable_autocast
+from nerf_lightning.nerf.matmul_precision import Linear, disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 

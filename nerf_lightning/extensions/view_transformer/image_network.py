@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.products import disable_autocast
 
 ImageNorm = Literal["none", "instance", "neurn"]
 PATCH = 3

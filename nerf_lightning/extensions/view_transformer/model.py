@@ -17,8 +17,8 @@ from nerf_lightning.extensions.view_transformer.source_views import SourceViews,
 from nerf_lightning.extensions.view_transformer.view_tables import ViewTables
 from nerf_lightning.extensions.view_transformer.views import BlendedColor, Largest, PooledColor, Spread, Views
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.matmul_precision import Linear, MatmulPrecision
 from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import DenseSampler
@@ -215,11 +215,11 @@ class ViewTransformer(Model):
     def fit_to(self, scene: Scene) -> None:
         """Nothing of a scene is kept: any may follow."""
 
-    def multiply_in(self, products: Products) -> None:
+    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the transformer's weights; the image network is float32 always."""
         for module in self.modules():
             if isinstance(module, Linear):
-                module.products = products
+                module.matmul_precision = matmul_precision
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct

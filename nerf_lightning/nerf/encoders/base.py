@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.products import Products
 
 
 class Encoder(Part, ABC):
@@ -16,7 +16,7 @@ class Encoder(Part, ABC):
     in_dim: int = 3
     needs_unit_cube: bool = False
     """True where points outside of the unit cube mean nothing; the field must map its positions there."""
-    products: Products = "float32"
+    matmul_precision: MatmulPrecision = "float32"
     """The precision of the products with the encoder's matrices, where it has any; its field sets it."""
 
     @property

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from nerf_lightning.nerf.encoders.base import Encoder
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.matmul_precision import Linear, MatmulPrecision
 from nerf_lightning.nerf.part import Part
-from nerf_lightning.nerf.products import Linear, Products
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.nerf.types.scene import Scene
@@ -37,15 +37,15 @@ class Field(Part, ABC):
     compiles: bool = True
     """False where kernels of our own do most of the work, which torch.compile cannot see into."""
 
-    products: Products = "float32"
-    """The precision of the products with the field's weights, and of nothing else: layers are `products.Linear`, and
+    matmul_precision: MatmulPrecision = "float32"
+    """The precision of the products with the field's weights, and of nothing else: layers are `matmul_precision.Linear`, and
     kernels are given this. A field that does neither multiplies in float32 everywhere, which is slow and right."""
 
-    def multiply_in(self, products: Products) -> None:
+    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""
         for module in self.modules():
             if isinstance(module, Linear | Field | Encoder):
-                module.products = products
+                module.matmul_precision = matmul_precision
 
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""

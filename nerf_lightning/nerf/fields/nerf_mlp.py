@@ -11,7 +11,7 @@ from nerf_lightning.nerf.encoders.base import Encoder, require_direction_encoder
 from nerf_lightning.nerf.fields.base import Field, HiddenLayer
 from nerf_lightning.nerf.geometry.boxes import require_box
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
-from nerf_lightning.nerf.products import Linear, linear
+from nerf_lightning.nerf.matmul_precision import Linear, linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput

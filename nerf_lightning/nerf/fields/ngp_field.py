@@ -17,7 +17,7 @@ from nerf_lightning.nerf.geometry.cones import contracted_covariance, scaled_cov
 from nerf_lightning.nerf.geometry.contraction import Contracted, contract, in_unit_ball
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.products import linear
+from nerf_lightning.nerf.matmul_precision import linear
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.renderings import FieldOutput
@@ -185,7 +185,7 @@ class NGPField(Field):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _through(self, weights: nn.ParameterList, features: Tensor) -> Tensor:
-        out = mlp(features.flatten(0, -2), list(weights), self.products)
+        out = mlp(features.flatten(0, -2), list(weights), self.matmul_precision)
         return out.view(*features.shape[:-1], out.shape[-1])
 
     def _encoded(self, points: Points, known: Tensor | None) -> Tensor:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.frames import poses_from_user, similarity
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 LEAST_SPREAD = 1e-6
 """Of the cameras' centres, as a share of their distance from the origin; below it they stand in one place."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cones import pixel_side
 from nerf_lightning.nerf.geometry.lenses import project_plane, unproject
 from nerf_lightning.nerf.geometry.ndc import ndc_rays
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Cameras
 

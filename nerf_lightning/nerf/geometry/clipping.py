@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
 from nerf_lightning.nerf.geometry.ndc import share_at_distance
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.rays import RayBundle
 
 # Farther than any light that a finite number of samples tells from infinity.

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 
 @disable_autocast

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.subpixels import Subpixels
-from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.photographs import Photographs
 from nerf_lightning.nerf.types.points import Points
@@ -86,7 +86,7 @@ class Model(nn.Module, ABC):
         """Draw every parameter anew from torch's generator, and forget what was learnt otherwise."""
 
     @abstractmethod
-    def multiply_in(self, products: Products) -> None:
+    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the fields' weights; everything else is float32 always."""
 
     def set_returns_weights(self, wanted: bool) -> None:

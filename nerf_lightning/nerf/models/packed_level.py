@@ -55,7 +55,9 @@ class PackedLevel(Level):
 
     def takes_whole_rays(self, rays: RayBundle) -> bool:
         """Return whether training renders rays in one kernel, where cameras are not learnt."""
-        return self._trains_whole(rays) and has_kernel(self.field.parts(), self.field.products, rays.near.device, True)
+        return self._trains_whole(rays) and has_kernel(
+            self.field.parts(), self.field.matmul_precision, rays.near.device, True
+        )
 
     def _trains_whole(self, rays: RayBundle) -> bool:
         # The kernel keeps no weights and knows no gradients of rays; off the CPU the field's parts would be read.
@@ -68,14 +70,14 @@ class PackedLevel(Level):
     ) -> Rendering | None:
         if not (evaluates or self._trains_whole(rays)):
             return None
-        parts, products, sampler = self.field.parts(), self.field.products, self.sampler
-        if parts is None or not has_kernel(parts, products, rays.near.device, not evaluates):
+        parts, matmul_precision, sampler = self.field.parts(), self.field.matmul_precision, self.sampler
+        if parts is None or not has_kernel(parts, matmul_precision, rays.near.device, not evaluates):
             return None
         march = sampler.marcher(rays).grid_march() if evaluates else sampler.grid_march(rays, random)
         if march is None:
             return None
         expected = None if evaluates else self.points_per_ray(1.0, training=True)
-        found = render_whole_rays(rays, parts, march, products, sampler.opaque_below, LEAST_ALPHA, expected)
+        found = render_whole_rays(rays, parts, march, matmul_precision, sampler.opaque_below, LEAST_ALPHA, expected)
         if not evaluates:
             self.counter.add(torch.tensor(found.samples), rays.near.shape[0], torch.tensor(0))
         return Rendering.from_light(rays, background, found.rgb, 1.0 - found.opacity, found.depth)

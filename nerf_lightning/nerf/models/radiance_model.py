@@ -6,10 +6,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf_lightning.nerf.geometry.contraction import Contracted
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.base import PointField, norm_of_gradients
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.subpixels import Subpixels
-from nerf_lightning.nerf.products import Products
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.rays import RayBundle
@@ -112,10 +112,10 @@ class RadianceModel(PointField):
         """Return the buffers of all levels that hold means over rays."""
         return [measured for level in self._in_order() for measured in level.measurements()]
 
-    def multiply_in(self, products: Products) -> None:
+    def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the fields' weights; everything else is float32 always."""
         for level in self._in_order():
-            level.field.multiply_in(products)
+            level.field.set_precision(matmul_precision)
 
     def compile_fields(self) -> list[str]:
         """Compile the fields of levels with static shapes (torch.compile), and return the levels' names."""

@@ -11,8 +11,8 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import which_camera
 from nerf_lightning.nerf.geometry.lenses import with_coefficients
 from nerf_lightning.nerf.geometry.poses import rotation_from_vector
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.part import StepContext
-from nerf_lightning.nerf.products import disable_autocast
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.scene import Cameras, Scene

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.frames import gaps_around
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, horizontal
 from nerf_lightning.video.paths.orbit import Orbit

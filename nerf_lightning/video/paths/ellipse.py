@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.frames import focus_point
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
 

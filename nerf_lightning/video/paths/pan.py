@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import look_at
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.photograph_path import find_views

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
-from nerf_lightning.nerf.products import disable_autocast
+from nerf_lightning.nerf.matmul_precision import disable_autocast
 
 # The shortest leg as a share of the mean one: keys that coincide are a pause.
 SHORTEST_LEG = 1e-2

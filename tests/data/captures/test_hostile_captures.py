@@ -185,7 +185,7 @@ def test_the_passes_of_a_jpeg_are_counted():
     assert jpeg_scans(b"\xff\xd8\xff\xda") == 1
 
 
-def contracted_spacing(hidden=b""):
+def endless_jpeg(hidden=b""):
     """Return a JPEG of 110 passes, each but the first behind `hidden`."""
     sound = jpeg(progressive=True)
     last = sound.rfind(b"\xff\xda")
@@ -195,13 +195,13 @@ def contracted_spacing(hidden=b""):
 # TEM, RST1 and, to decoders, all below SOF0 have no length: two bytes of 255 behind them skip nothing.
 @pytest.mark.parametrize("marker", [0x01, 0xD1, 0x02, 0xBF])
 def test_passes_behind_markers_without_a_length_are_counted(marker):
-    assert jpeg_scans(contracted_spacing(bytes([0xFF, marker, 0xFF]))) == 10 + MOST_SCANS
+    assert jpeg_scans(endless_jpeg(bytes([0xFF, marker, 0xFF]))) == 10 + MOST_SCANS
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "MPO"])
 def test_a_jpeg_that_goes_over_its_pixels_without_end(tmp_path, kind):
     """A pass can be a few bytes and takes a tenth of a second where the picture is large."""
-    content = contracted_spacing()
+    content = endless_jpeg()
     if kind == "MPO":
         made = io.BytesIO()
         Image.new("RGB", (64, 64)).save(made, "MPO", save_all=True, append_images=[Image.new("RGB", (64, 64))])

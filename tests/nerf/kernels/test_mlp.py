@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
-from nerf_lightning.nerf.products import TILE_ROWS as TILE
+from nerf_lightning.nerf.matmul_precision import TILE_ROWS as TILE
 
 
 def weights(*sizes):

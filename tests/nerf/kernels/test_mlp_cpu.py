@@ -11,7 +11,7 @@ import torch
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
-from nerf_lightning.nerf.products import TILE_ROWS, cpu_multiplies_bfloat16
+from nerf_lightning.nerf.matmul_precision import TILE_ROWS, cpu_multiplies_bfloat16
 
 needs_bfloat16 = pytest.mark.skipif(
     not cpu_multiplies_bfloat16(), reason="this CPU, as far as torch may use it, does not multiply bfloat16 itself"
@@ -121,8 +121,8 @@ def test_gradients_of_the_points_are_left_out_where_nobody_asks(kernels, dtype):
 def test_other_widths_take_the_other_way(monkeypatch, kernels, dtype):
     points, weights = given((27, 64, 3), 500, torch.float32)
     monkeypatch.setattr(kernels, "_forward", lambda *arguments: pytest.fail("not this way"))
-    products = "bfloat16" if dtype == torch.bfloat16 else "float32"
-    assert far_apart(mlp(points, weights, products), mlp_torch(points, weights).double()) < 2e-2
+    matmul_precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
+    assert far_apart(mlp(points, weights, matmul_precision), mlp_torch(points, weights).double()) < 2e-2
 
 
 @pytest.mark.skipif(

@@ -34,9 +34,9 @@ def far_apart(found, expected):
 @pytest.mark.parametrize(("features", "color_layers"), [(2, 1), (4, 2)])
 @pytest.mark.parametrize(("opaque_below", "bias"), [(0.0, 1.0), (1e-3, 4.0)])
 def test_it_sees_and_learns_what_the_single_kernels_do(
-    jitter, products, most, features, color_layers, opaque_below, bias
+    jitter, matmul_precision, most, features, color_layers, opaque_below, bias
 ):
-    level = a_level(opaque_below, 32, features, products, density_bias=bias, color_layers=color_layers)
+    level = a_level(opaque_below, 32, features, matmul_precision, density_bias=bias, color_layers=color_layers)
     level.returns_weights = False
     rays, random = some_rays(700), batch_random(3, 700) if jitter else None
     weight, background = torch.randn(700, 8), torch.rand(700, 3)

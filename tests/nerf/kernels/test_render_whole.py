@@ -8,8 +8,8 @@ from support.scenes import some_rays
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
+from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.part import StepContext
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.rendering.sample_points import packed_points
 
 
@@ -22,8 +22,8 @@ def rendered(level, rays, background=None):
 @pytest.mark.parametrize("features", [2, 4])
 @pytest.mark.parametrize("opaque_below", [0.0, 0.05])
 @pytest.mark.parametrize("bias", [1.0, 4.0])
-def test_it_sees_what_rounds_see(products, features, opaque_below, bias):
-    level = a_level(opaque_below, features=features, products=products, density_bias=bias)
+def test_it_sees_what_rounds_see(matmul_precision, features, opaque_below, bias):
+    level = a_level(opaque_below, features=features, matmul_precision=matmul_precision, density_bias=bias)
     rays = some_rays(700)
     background = torch.rand(700, 3)
     whole = rendered(level, rays, background)

@@ -39,7 +39,7 @@ def trained(name, scene):
         model, rays_of(scene), loss, build(config.optimizer), build(config.scheduler), progress, 2, background_of(name),
         TILE_POINTS, num_steps=steps,
     )  # fmt: skip
-    model.multiply_in("bfloat16")
+    model.set_precision("bfloat16")
     batches, optimizer = RayBatches(scene, progress, 0, rays), step.new_optimizer()
     for _ in range(steps):
         step(batches.at(0, progress.rays_seen), optimizer)
@@ -62,15 +62,15 @@ def test_weights_see_the_same_in_both_precisions(name):
     *_, side = LESS.get(name, (STEPS, RAYS, SIDE))
     scene = ball_scene(num_views=24 if name in LOOKING else 4, size=side)
     model, found = trained(name, scene), {}
-    for products in ("float32", "bfloat16"):
-        model.multiply_in(products)
+    for matmul_precision in ("float32", "bfloat16"):
+        model.set_precision(matmul_precision)
         measured = []
         for view in SEEN_FROM:
             picture = render_picture(model, rays_of(scene), view, "white", TILE_POINTS)
             measured.append(image_metrics(picture.rgb, photograph(scene, view, "white")))
         # Of several views, as evaluations are: the coarse level moves the fine one's samples a little, and a field
         # that is half trained shows each move.
-        found[products] = mean_over_images(measured)
+        found[matmul_precision] = mean_over_images(measured)
     assert abs(found["float32"]["psnr"] - found["bfloat16"]["psnr"]) < 0.05
     assert abs(found["float32"]["ssim"] - found["bfloat16"]["ssim"]) < 0.001
     assert found["float32"] != found["bfloat16"]  # they were computed differently

@@ -55,5 +55,5 @@ class VoxelModel(PointField):
     def reset_parameters(self):
         nn.init.normal_(self.grid, std=0.1)
 
-    def multiply_in(self, products):
+    def set_precision(self, matmul_precision):
         pass

@@ -10,7 +10,7 @@ from nerf_lightning.compute.devices import working_device
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.products import cpu_multiplies_bfloat16
+from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 
 CHOSEN = ("cuda", "Old GPU, found")
 

@@ -6,7 +6,7 @@ from support.scenes import tiny_model
 from support.static_models import fast_model
 
 from nerf_lightning.compute import devices
-from nerf_lightning.nerf import products
+from nerf_lightning.nerf import matmul_precision
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 
@@ -18,7 +18,7 @@ def slow_bfloat16(monkeypatch):
 
 
 def products_of(model):
-    return {level.field.products for level in model.levels.values()}
+    return {level.field.matmul_precision for level in model.levels.values()}
 
 
 def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower(slow_bfloat16):
@@ -48,17 +48,17 @@ def test_what_was_asked_for_or_begun_stays(slow_bfloat16, monkeypatch):
     ],
 )
 def test_who_gains_by_bfloat16(name, native, amx, gains, monkeypatch):
-    monkeypatch.setattr(products, "cpu_multiplies_bfloat16", lambda: native)
+    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: native)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": name}, raising=False)
-    assert products.cpu_gains_by_bfloat16.__wrapped__() == gains
+    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__() == gains
 
 
 def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch):
-    monkeypatch.setattr(products, "cpu_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: True)
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    assert products.cpu_gains_by_bfloat16.__wrapped__()
+    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__()
 
 
 @pytest.mark.parametrize(("native", "used"), [(False, "32-true"), (True, "bf16-mixed")])

@@ -14,16 +14,16 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin, is_on
 from nerf_lightning.nerf.kernels.mlp import tiles
-from nerf_lightning.nerf.products import Products, linear
+from nerf_lightning.nerf.matmul_precision import MatmulPrecision, linear
 
 
 def mlp(
-    points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
+    points: Float[Tensor, "points in"], weights: list[Tensor], matmul_precision: MatmulPrecision = "float32"
 ) -> Float[Tensor, "points out"]:
     """Return W_n relu(... relu(W_1 x)); each weight has shape (out, in). Gradients of weights are float32."""
-    found = _kernels_for(points, weights, products)
+    found = _kernels_for(points, weights, matmul_precision)
     if found is None:
-        return mlp_torch(points, weights, products)
+        return mlp_torch(points, weights, matmul_precision)
     kernels, dtype = found
     if torch.is_grad_enabled() and any(x.requires_grad for x in (points, *weights)):
         return _TiledMLP.apply(points, kernels, dtype, *weights)
@@ -31,26 +31,31 @@ def mlp(
 
 
 def mlp_torch(
-    points: Float[Tensor, "points in"], weights: list[Tensor], products: Products = "float32"
+    points: Float[Tensor, "points in"], weights: list[Tensor], matmul_precision: MatmulPrecision = "float32"
 ) -> Float[Tensor, "points out"]:
     """Return the same in plain torch: the reference, and what runs where there are no kernels."""
     for weight in weights[:-1]:
-        points = linear(points, weight, None, products).relu_()
-    return linear(points, weights[-1], None, products)
+        points = linear(points, weight, None, matmul_precision).relu_()
+    return linear(points, weights[-1], None, matmul_precision)
 
 
-def _kernels_for(points: Tensor, weights: list[Tensor], products: Products) -> tuple[ModuleType, torch.dtype] | None:
+def _kernels_for(
+    points: Tensor, weights: list[Tensor], matmul_precision: MatmulPrecision
+) -> tuple[ModuleType, torch.dtype] | None:
     """Return the device's kernels, and what they take the weights in."""
     if points.dtype == torch.float64:
         return None
     if points.is_cuda:
-        kernels = cuda_twin("mlp.cuda", points.device) if products == "bfloat16" else None
+        kernels = cuda_twin("mlp.cuda", points.device) if matmul_precision == "bfloat16" else None
         sizes = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
         takes = kernels is not None and kernels.takes(sizes, points.device)
         return (kernels, torch.float32) if kernels is not None and takes else None  # it rounds by itself
     if not points.is_cpu or not is_on("mlp.cpu"):
         return None
-    kernels, dtype = cpu_twin("mlp.cpu", points.device), torch.bfloat16 if products == "bfloat16" else points.dtype
+    kernels, dtype = (
+        cpu_twin("mlp.cpu", points.device),
+        torch.bfloat16 if matmul_precision == "bfloat16" else points.dtype,
+    )
     return (kernels if kernels is not None and kernels.takes(weights, dtype) else tiles), dtype
 
 

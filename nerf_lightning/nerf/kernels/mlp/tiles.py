@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.threads import in_parallel
-from nerf_lightning.nerf.products import TILE_ROWS, disable_autocast, multiply, pad_rows, tiles_of_rows
+from nerf_lightning.nerf.matmul_precision import TILE_ROWS, disable_autocast, multiply, pad_rows, tiles_of_rows
 
 relu_backward_ = functools.partial(torch.ops.aten.threshold_backward.grad_input, threshold=0)
 

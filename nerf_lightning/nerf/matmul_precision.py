@@ -2,7 +2,7 @@
 
 torch lowers every float32 product inside `torch.autocast`, and on NVIDIA GPUs wherever TensorFloat-32 is allowed. A
 pose that is multiplied in bfloat16 is wrong by half a percent. So this program opens neither: a field is given the
-precision of the products with its weights (`Field.multiply_in`), and every other function that multiplies matrices is
+precision of the products with its weights (`Field.set_precision`), and every other function that multiplies matrices is
 marked `disable_autocast`, which holds even where somebody else has opened autocast around it.
 """
 
@@ -23,7 +23,7 @@ TILE_ROWS = 4096
 """At a width of 64 the activations of a tile take about a core's second-level cache."""
 ROUND_ROWS, FEWEST_ROWS = 512, 64
 AUTOCAST_DEVICES = ("cpu", "cuda", "mps", "xla")
-Products = Literal["float32", "tf32", "bfloat16"]
+MatmulPrecision = Literal["float32", "tf32", "bfloat16"]
 """What the factors of a product are rounded to: not at all, to 10 bits of mantissa, to 7. Sums are float32."""
 
 
@@ -54,16 +54,16 @@ def linear(
     features: Float[Tensor, "*points inputs"],
     weight: Float[Tensor, "outputs inputs"],
     bias: Float[Tensor, "outputs"] | None,
-    products: Products,
+    matmul_precision: MatmulPrecision,
 ) -> Float[Tensor, "*points outputs"]:
     """Return features W^T + b: with bfloat16 products in bfloat16, which halves the traffic, else in float32."""
-    if products == "bfloat16":
+    if matmul_precision == "bfloat16":
         if features.is_cpu and not torch.compiler.is_compiling():
             return _LinearInTiles.apply(features, weight, bias)
         lowered = None if bias is None else bias.bfloat16()
         return functional.linear(features.bfloat16(), weight.bfloat16(), lowered)
     features = features.to(weight.dtype)  # an earlier layer may have lowered them
-    if products == "float32":
+    if matmul_precision == "float32":
         return functional.linear(features, weight, bias)
     out = _tf32_product(features, weight.t())
     return out if bias is None else out + bias
@@ -72,11 +72,11 @@ def linear(
 class Linear(nn.Linear):
     """torch's linear layer, whose product has a precision of its own."""
 
-    products: Products = "float32"
+    matmul_precision: MatmulPrecision = "float32"
 
     def forward(self, features: Float[Tensor, "*points inputs"]) -> Float[Tensor, "*points outputs"]:
         """Return features W^T + b."""
-        return linear(features, self.weight, self.bias, self.products)
+        return linear(features, self.weight, self.bias, self.matmul_precision)
 
 
 class _LinearInTiles(torch.autograd.Function):

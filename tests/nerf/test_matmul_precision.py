@@ -9,8 +9,8 @@ import torch
 from support.running import start_code
 from torch.nn import functional
 
-from nerf_lightning.nerf import products
-from nerf_lightning.nerf.products import ROUND_ROWS, TILE_ROWS, disable_autocast, linear, pad_rows
+from nerf_lightning.nerf import matmul_precision
+from nerf_lightning.nerf.matmul_precision import ROUND_ROWS, TILE_ROWS, disable_autocast, linear, pad_rows
 
 # A factor that is rounded to bfloat16 (7 bits behind the leading one) is wrong by 2^-8 of itself at most; a product of
 # two, summed over many terms of either sign, by less than twice that of the sum's own size.
@@ -55,8 +55,8 @@ def test_bfloat16_is_the_exact_product_up_to_its_rounding(shape, bias):
 def test_a_cpu_without_bfloat16_rounds_where_one_with_it_does(monkeypatch):
     features, (weight, bias) = torch.randn(300, 48), layer()
     results = []
-    for native in (products.cpu_multiplies_bfloat16(), False):
-        monkeypatch.setattr(products, "cpu_multiplies_bfloat16", lambda native=native: native)
+    for native in (matmul_precision.cpu_multiplies_bfloat16(), False):
+        monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda native=native: native)
         results.append(gradients(lambda *x: linear(*x, "bfloat16"), features, weight, bias))
     for native, emulated in zip(*results, strict=True):
         assert native.dtype == emulated.dtype
@@ -128,7 +128,7 @@ def test_tf32_is_switched_on_for_its_products_alone_forward_and_backward(monkeyp
 
 COMPILING = """
 import torch
-from nerf_lightning.nerf.products import Linear
+from nerf_lightning.nerf.matmul_precision import Linear
 for products in ("float32", "tf32", "bfloat16"):
     made, features = Linear(48, 40), torch.randn(16, 48)
     made.products = products
