@@ -16,7 +16,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_rays
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.progress import Progress
@@ -83,14 +83,14 @@ class Bench:
     @contextmanager
     def _plainly(self) -> Iterator[None]:
         model = self.step.model
-        samplers = [level.sampler for level in model.modules() if isinstance(level, PackedLevel)]
+        samplers = [level.sampler for level in model.modules() if isinstance(level, RaggedLevel)]
         former = [sampler.opaque_below for sampler in samplers]
         self.step.tile_points = None
         model.set_precision("float32")
         for sampler in samplers:
             sampler.opaque_below = 0.0
         self._release_gradients()
-        with without("march.cpu", "packed.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"):
+        with without("march.cpu", "ragged.cpu", "mlp.cpu", "adam.cpu", "render.cpu", "render.gradients"):
             yield
         self.settings.prepare(model)
         for sampler, value in zip(samplers, former, strict=True):

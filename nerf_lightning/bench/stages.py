@@ -9,8 +9,8 @@ from nerf_lightning.compute.machine import seconds_of
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.kernels.backends import without
-from nerf_lightning.nerf.models.packed_level import PackedLevel
-from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.types.rays import Batch
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.step import TrainStep
@@ -24,7 +24,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
 
     Where one kernel takes rays from march to light, it has no stages: all of it, both ways, is the rest.
     """
-    level = next((part for part in step.model.modules() if isinstance(part, PackedLevel)), None)
+    level = next((part for part in step.model.modules() if isinstance(part, RaggedLevel)), None)
     if level is None:
         return {}
     rays, sampler = step.rays(batch.pixels), level.sampler
@@ -34,7 +34,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     if level.takes_whole_rays(rays):
         return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
-        points = packed_points(rays, sampler(rays, None), None)
+        points = ragged_points(rays, sampler(rays, None), None)
         walking, screening = seconds_of(lambda: sampler(rays, None)), seconds_of(lambda: level.field.density(points))
     rest = whole - walking - screening
     return {"march": walking, "screen": screening, "field, loss and gradients": rest, "optimizer": update}

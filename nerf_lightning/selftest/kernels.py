@@ -17,10 +17,10 @@ from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells, b
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import march_torch
 from nerf_lightning.nerf.kernels.mlp.mlp import mlp, mlp_torch
-from nerf_lightning.nerf.kernels.packed.integrate import integrate
-from nerf_lightning.nerf.kernels.packed.reference import integrate_torch
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate
+from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch
 from nerf_lightning.nerf.matmul_precision import TILE_ROWS, MatmulPrecision
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.selftest.check import UNIT, CannotRun, Check, gradient_bound, norm_apart, relative, value_bound
 
 POINTS, RAYS, PACKED_SAMPLES, MLP_SIZES = 2048, 400, 60, (32, 64, 64, 3)
@@ -117,14 +117,14 @@ def _march(device: torch.device, capacity: int | None) -> float:
     return sum(_of_ray(found.to("cpu"), ray) != _of_ray(expected, ray) for ray in range(RAYS)) / RAYS
 
 
-def _of_ray(samples: PackedSamples, ray: int) -> list[list[float]]:
+def _of_ray(samples: RaggedSamples, ray: int) -> list[list[float]]:
     """Return index, starts and ends of a ray's samples, to 4 decimals."""
     own = slice(*samples.bounds[ray : ray + 2].tolist())
     places = 1e4 * torch.stack([samples.starts[own], samples.ends[own]])
     return [samples.ray_index[own].float().tolist(), *places.round().tolist()]
 
 
-def _packed_samples() -> tuple[Tensor, Tensor, PackedSamples, PackedSamples]:
+def _packed_samples() -> tuple[Tensor, Tensor, RaggedSamples, RaggedSamples]:
     """Return densities, colours, samples, and the same in float64."""
     random, counts = _generator(), torch.arange(RAYS) % (PACKED_SAMPLES + 1)
     index = torch.repeat_interleave(torch.arange(RAYS), counts)
@@ -132,7 +132,7 @@ def _packed_samples() -> tuple[Tensor, Tensor, PackedSamples, PackedSamples]:
     starts = 2.0 + 0.0625 * (torch.arange(index.numel()) - bounds[index])
     density = 3.0 * torch.rand(index.numel(), generator=random)
     rgb = torch.rand(index.numel(), 3, generator=random)
-    single, double = (PackedSamples(index, s, s + 0.0625, bounds, bounds[-1]) for s in (starts, starts.double()))
+    single, double = (RaggedSamples(index, s, s + 0.0625, bounds, bounds[-1]) for s in (starts, starts.double()))
     return density, rgb, single, double
 
 

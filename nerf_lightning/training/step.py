@@ -31,7 +31,7 @@ from nerf_lightning.nerf.optimizers.schedule import Schedule
 from nerf_lightning.nerf.part import Part, StepContext, parts_of
 from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
-from nerf_lightning.nerf.samplers.base import PackedSampler
+from nerf_lightning.nerf.samplers.base import RaggedSampler
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, Target
 from nerf_lightning.nerf.types.renderings import Rendering
@@ -130,7 +130,7 @@ class TrainStep:
         self._recorded: RecordedGradients | None = None
         model.set_returns_weights(loss.needs_weights)
         for part in model.modules():
-            if isinstance(part, PackedSampler) and sample_budget is not None:
+            if isinstance(part, RaggedSampler) and sample_budget is not None:
                 part.sample_budget = -(-sample_budget // ranks.world_size())
         if model.subpixels.side > 1 and loss.needs_weights:
             raise InputError(

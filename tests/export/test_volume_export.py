@@ -20,8 +20,8 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.types.points import Points
 
@@ -51,7 +51,7 @@ def test_the_grid_lies_where_the_json_says_in_the_users_units(tmp_path):
     assert (rgb[distance > 1.0] == 0).all()
 
 
-@pytest.mark.parametrize("kind", [PackedLevel, MaskedLevel])
+@pytest.mark.parametrize("kind", [RaggedLevel, MaskedLevel])
 def test_what_rays_pass_by_has_no_density(kind):
     torch.manual_seed(0)
 

@@ -1,6 +1,6 @@
 """Within a step the host never waits for the GPU: no synchronisation, no copy to the host.
 
-What is read on the host, and when, by name: `PackedLevel.update` every 16 steps (how many samples rays had, by which
+What is read on the host, and when, by name: `RaggedLevel.update` every 16 steps (how many samples rays had, by which
 the tiles of the next step are cut; at its first time, which cells there are), `MaskedLevel.update` at its first time,
 `CollapseGuard` every 25 steps, `Monitor` every 50, `NanGuard` every 100.
 """
@@ -15,7 +15,7 @@ from support.configs import options
 from support.gpu_training import default_callbacks, step_by_step
 
 from nerf_lightning.data.datamodule import RayDataModule
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.selftest.training import METHODS
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -40,7 +40,7 @@ def never_waiting(device):
 
 def updates(run) -> set[int]:
     """The steps in which a grid is updated, and read."""
-    levels = [level for level in run.training.model.modules() if isinstance(level, PackedLevel)]
+    levels = [level for level in run.training.model.modules() if isinstance(level, RaggedLevel)]
     every = min((level.sampler.update_every for level in levels), default=1 << 30)
     return {1, *range(0, 1000, every)}
 

@@ -31,12 +31,12 @@ from nerf_lightning.nerf.geometry.cameras import all_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.packed import composite_packed
 from nerf_lightning.nerf.rendering.quadrature import composite
-from nerf_lightning.nerf.samplers.base import PackedSampler, _OneChunk
+from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.samplers.base import RaggedSampler, _OneChunk
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
-from nerf_lightning.nerf.types.rays import PackedSamples, RaySamples
+from nerf_lightning.nerf.types.rays import RaggedSamples, RaySamples
 from nerf_lightning.nerf.types.renderings import FieldOutput
 from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
@@ -48,7 +48,7 @@ WRITERS = {"evaluation.evaluator", "evaluation.kept_views", "evaluation.metrics_
 """Of what was measured: they compute nothing themselves."""
 PRODUCTS = {"matmul", "mm", "bmm", "mv", "dot", "einsum", "linear", "addmm", "baddbmm", "conv2d", "tensordot", "inner"}
 RAYS = 40
-CONTRACTS = {"Encoder", "ConeEncoder", "Sampler", "DenseSampler", "PackedSampler", "Walk", "CameraPath"}
+CONTRACTS = {"Encoder", "ConeEncoder", "Sampler", "DenseSampler", "RaggedSampler", "Walk", "CameraPath"}
 """Classes that are tried through those that follow them."""
 FORWARD_AGAIN = {"attach_gradients"}
 """Methods that do what `forward` does, with what it returned before."""
@@ -97,7 +97,7 @@ def known() -> dict[str, Any]:
     dense = RaySamples(torch.linspace(2, 6, 9) + 0.1 * torch.rand(RAYS, 9, generator=drawn))
     each = torch.arange(RAYS).repeat_interleave(2)
     starts = 2.1 + 0.9 * torch.arange(2).repeat(RAYS) + 0.1 * torch.rand(2 * RAYS, generator=drawn)
-    packed = PackedSamples(each, starts, starts + 0.7, torch.arange(RAYS + 1) * 2, torch.tensor(2 * RAYS))
+    packed = RaggedSamples(each, starts, starts + 0.7, torch.arange(RAYS + 1) * 2, torch.tensor(2 * RAYS))
 
     def output(*shape: int) -> FieldOutput:
         return FieldOutput(torch.rand(*shape, generator=drawn), torch.rand(*shape, 3, generator=drawn))
@@ -132,10 +132,10 @@ def known() -> dict[str, Any]:
         "edges": dense.edges, "weights": torch.rand(RAYS, 8, generator=drawn),
         "u": torch.rand(RAYS, 6, generator=drawn),
         "floor": 1e-5, "density": 2 * torch.rand(RAYS, 8, generator=drawn), "deltas": dense.deltas,
-        "output": output(RAYS, 8), "samples": dense, "packed output": output(2 * RAYS), "packed samples": packed,
+        "output": output(RAYS, 8), "samples": dense, "ragged output": output(2 * RAYS), "ragged samples": packed,
         "counts": torch.full((RAYS,), 2), "bins": 16, "contracted_spacing": False,
         "rendering": composite(output(RAYS, 8), dense, rays, background),
-        "packed rendering": composite_packed(output(2 * RAYS), packed, rays, background),
+        "packed rendering": composite_ragged(output(2 * RAYS), packed, rays, background),
         "depth": depth, "opacity": torch.rand(RAYS, generator=drawn), "truth_depth": depth + 0.1,
         "alpha": torch.rand(RAYS, generator=drawn).round(), "normals": nn.functional.normalize(picture - 0.4, dim=-1),
         "truth_normals": nn.functional.normalize(picture - 0.5, dim=-1), "mse": 0.01 * background, "render": picture,
@@ -187,12 +187,12 @@ ELSEWHERE: dict[str, dict[str, Any]] = {
     "nerf.rendering.blending.in_other_light": {"change": torch.square, "foreground": torch.rand(40, 3)},
     "nerf.rendering.blending.background_colors": {"background": "random"},
     "nerf.rendering.blending.photograph": {"background": "white"},
-    "nerf.rendering.packed.composite_packed": {"output": Known("packed output"), "samples": Known("packed samples")},
-    "nerf.rendering.sample_points.packed_points": {"samples": Known("packed samples"), "first": 0},
-    "nerf.rendering.packed.sum_over_rays": {"samples": Known("packed samples"), "values": torch.rand(80, 2)},
+    "nerf.rendering.ragged.composite_ragged": {"output": Known("ragged output"), "samples": Known("ragged samples")},
+    "nerf.rendering.sample_points.ragged_points": {"samples": Known("ragged samples"), "first": 0},
+    "nerf.rendering.ragged.sum_over_rays": {"samples": Known("ragged samples"), "values": torch.rand(80, 2)},
     "nerf.samplers.early_termination.visible_samples": PACKED,
     "nerf.samplers.early_termination.render_until_opaque": PACKED,
-    "nerf.rendering.packed.first_of_each_ray": {"samples": Known("packed samples")},
+    "nerf.rendering.ragged.first_of_each_ray": {"samples": Known("ragged samples")},
     "nerf.samplers.base.Sampler.update": {"density": density_there},
     "nerf.samplers.base.Sampler.reached_density": {"density": density_there},
     "nerf.samplers.occupancy.OccupancySampler.update": {"density": density_there},
@@ -280,7 +280,7 @@ def instances(tmp_path_factory) -> list[Any]:
     ]
     for sampler in samplers:
         sampler.fit_to(known()["scene"])
-    packed = [sampler for sampler in samplers if isinstance(sampler, PackedSampler)]
+    packed = [sampler for sampler in samplers if isinstance(sampler, RaggedSampler)]
     walks = [
         part for sampler in packed for part in (sampler.marcher(known()["rays"]), _OneChunk(sampler, known()["rays"]))
     ]

@@ -7,8 +7,8 @@ from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid_cpu
 from nerf_lightning.nerf.kernels.march import cpu as march_cpu
 from nerf_lightning.nerf.kernels.mlp import cpu as mlp_cpu
-from nerf_lightning.nerf.kernels.packed import cpu as packed_cpu
-from nerf_lightning.nerf.kernels.packed import integrate as packed
+from nerf_lightning.nerf.kernels.ragged import cpu as ragged_cpu
+from nerf_lightning.nerf.kernels.ragged import integrate as packed
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.kernels import checks
 
@@ -60,8 +60,8 @@ MISTAKES = {
     "march into a fixed capacity: rays with other intervals": (
         torch, "nonzero_static", lambda right: lambda flat, **options: right(flat, **options).flip(0),
     ),
-    "packed samples: value": (packed_cpu, "integrate", off_by_one_percent),
-    "packed samples: gradients": (packed_cpu, "integrate_gradient", off_by_one_percent),
+    "packed samples: value": (ragged_cpu, "integrate", off_by_one_percent),
+    "packed samples: gradients": (ragged_cpu, "integrate_gradient", off_by_one_percent),
     "perceptron, float32: value": (mlp_cpu, "forward", rounded),
     "perceptron, float32: gradients": (mlp_cpu, "backward", weight_gradients),
 }  # fmt: skip

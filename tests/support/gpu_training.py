@@ -10,7 +10,7 @@ from nerf_lightning.compute.settings import PRODUCTS
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.scene import ball_scene
 from nerf_lightning.training.build_step import build_step
@@ -53,7 +53,7 @@ def step_by_step(
     training = build_step(config, settings, scene, progress).to(device)
     training.num_steps = 1000
     for level in training.model.modules():
-        if isinstance(level, PackedLevel):
+        if isinstance(level, RaggedLevel):
             level.sampler.opaque_below = CUT
     training.model.set_precision(PRODUCTS[precision])
     here = scene if device.type == "cpu" else on_device(scene, device)

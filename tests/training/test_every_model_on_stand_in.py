@@ -15,7 +15,7 @@ from support.stand_in_device import StandInDevice
 
 from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
@@ -34,7 +34,7 @@ TILE_POINTS = 128
 # At the first update the host reads which cells there are, and how large; it sends their numbers.
 CELLS = {"OccupancySampler.update": 3}
 # At each update it asks whether samples were counted, and then how many a ray has, by which tiles are cut.
-TALLY = {"PackedLevel.update": 2, "PackedLevel.points_per_ray": 2}
+TALLY = {"RaggedLevel.update": 2, "RaggedLevel.points_per_ray": 2}
 # In each step it reads where rays come from, how many photographs shall be looked at, and whether there are any; and
 # which they are, since it is the host that holds them.
 SOURCES = {"choose_sources": 3 * (STEPS - WARM), "ViewTransformer._looked_up": 2 * (STEPS - WARM)}
@@ -73,8 +73,8 @@ def run_on(there, model, precision):
 def named_waits(model):
     """Return how often functions may wait in the steps after the first."""
     parts = {type(part) for part in model.modules()}
-    of_grids = CELLS if parts & {PackedLevel, MaskedLevel} else {}
-    return of_grids | (TALLY if PackedLevel in parts else {}) | (SOURCES if model.needs_photographs else {})
+    of_grids = CELLS if parts & {RaggedLevel, MaskedLevel} else {}
+    return of_grids | (TALLY if RaggedLevel in parts else {}) | (SOURCES if model.needs_photographs else {})
 
 
 def step_and_render(there, run, waits):

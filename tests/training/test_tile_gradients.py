@@ -11,11 +11,11 @@ from support.steps import make_step
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, defer_table_grads, interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 
 MODELS = {
     "nerf": lambda: tiny_model(density_bias=0.5),
-    "fast": lambda: fast_model(PackedLevel),
+    "fast": lambda: fast_model(RaggedLevel),
 }
 
 

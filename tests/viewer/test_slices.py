@@ -10,7 +10,7 @@ from support.steps import rays_of
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.nerf.geometry.clipping import CropBox
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.viewer import renderer as slices
@@ -31,7 +31,7 @@ def renderer(scene):
 @pytest.fixture
 def behind_grid(scene):
     """A model that asks its field only in occupied cells: those in which the photographs' alpha leaves something."""
-    model = fast_model(PackedLevel).eval()
+    model = fast_model(RaggedLevel).eval()
     model.fit_to(scene)
     return SlicedRenderer(model, scene_record(scene), "white", 4096)
 

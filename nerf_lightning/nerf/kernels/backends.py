@@ -22,7 +22,7 @@ import torch
 ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
 CPU_TWINS = (
-    *("hash_grid.cpu", "march.cpu", "packed.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
+    *("hash_grid.cpu", "march.cpu", "ragged.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
     *("render.cpu", "render.gradients"),
 )
 """The modules of this room that numba compiles."""

@@ -19,7 +19,7 @@ from nerf_lightning.nerf.types.renderings import DenseRendering, Rendering
 class MaskedLevel(Level):
     """Ask the field in every interval of a ray, and let empty cells have no density.
 
-    It renders what `PackedLevel` renders, up to the light that is left behind samples which are opaque. It computes
+    It renders what `RaggedLevel` renders, up to the light that is left behind samples which are opaque. It computes
     several times as many samples, and is for compilers that need static shapes (XLA).
     """
 
@@ -37,7 +37,7 @@ class MaskedLevel(Level):
         history: list[Rendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Render rays; without a background they are open in front of black, as those of `PackedLevel` are."""
+        """Render rays; without a background they are open in front of black, as those of `RaggedLevel` are."""
         state = self.sampler.start(rays, random)
         lattice = self.sampler.lattice if random is not None else self.sampler.lattice_over(rays)
         occupied, edges = occupied_intervals(rays, state, lattice, self.sampler.grid.occupied())

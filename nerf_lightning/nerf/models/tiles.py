@@ -8,7 +8,7 @@ from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import background_colors
 from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 from nerf_lightning.nerf.types.scene import Background
 
 
@@ -49,7 +49,7 @@ def is_out_of_memory(error: RuntimeError) -> bool:
 
 def weighted_renderings(
     model: Model, rays: RayBundle, background: Background, key: int, tile_points: int
-) -> Iterator[tuple[RayBundle, list[DenseRendering | PackedRendering]]]:
+) -> Iterator[tuple[RayBundle, list[DenseRendering | RaggedRendering]]]:
     """Render rays as a training step does, without its gradients: tile by tile, each with what every level saw.
 
     With random numbers a level that leaves out what is empty keeps its weights, which it does not in plain rendering.

@@ -6,10 +6,10 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
 from nerf_lightning.nerf.types.rays import RayBundle
-from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 
 
-def effective_samples(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
+def effective_samples(rendering: DenseRendering | RaggedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
     """Return on how many samples each ray's light rests: (sum of weights)^2 / (sum of their squares), Kish's measure.
 
     It is 1 where one sample has all the weight, the number of samples where all weigh the same, and 0 where none has
@@ -22,7 +22,7 @@ def effective_samples(rendering: DenseRendering | PackedRendering, rays: RayBund
 
 
 def weight_along(
-    rendering: DenseRendering | PackedRendering, rays: RayBundle, bins: int, contracted_spacing: bool = False
+    rendering: DenseRendering | RaggedRendering, rays: RayBundle, bins: int, contracted_spacing: bool = False
 ) -> Float[Tensor, "bins"]:
     """Return how much weight lies in each of `bins` equal parts of the way from near to far, as a mean over rays.
 
@@ -42,7 +42,7 @@ def weight_along(
     return total / rays.near.numel()
 
 
-def median_distances(rendering: DenseRendering | PackedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
+def median_distances(rendering: DenseRendering | RaggedRendering, rays: RayBundle) -> Float[Tensor, "rays"]:
     """Return where each ray has half of its weight behind it; far, where it has none.
 
     Unlike the expected distance it lies in what the ray sees, not between the haze before a surface and the surface.
@@ -58,7 +58,7 @@ def median_distances(rendering: DenseRendering | PackedRendering, rays: RayBundl
 
 
 def transmittance_at(
-    rendering: DenseRendering | PackedRendering, rays: RayBundle, distance: Float[Tensor, "rays"]
+    rendering: DenseRendering | RaggedRendering, rays: RayBundle, distance: Float[Tensor, "rays"]
 ) -> Float[Tensor, "rays"]:
     """Return the share of each ray's light that nothing has stopped before a distance."""
     ray, midpoint, weights = _samples_of(rendering)
@@ -68,11 +68,11 @@ def transmittance_at(
 
 
 def _samples_of(
-    rendering: DenseRendering | PackedRendering,
+    rendering: DenseRendering | RaggedRendering,
 ) -> tuple[Int[Tensor, "samples"], Float[Tensor, "samples"], Float[Tensor, "samples"]]:
     """Return each sample's ray, distance and weight."""
     samples, weights = rendering.samples, rendering.weights.float().reshape(-1)
-    if isinstance(rendering, PackedRendering):
+    if isinstance(rendering, RaggedRendering):
         return rendering.samples.ray_index, samples.midpoints.float(), weights
     per_ray = rendering.weights.shape[-1]
     ray = torch.arange(weights.numel(), device=weights.device) // per_ray

@@ -7,7 +7,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.cones import cone_covariance
 from nerf_lightning.nerf.randomness import PointRandom, RayRandom
 from nerf_lightning.nerf.types.points import Points
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 
 
 def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None, cones: bool = False) -> Points:
@@ -30,8 +30,8 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None,
     )
 
 
-def packed_points(
-    rays: RayBundle, samples: PackedSamples, random: RayRandom | None, cones: bool = False, first: int = 0
+def ragged_points(
+    rays: RayBundle, samples: RaggedSamples, random: RayRandom | None, cones: bool = False, first: int = 0
 ) -> Points:
     """Return the midpoints of packed samples: one axis.
 
@@ -52,7 +52,7 @@ def packed_points(
     )
 
 
-def _covariance(rays: RayBundle, samples: RaySamples | PackedSamples, ray_of: Any) -> Tensor | None:
+def _covariance(rays: RayBundle, samples: RaySamples | RaggedSamples, ray_of: Any) -> Tensor | None:
     if rays.pixel_side is None:
         return None
     side, growth = rays.pixel_side[ray_of].unbind(dim=-1)

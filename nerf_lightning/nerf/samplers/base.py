@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.march.grid import GridMarch
 from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -70,7 +70,7 @@ class RayMarcher(ABC):
     """Rays on their way through the scene while a picture is rendered, a chunk of samples at a time."""
 
     @abstractmethod
-    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[RaggedSamples, Bool[Tensor, "alive"]]:
         """Return the next samples of some of the rays, about `limit` each at most, and which rays have more of them."""
 
     def grid_march(self) -> GridMarch | None:
@@ -78,7 +78,7 @@ class RayMarcher(ABC):
         return None
 
 
-class PackedSampler(Sampler, ABC):
+class RaggedSampler(Sampler, ABC):
     """Choose intervals along rays, only where there may be something: their number differs from ray to ray."""
 
     opaque_below: float = 1e-3
@@ -94,7 +94,7 @@ class PackedSampler(Sampler, ABC):
         """How many samples a ray is taken to have until they have been counted."""
 
     @abstractmethod
-    def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
+    def forward(self, rays: RayBundle, random: RayRandom | None) -> RaggedSamples:
         """Return the intervals that may hold something; `random` is None outside of training."""
 
     def capacity_for(self, rays: RayBundle) -> int | None:
@@ -111,9 +111,9 @@ class PackedSampler(Sampler, ABC):
 
 
 class _OneChunk(RayMarcher):
-    def __init__(self, sampler: PackedSampler, rays: RayBundle):
+    def __init__(self, sampler: RaggedSampler, rays: RayBundle):
         self.sampler, self.rays = sampler, rays
 
-    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[RaggedSamples, Bool[Tensor, "alive"]]:
         """Return all samples of these rays."""
         return self.sampler(self.rays[alive], None), torch.zeros_like(alive, dtype=torch.bool)

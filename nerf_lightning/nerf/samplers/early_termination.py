@@ -5,12 +5,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
-from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.packed import composite_packed, first_of_each_ray
-from nerf_lightning.nerf.rendering.sample_points import packed_points
-from nerf_lightning.nerf.samplers.base import PackedSampler
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.rendering.ragged import composite_ragged, first_of_each_ray
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
+from nerf_lightning.nerf.samplers.base import RaggedSampler
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.renderings import FieldOutput, Rendering
 
 # Samples of a ray in one chunk; more where few rays are left.
@@ -20,8 +20,8 @@ LEAST_ALPHA = 1e-3
 
 
 def visible_samples(
-    sampler: PackedSampler, field: Field, rays: RayBundle, random: RayRandom | None
-) -> tuple[PackedSamples, Float[Tensor, "capacity features"] | None]:
+    sampler: RaggedSampler, field: Field, rays: RayBundle, random: RayRandom | None
+) -> tuple[RaggedSamples, Float[Tensor, "capacity features"] | None]:
     """Return the samples of each ray up to where it is opaque, and the features that were computed to see that.
 
     Without gradients. Where sizes may not be read on the host, all samples are kept.
@@ -36,7 +36,7 @@ def visible_samples(
 
 
 def render_until_opaque(
-    sampler: PackedSampler, field: Field, rays: RayBundle, background: Float[Tensor, "rays 3"] | None
+    sampler: RaggedSampler, field: Field, rays: RayBundle, background: Float[Tensor, "rays 3"] | None
 ) -> Rendering:
     """Render rays without gradients, chunk by chunk, until each is opaque or has left the scene."""
     marcher = sampler.marcher(rays)
@@ -47,7 +47,7 @@ def render_until_opaque(
     while alive.numel():
         left = rays[alive]
         samples, more = marcher.advance(alive, _samples_per_chunk(rays.near.shape[0], alive.numel()))
-        part = composite_packed(_visible_colors(field, left, samples), samples, left, None)
+        part = composite_ragged(_visible_colors(field, left, samples), samples, left, None)
         before = light[alive]
         rgb[alive] += before[:, None] * part.foreground
         depth[alive] += before * (part.depth - (1.0 - part.opacity) * left.far)
@@ -60,7 +60,7 @@ def render_until_opaque(
 
 
 def _until_opaque(
-    sampler: PackedSampler, field: Field, rays: RayBundle, samples: PackedSamples, random: RayRandom | None
+    sampler: RaggedSampler, field: Field, rays: RayBundle, samples: RaggedSamples, random: RayRandom | None
 ) -> tuple[Tensor, Tensor | None]:
     """Return how many samples of each ray are visible, and the features of all that were computed."""
     density, features = torch.zeros_like(samples.starts), None
@@ -71,7 +71,7 @@ def _until_opaque(
         until_there = counts.clamp(max=until).index_select(0, samples.ray_index)
         number = ((place >= asked) & (place < until_there)).nonzero()[:, 0]
         part = samples.at(number, torch.cat([counts.new_zeros(1), in_chunk.cumsum(0)]))
-        found, computed = field.density(packed_points(rays, part, random, field.sees_cones, first=asked))
+        found, computed = field.density(ragged_points(rays, part, random, field.sees_cones, first=asked))
         density[number] = found.float()
         if computed is not None:
             features = computed.new_empty(*place.shape, computed.shape[1]) if features is None else features
@@ -81,9 +81,9 @@ def _until_opaque(
     return counts, features
 
 
-def _visible_colors(field: Field, rays: RayBundle, samples: PackedSamples) -> FieldOutput:
+def _visible_colors(field: Field, rays: RayBundle, samples: RaggedSamples) -> FieldOutput:
     # Most samples are all but transparent: their colour, which costs most, is not computed.
-    points = packed_points(rays, samples, None, field.sees_cones)
+    points = ragged_points(rays, samples, None, field.sees_cones)
     density, features = field.density(points)
     if features is None:
         return field(points)

@@ -16,10 +16,10 @@ from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
 from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
 from nerf_lightning.nerf.ranges import require_ranges
-from nerf_lightning.nerf.samplers.base import DensityFn, PackedSampler, RayMarcher
+from nerf_lightning.nerf.samplers.base import DensityFn, RaggedSampler, RayMarcher
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
 from nerf_lightning.nerf.samplers.space_carving import possible_cells
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 from nerf_lightning.nerf.types.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ RANGES = {
 }
 
 
-class OccupancySampler(PackedSampler):
+class OccupancySampler(RaggedSampler):
     """Keep a moving average of the density in each cell, and sample only where it is high enough.
 
     Every `update_every` steps cells are asked at a random point each; a cell holds the larger of its decayed value and
@@ -152,7 +152,7 @@ class OccupancySampler(PackedSampler):
         """As if every interval across the box held something."""
         return self.num_steps
 
-    def forward(self, rays: RayBundle, random: RayRandom | None) -> PackedSamples:
+    def forward(self, rays: RayBundle, random: RayRandom | None) -> RaggedSamples:
         """Return the occupied intervals of each ray; `random` None asks for the deterministic lattice of evaluation."""
         rays = rays.map(torch.Tensor.detach)  # where cameras learn: which cells a ray meets has no gradient
         return march(rays, *self.grid_march(rays, random), capacity=self.capacity_for(rays))[0]
@@ -296,7 +296,7 @@ class GridMarcher(RayMarcher):
         self.rays, self.state = rays, sampler.start(rays, None)
         self.lattice, self.cells = sampler.lattice_over(rays), sampler.grid.occupied()
 
-    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[PackedSamples, Bool[Tensor, "alive"]]:
+    def advance(self, alive: Int[Tensor, "alive"], limit: int) -> tuple[RaggedSamples, Bool[Tensor, "alive"]]:
         """March on from where each ray stands."""
         samples, following = march(self.rays[alive], self.state[alive], self.lattice, self.cells, limit)
         self.state.next[alive] = following

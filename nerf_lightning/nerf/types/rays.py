@@ -63,12 +63,12 @@ class RaySamples(TensorStruct):
 
 
 @dataclass(frozen=True)
-class PackedSamples(TensorStruct):
+class RaggedSamples(TensorStruct):
     """Only the intervals that may hold something, ray after ray, each ray's in order.
 
     The arrays have a capacity; what lies beyond the last bound is padding of zero length, spread over the rays, since a
     GPU adds up what flows back to one ray one by one. It is packed for speed, and has functions of its own
-    (`rendering.packed`).
+    (`rendering.ragged`).
     """
 
     ray_index: Int[Tensor, "capacity"]
@@ -87,10 +87,10 @@ class PackedSamples(TensorStruct):
         first = self.bounds.index_select(0, self.ray_index)
         return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - first
 
-    def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "PackedSamples":
+    def at(self, kept: Int[Tensor, "kept"], bounds: Int[Tensor, "bounds"]) -> "RaggedSamples":
         """Return some of the samples, in order, with the bounds that they have then."""
         ray, starts, ends = (each.index_select(0, kept) for each in (self.ray_index, self.starts, self.ends))
-        return PackedSamples(ray, starts, ends, bounds, self.found, self.longest)
+        return RaggedSamples(ray, starts, ends, bounds, self.found, self.longest)
 
     @property
     def midpoints(self) -> Float[Tensor, "capacity"]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 
@@ -67,8 +67,8 @@ class DenseRendering(Rendering):
 
 
 @dataclass(frozen=True)
-class PackedRendering(Rendering):
+class RaggedRendering(Rendering):
     """A level that skipped what is empty."""
 
     weights: Float[Tensor, "capacity"]
-    samples: PackedSamples
+    samples: RaggedSamples

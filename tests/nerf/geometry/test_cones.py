@@ -15,8 +15,8 @@ from nerf_lightning.nerf.geometry.cones import (
     to_matrix,
 )
 from nerf_lightning.nerf.geometry.contraction import contract
-from nerf_lightning.nerf.rendering.sample_points import packed_points, points_along
-from nerf_lightning.nerf.types.rays import PackedSamples, PixelIndex, RaySamples
+from nerf_lightning.nerf.rendering.sample_points import points_along, ragged_points
+from nerf_lightning.nerf.types.rays import PixelIndex, RaggedSamples, RaySamples
 
 
 def one_camera(size):
@@ -84,13 +84,13 @@ def test_both_layouts_of_samples_have_the_same_cones_and_only_where_they_are_ask
     rays, edges = replace(some_rays(5), pixel_side=torch.rand(5, 2)), torch.linspace(2, 6, 4).expand(5, 4)
     dense, each = RaySamples(edges), torch.arange(5).repeat_interleave(3)
     starts, ends = dense.starts.flatten(), dense.ends.flatten()
-    packed = PackedSamples(each, starts, ends, torch.arange(6) * 3, torch.tensor(15))
+    packed = RaggedSamples(each, starts, ends, torch.arange(6) * 3, torch.tensor(15))
     along = points_along(rays, dense, None, cones=True)
-    torch.testing.assert_close(packed_points(rays, packed, None, cones=True).covariance, along.covariance.flatten(0, 1))
+    torch.testing.assert_close(ragged_points(rays, packed, None, cones=True).covariance, along.covariance.flatten(0, 1))
     side = rays.pixel_side[2, 0] + rays.pixel_side[2, 1] * dense.midpoints[2, 1]
     expected = cone_covariance(rays.directions[2], dense.deltas[2, 1], side)
     torch.testing.assert_close(along.covariance[2, 1], expected)
     assert points_along(rays, dense, None).covariance is None
-    assert packed_points(rays, packed, None).covariance is None
+    assert ragged_points(rays, packed, None).covariance is None
     nobodys = replace(rays, pixel_side=None)
     assert points_along(nobodys, dense, None, cones=True).covariance is None

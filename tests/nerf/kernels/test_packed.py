@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from nerf_lightning.nerf.kernels.packed.integrate import integrate, num_visible
-from nerf_lightning.nerf.kernels.packed.reference import integrate_torch, transmittance_torch
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate, num_visible
+from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
 from nerf_lightning.nerf.rendering.quadrature import weights_from_density
-from nerf_lightning.nerf.types.rays import PackedSamples
+from nerf_lightning.nerf.types.rays import RaggedSamples
 
 
 def packed(counts, dtype=torch.float32):
@@ -15,7 +15,7 @@ def packed(counts, dtype=torch.float32):
     index = torch.repeat_interleave(torch.arange(counts.numel()), counts)
     bounds = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
     starts = 2.0 + 0.05 * (torch.arange(total) - bounds[index]).to(dtype)
-    samples = PackedSamples(index, starts, starts + 0.05, bounds, bounds[-1])
+    samples = RaggedSamples(index, starts, starts + 0.05, bounds, bounds[-1])
     return (5 * torch.rand(total, dtype=dtype)).exp() - 1, torch.rand(total, 3, dtype=dtype), samples
 
 
@@ -28,7 +28,7 @@ def test_the_numba_twin_equals_the_reference_in_value_and_gradient(counts):
     results = []
     for fn, dtype in ((integrate, torch.float32), (integrate_torch, torch.float64)):
         leaves = [x.to(dtype, copy=True).requires_grad_() for x in (density, rgb)]
-        placed = PackedSamples(
+        placed = RaggedSamples(
             samples.ray_index, samples.starts.to(dtype), samples.ends.to(dtype), samples.bounds, samples.found
         )
         out = fn(*leaves, placed)
@@ -44,7 +44,7 @@ def test_the_numba_twin_equals_the_reference_in_value_and_gradient(counts):
 def test_light_is_exact_in_float32_whatever_other_rays_stop(longest):
     density, _, samples = packed([40, 0, 7] * 200)
     padding = torch.zeros(1000)
-    samples = PackedSamples(
+    samples = RaggedSamples(
         torch.cat([samples.ray_index, torch.arange(1000) % 600]), torch.cat([samples.starts, padding]),
         torch.cat([samples.ends, padding]), samples.bounds, samples.found, longest,
     )  # fmt: skip

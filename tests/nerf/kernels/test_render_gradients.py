@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from support.packed_levels import a_level, needs_bfloat16
+from support.ragged_levels import a_level, needs_bfloat16
 from support.scenes import some_rays
 
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import gradients as kernels
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.types.renderings import PackedRendering
+from nerf_lightning.nerf.types.renderings import RaggedRendering
 
 
 def learnt(level, rays, random, weight, background=None):
@@ -89,15 +89,15 @@ def test_many_rays_are_shared_out_and_nothing_changes(threads):
 
 def test_it_goes_the_other_way_where_something_else_is_wanted():
     level, rays = a_level(density_bias=3.0), some_rays(50)
-    assert isinstance(level(rays, None, [], None), PackedRendering)  # as a notebook wants it
+    assert isinstance(level(rays, None, [], None), RaggedRendering)  # as a notebook wants it
     assert not level.takes_whole_rays(rays)
     level.returns_weights = False
     assert level.takes_whole_rays(rays)
-    assert not isinstance(level(rays, None, [], None), PackedRendering)
+    assert not isinstance(level(rays, None, [], None), RaggedRendering)
     with torch.no_grad():
-        assert isinstance(level(rays, None, [], batch_random(0, 50)), PackedRendering)
+        assert isinstance(level(rays, None, [], batch_random(0, 50)), RaggedRendering)
     turned = replace(rays, origins=rays.origins.clone().requires_grad_())
-    assert isinstance(level(turned, None, [], None), PackedRendering)
+    assert isinstance(level(turned, None, [], None), RaggedRendering)
     level.field.__class__ = type("Other", (NGPField,), {})
     assert level.field.parts() is None
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.packed_levels import a_level, needs_bfloat16
+from support.ragged_levels import a_level, needs_bfloat16
 from support.scenes import some_rays
 
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
@@ -10,7 +10,7 @@ from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.part import StepContext
-from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
 
 
 def rendered(level, rays, background=None):
@@ -27,7 +27,7 @@ def test_it_sees_what_rounds_see(matmul_precision, features, opaque_below, bias)
     rays = some_rays(700)
     background = torch.rand(700, 3)
     whole = rendered(level, rays, background)
-    with without("render.cpu", "march.cpu", "packed.cpu", "hash_grid.cpu"):
+    with without("render.cpu", "march.cpu", "ragged.cpu", "hash_grid.cpu"):
         rounds = rendered(level, rays, background)
     assert 0.1 < float(whole.opacity.mean()) < 0.9
     for name in ("rgb", "foreground", "opacity", "depth"):
@@ -51,7 +51,7 @@ def test_a_ray_ends_where_too_little_light_is_left():
     level, rays = a_level(opaque_below=0.5, density_bias=3.0), some_rays(300)
     with torch.no_grad():
         samples = level.sampler(rays, None)
-        density = level.field.density(packed_points(rays, samples, None))[0].double()
+        density = level.field.density(ragged_points(rays, samples, None))[0].double()
     light, expected = torch.ones(300).double(), torch.zeros(300).double()
     for ray, opacity in zip(samples.ray_index, -torch.expm1(-density * samples.deltas), strict=True):
         if light[ray] > 0.5:

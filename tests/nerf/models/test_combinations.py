@@ -14,9 +14,9 @@ from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.proposal import ProposalLoss
 from nerf_lightning.nerf.models.dense_level import DenseLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
@@ -46,9 +46,9 @@ MODELS = {
         "coarse": DenseLevel(StratifiedSampler(12), field()),
         "fine": DenseLevel(ImportanceSampler(12), field()),
     },
-    "occupancy": lambda field: {"fine": PackedLevel(OccupancySampler(resolution=16, num_steps=48), field())},
+    "occupancy": lambda field: {"fine": RaggedLevel(OccupancySampler(resolution=16, num_steps=48), field())},
     "cascades": lambda field: {
-        "fine": PackedLevel(OccupancySampler(resolution=8, num_cascades=3, num_steps=32, cone_angle=0.01), field())
+        "fine": RaggedLevel(OccupancySampler(resolution=8, num_cascades=3, num_steps=32, cone_angle=0.01), field())
     },
     "proposal": lambda field: {
         "proposal": ProposalLevel(StratifiedSampler(24), field()),
@@ -97,7 +97,7 @@ def test_it_learns(model, field, position, direction):
 
 def test_rays_per_step_follow_the_budget_in_fixed_sizes():
     scene, progress = ball_scene(num_views=8, size=16), Progress()
-    level = PackedLevel(
+    level = RaggedLevel(
         OccupancySampler(resolution=16, num_steps=48),
         FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]()),
     )

@@ -4,7 +4,7 @@ from support.scenes import ball_scene, some_rays
 from support.static_models import fast_model
 
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.randomness import batch_random
 
 
@@ -12,7 +12,7 @@ def both(**sampler):
     """The same field and grid in both forms, with some cells empty."""
     scene = ball_scene(num_views=12)
     packed, masked = (
-        fast_model(level, num_steps=96, **({"opaque_below": 0.0} | sampler)) for level in (PackedLevel, MaskedLevel)
+        fast_model(level, num_steps=96, **({"opaque_below": 0.0} | sampler)) for level in (RaggedLevel, MaskedLevel)
     )
     packed.fit_to(scene)
     torch.nn.init.normal_(packed.levels["fine"].field.position_encoder.table, std=1.0)

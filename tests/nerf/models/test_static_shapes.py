@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 
 
@@ -87,4 +87,4 @@ def test_what_xla_could_not_compile_is_refused(name, fault):
 
 def test_the_packed_form_is_refused():
     with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
-        operations_of_steps("fast_dense", [2], model=fast_model(PackedLevel))
+        operations_of_steps("fast_dense", [2], model=fast_model(RaggedLevel))

@@ -8,8 +8,8 @@ from nerf_lightning.nerf.rendering.ray_statistics import (
     transmittance_at,
     weight_along,
 )
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle, RaySamples
-from nerf_lightning.nerf.types.renderings import DenseRendering, PackedRendering
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle, RaySamples
+from nerf_lightning.nerf.types.renderings import DenseRendering, RaggedRendering
 
 
 def straight_rays(count, near=0.0, far=1.0):
@@ -39,11 +39,11 @@ def packed(weights, near=0.0, far=1.0):
     ray, place = weights.nonzero(as_tuple=True)
     bounds = torch.cat([torch.zeros(1, dtype=torch.long), (weights > 0).sum(1).cumsum(0)])
     padding = torch.zeros(2)
-    samples = PackedSamples(
+    samples = RaggedSamples(
         torch.cat([ray, torch.zeros(2, dtype=torch.long)]), torch.cat([edges[:-1][place], padding]),
         torch.cat([edges[1:][place], padding]), bounds, bounds[-1],
     )  # fmt: skip
-    return seen(torch.cat([weights[ray, place], padding]), samples, rays, PackedRendering), rays
+    return seen(torch.cat([weights[ray, place], padding]), samples, rays, RaggedRendering), rays
 
 
 @pytest.mark.parametrize("kind", [dense, packed])

@@ -7,7 +7,7 @@ from support.scenes import ball_scene, some_rays
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.randomness import batch_random, fold
-from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 
 
@@ -196,7 +196,7 @@ def test_cascades_cover_what_lies_far_out():
     rays = replace(rays, near=torch.full((40,), 0.05), far=torch.full((40,), 16.0))
     samples = sampler(rays, None)
     assert float(samples.ends.max()) > 14.0
-    assert float(packed_points(rays, samples, None).positions.abs().max()) > 8.0
+    assert float(ragged_points(rays, samples, None).positions.abs().max()) > 8.0
     # Intervals grow with the distance.
     far, near = samples.starts > 10.0, samples.starts < 2.0
     assert float(samples.deltas[far].mean()) > 1.4 * float(samples.deltas[near].min())

@@ -3,11 +3,11 @@
 import torch
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
-from nerf_lightning.nerf.samplers.base import PackedSampler
-from nerf_lightning.nerf.types.rays import PackedSamples
+from nerf_lightning.nerf.samplers.base import RaggedSampler
+from nerf_lightning.nerf.types.rays import RaggedSamples
 
 
-class BoxSampler(PackedSampler):
+class BoxSampler(RaggedSampler):
     def __init__(self, num_steps: int = 96):
         super().__init__()
         self.num_steps = num_steps
@@ -29,4 +29,4 @@ class BoxSampler(PackedSampler):
         number = torch.arange(len(ray)) - bounds[ray]
         jitter = torch.zeros_like(enter) if random is None else random.uniform("box", 1)[..., 0]
         starts = enter[ray] + (number + jitter[ray]) * step
-        return PackedSamples(ray, starts, starts + step, bounds, bounds[-1])
+        return RaggedSamples(ray, starts, starts + step, bounds, bounds[-1])

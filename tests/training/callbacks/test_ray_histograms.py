@@ -8,14 +8,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.data.ray_batches import RayBatches
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.training.callbacks.ray_histograms import PARTS, look_along, write_shares
 
 
 def a_system(name):
     progress, scene = Progress(), ball_scene(num_views=6)
-    model = fast_model(PackedLevel) if name == "fast_dense" else tiny_model()
+    model = fast_model(RaggedLevel) if name == "fast_dense" else tiny_model()
     system = static_system(name, scene, progress, 10, model=model)
     return system.step, RayBatches(scene, progress, 0, 64).at(0, 0)
 

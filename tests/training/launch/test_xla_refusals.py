@@ -9,7 +9,7 @@ from support.static_models import MODELS, fast_model
 from nerf_lightning.compute import xla_device
 from nerf_lightning.compute.devices import choose_precision
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.training.launch import xla
 from nerf_lightning.training.launch.processes import num_processes
 from nerf_lightning.training.launch.trainer import TrainerSettings
@@ -51,4 +51,4 @@ def test_models_whose_shapes_depend_on_data_are_refused():
     for model in MODELS.values():
         xla.require_static_shapes(model())
     with pytest.raises(InputError, match="model=fast_dense"):
-        xla.require_static_shapes(fast_model(PackedLevel))
+        xla.require_static_shapes(fast_model(RaggedLevel))

@@ -14,7 +14,7 @@ from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsE
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
@@ -61,7 +61,7 @@ def test_known_features_have_the_gradients_of_computed_ones(settings):
     assert all(torch.equal(found, expected) for found, expected in zip(*results, strict=True))
 
 
-@pytest.mark.parametrize("kind", [PackedLevel, MaskedLevel, DenseLevel])
+@pytest.mark.parametrize("kind", [RaggedLevel, MaskedLevel, DenseLevel])
 def test_every_level_tells_the_factor_of_the_cones(kind):
     field = NGPField(an_encoder(cones=True), SphericalHarmonicsEncoder(2), width=16, density_bias=0.0)
     sampler = StratifiedSampler(12) if kind is DenseLevel else OccupancySampler(resolution=8, num_steps=64)

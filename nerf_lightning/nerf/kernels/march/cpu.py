@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, MarchState, OccupancyCells, blocks_of, leaps_over
 from nerf_lightning.nerf.kernels.threads import over_rows
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
 HALF, ONE, TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 FAR_AWAY = np.float32(1e30)
@@ -19,7 +19,7 @@ FAR_AWAY = np.float32(1e30)
 
 def march(
     rays: RayBundle, state: MarchState, lattice: Float[Tensor, "edges"], grid: OccupancyCells, limit: int | None
-) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals and where each ray would go on."""
     count, edges = rays.near.shape[0], lattice.shape[0]
     most = min(edges, limit if limit is not None else edges)
@@ -32,7 +32,7 @@ def march(
     total = int(bounds[-1])
     out = torch.empty(total, dtype=torch.int64), torch.empty(total), torch.empty(total)
     over_rows(_pack, count, *(x.numpy() for x in (state.jitter.contiguous(), lattice, numbers, bounds, *out)))
-    return PackedSamples(*out, bounds, bounds[-1], most), following
+    return RaggedSamples(*out, bounds, bounds[-1], most), following
 
 
 def in_box(rays: RayBundle, grid: OccupancyCells) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:

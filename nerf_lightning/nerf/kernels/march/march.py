@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
 
 def march(
@@ -19,7 +19,7 @@ def march(
     grid: OccupancyCells,
     limit: int | None = None,
     capacity: int | None = None,
-) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals, at most `limit` per ray, and where each ray would go on.
 
     Args:

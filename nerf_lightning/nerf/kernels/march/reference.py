@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import center_and_half
 from nerf_lightning.nerf.kernels.march.grid import MarchState, OccupancyCells
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
 
 
 def march_torch(
@@ -16,7 +16,7 @@ def march_torch(
     grid: OccupancyCells,
     limit: int | None,
     capacity: int | None,
-) -> tuple[PackedSamples, Int[Tensor, "rays"]]:
+) -> tuple[RaggedSamples, Int[Tensor, "rays"]]:
     """Return the occupied intervals and where each ray would go on."""
     keep, edges = occupied_intervals(rays, state, lattice, grid)
     number = torch.arange(keep.shape[1], device=edges.device)
@@ -60,7 +60,7 @@ def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> 
 
 def _packed(
     keep: Bool[Tensor, "rays k"], edges: Float[Tensor, "rays e"], capacity: int | None, limit: int | None
-) -> PackedSamples:
+) -> RaggedSamples:
     counts, intervals = keep.sum(dim=-1), keep.shape[1]
     found = counts.sum()
     bounds = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
@@ -78,4 +78,4 @@ def _packed(
     number = flat - ray * intervals
     starts, ends = edges[ray, number], edges[ray, number + 1]
     longest = intervals if limit is None else min(limit, intervals)
-    return PackedSamples(ray, starts * filled, ends * filled, bounds, found, longest)
+    return RaggedSamples(ray, starts * filled, ends * filled, bounds, found, longest)

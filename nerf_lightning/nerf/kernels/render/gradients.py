@@ -4,7 +4,7 @@ As in `cpu.py` ROWS samples are taken at a time, but of fewer rays: each takes s
 What the way back needs is kept block by block. It takes the blocks from the last to the first, so that of each ray
 those samples come first that lie farthest, and sums up what lies behind each.
 
-Letters as in `kernels.packed.integrate`. Where the samples lie has no gradient.
+Letters as in `kernels.ragged.integrate`. Where the samples lie has no gradient.
 """
 
 import threading

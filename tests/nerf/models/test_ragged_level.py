@@ -6,15 +6,15 @@ from support.known_fields import SolidField, ball
 from support.scenes import ball_scene, some_rays, tiny_field
 from support.steps import rays_of
 
-from nerf_lightning.nerf.kernels.packed.integrate import num_visible
+from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.masked_level import MaskedLevel
-from nerf_lightning.nerf.models.packed_level import PackedLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.randomness import batch_random
-from nerf_lightning.nerf.rendering.packed import first_of_each_ray
-from nerf_lightning.nerf.rendering.sample_points import packed_points
+from nerf_lightning.nerf.rendering.ragged import first_of_each_ray
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
 from nerf_lightning.nerf.samplers.early_termination import visible_samples
 from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -24,7 +24,7 @@ def a_level(**settings):
     torch.manual_seed(1)
     field = tiny_field(density_activation="softplus", density_bias=1.0)
     sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
-    level = PackedLevel(sampler, field)
+    level = RaggedLevel(sampler, field)
     level.fit_to(ball_scene(num_views=12))
     level.sampler.grid.occupy(torch.ones_like(level.sampler.grid.possible))
     return level
@@ -55,12 +55,12 @@ def test_rendering_in_rounds_equals_rendering_at_once():
         torch.testing.assert_close(getattr(rounds, name), getattr(whole, name).detach(), atol=2e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("level", [PackedLevel, MaskedLevel])
+@pytest.mark.parametrize("level", [RaggedLevel, MaskedLevel])
 @pytest.mark.parametrize("distance", [2.5, 3.0, 8.0, 800.0])
 def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
     """Rays that lie on the same lines, of photographs 4 units away and of a camera elsewhere, see the same."""
     packed = a_level(resolution=8, num_steps=200, opaque_below=0.0)
-    level = packed if level is PackedLevel else MaskedLevel(packed.sampler, packed.field)
+    level = packed if level is RaggedLevel else MaskedLevel(packed.sampler, packed.field)
     rays = some_rays(60)
     moved = distance - 4.0
     elsewhere = replace(
@@ -81,7 +81,7 @@ def test_samples_end_where_the_ray_is_opaque():
     samples, features = visible_samples(level.sampler, level.field, rays, batch_random(1, 300))
     assert features is None
     assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
-    density, _ = level.field.density(packed_points(rays, samples, None))
+    density, _ = level.field.density(ragged_points(rays, samples, None))
     optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
     longest = 80.0 * level.sampler.step_size
     assert 1.0 < float(optical.max()) <= -torch.tensor(1e-3).log() + longest + 1e-3
@@ -99,7 +99,7 @@ def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypa
     found, _ = visible_samples(level.sampler, level.field, rays, random)
     samples = level.sampler(rays, random)
     with torch.no_grad():
-        density, _ = density_of(packed_points(rays, samples, random))
+        density, _ = density_of(ragged_points(rays, samples, random))
     kept, bounds = first_of_each_ray(samples, num_visible(density, samples, opaque_below))
     for ours, theirs in zip(found.tensors(), samples.at(kept, bounds).tensors(), strict=True):
         assert torch.equal(ours, theirs)

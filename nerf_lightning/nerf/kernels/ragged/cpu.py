@@ -10,7 +10,7 @@ from numba import njit
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.threads import over_rows
-from nerf_lightning.nerf.types.rays import PackedSamples
+from nerf_lightning.nerf.types.rays import RaggedSamples
 
 
 def integrate(
@@ -46,7 +46,7 @@ def integrate_gradient(
     return out
 
 
-def num_visible(density: Float[Tensor, "n"], samples: PackedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
+def num_visible(density: Float[Tensor, "n"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
     out = torch.empty_like(samples.bounds[1:])
     arrays = (density.detach().contiguous(), samples.starts, samples.ends, samples.bounds, out)
@@ -58,7 +58,7 @@ def num_visible(density: Float[Tensor, "n"], samples: PackedSamples, opaque_belo
 def trial() -> None:
     """Run every kernel once on next to nothing; it raises whatever their compiler raises."""
     bounds, along = torch.tensor([0, 2]), torch.arange(2.0)
-    samples = PackedSamples(torch.zeros(2, dtype=torch.long), along, along + 1.0, bounds, bounds[-1])
+    samples = RaggedSamples(torch.zeros(2, dtype=torch.long), along, along + 1.0, bounds, bounds[-1])
     density, rgb = torch.ones(2), torch.ones(2, 3)
     foreground, opacity, depth, weights = integrate(density, rgb, samples.starts, samples.ends, bounds)
     grads = (foreground, opacity, depth, weights)

@@ -5,10 +5,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.nerf.types.rays import PackedSamples
+from nerf_lightning.nerf.types.rays import RaggedSamples
 
 
-def transmittance_torch(density: Float[Tensor, "capacity"], samples: PackedSamples) -> Float[Tensor, "capacity"]:
+def transmittance_torch(density: Float[Tensor, "capacity"], samples: RaggedSamples) -> Float[Tensor, "capacity"]:
     """Return the light that reaches the start of each interval."""
     # A row of a table for each ray: sums of their own are exact in float32, and no two samples share a cell, so what
     # flows back waits for nothing. Padding has rows of its own.
@@ -25,7 +25,7 @@ def transmittance_torch(density: Float[Tensor, "capacity"], samples: PackedSampl
 
 
 def integrate_torch(
-    density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: PackedSamples
+    density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: RaggedSamples
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "capacity"]]:
     """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w."""
     alpha = -torch.expm1(-density * samples.deltas)

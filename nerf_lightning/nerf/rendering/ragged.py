@@ -4,17 +4,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.packed.integrate import integrate
-from nerf_lightning.nerf.types.rays import PackedSamples, RayBundle
-from nerf_lightning.nerf.types.renderings import FieldOutput, PackedRendering
+from nerf_lightning.nerf.kernels.ragged.integrate import integrate
+from nerf_lightning.nerf.types.rays import RaggedSamples, RayBundle
+from nerf_lightning.nerf.types.renderings import FieldOutput, RaggedRendering
 
 
-def composite_packed(
+def composite_ragged(
     output: FieldOutput,
-    samples: PackedSamples,
+    samples: RaggedSamples,
     rays: RayBundle,
     background: Float[Tensor, "rays 3"] | None,
-) -> PackedRendering:
+) -> RaggedRendering:
     """Render one level. Light that escapes belongs to `background` and, in the depth, to far.
 
     Args:
@@ -25,7 +25,7 @@ def composite_packed(
     """
     foreground, opacity, depth, weights = integrate(output.density, output.rgb, samples)
     escaped = 1.0 - opacity
-    return PackedRendering(
+    return RaggedRendering(
         rgb=foreground if background is None else foreground + escaped[:, None] * background,
         foreground=foreground,
         opacity=opacity,
@@ -36,13 +36,13 @@ def composite_packed(
     )
 
 
-def sum_over_rays(values: Float[Tensor, "capacity n"], samples: PackedSamples) -> Float[Tensor, "rays n"]:
+def sum_over_rays(values: Float[Tensor, "capacity n"], samples: RaggedSamples) -> Float[Tensor, "rays n"]:
     """Return the sum of each ray's values."""
     total = values.new_zeros(samples.bounds.shape[0] - 1, values.shape[1])
     return total.index_add(0, samples.ray_index, values)
 
 
-def first_of_each_ray(samples: PackedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
+def first_of_each_ray(samples: RaggedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
     """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
     kept = (samples.place < counts.index_select(0, samples.ray_index)).nonzero()[:, 0]
     return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

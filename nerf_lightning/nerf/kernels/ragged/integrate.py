@@ -11,23 +11,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.backends import cpu_twin
-from nerf_lightning.nerf.kernels.packed.reference import integrate_torch, transmittance_torch
-from nerf_lightning.nerf.types.rays import PackedSamples
+from nerf_lightning.nerf.kernels.ragged.reference import integrate_torch, transmittance_torch
+from nerf_lightning.nerf.types.rays import RaggedSamples
 
 
 def integrate(
-    density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: PackedSamples
+    density: Float[Tensor, "capacity"], rgb: Float[Tensor, "capacity 3"], samples: RaggedSamples
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"], Float[Tensor, "rays"], Float[Tensor, "capacity"]]:
     """Return, per ray, sum of w rgb, sum of w, sum of w t, and the weights w."""
-    twin = cpu_twin("packed.cpu", density.device)
+    twin = cpu_twin("ragged.cpu", density.device)
     if twin is None or density.dtype != torch.float32 or rgb.dtype != torch.float32:
         return integrate_torch(density, rgb, samples)
     return _Integrate.apply(density, rgb, samples.starts, samples.ends, samples.bounds, twin)
 
 
-def num_visible(density: Float[Tensor, "capacity"], samples: PackedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
+def num_visible(density: Float[Tensor, "capacity"], samples: RaggedSamples, opaque_below: float) -> Int[Tensor, "rays"]:
     """Return how many samples of each ray begin where more than `opaque_below` of the light is left."""
-    twin = cpu_twin("packed.cpu", density.device)
+    twin = cpu_twin("ragged.cpu", density.device)
     if twin is not None and density.dtype == torch.float32:
         return twin.num_visible(density, samples, opaque_below)
     counts = torch.zeros_like(samples.bounds[1:])

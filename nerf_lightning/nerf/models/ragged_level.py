@@ -9,22 +9,22 @@ from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel, render_who
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.models.sample_counter import SampleCounter
 from nerf_lightning.nerf.randomness import RayRandom
-from nerf_lightning.nerf.rendering.packed import composite_packed
-from nerf_lightning.nerf.rendering.sample_points import packed_points
-from nerf_lightning.nerf.samplers.base import PackedSampler, Sampler
+from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
+from nerf_lightning.nerf.samplers.base import RaggedSampler, Sampler
 from nerf_lightning.nerf.samplers.early_termination import LEAST_ALPHA, render_until_opaque, visible_samples
 from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.renderings import Rendering
 
 
-class PackedLevel(Level):
+class RaggedLevel(Level):
     """Sample, drop what lies behind opaque samples, ask the field, composite.
 
     Rays are first offered to a kernel that renders them from end to end; the way below is its reference.
     """
 
-    sampler: PackedSampler
-    sampler_kind = PackedSampler
+    sampler: RaggedSampler
+    sampler_kind = RaggedSampler
     has_static_shapes = False
     replays = True  # with arrays of a capacity, which no size is read for
 
@@ -50,8 +50,8 @@ class PackedLevel(Level):
         capacity = self.sampler.capacity_for(rays)
         dropped = 0 if capacity is None else samples.found - samples.found.clamp(max=capacity)
         self.counter.add(samples.found, rays.near.shape[0], torch.zeros_like(samples.found) + dropped)
-        output = self.field(packed_points(rays, samples, random, self.field.sees_cones), features)
-        return composite_packed(output, samples, rays, background)
+        output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
+        return composite_ragged(output, samples, rays, background)
 
     def takes_whole_rays(self, rays: RayBundle) -> bool:
         """Return whether training renders rays in one kernel, where cameras are not learnt."""
