@@ -169,8 +169,8 @@ def prepare_machine(num_threads: int | None) -> None:
 
 
 def _keep_float32() -> None:
-    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (matmul_precision.py). cuDNN would
-    # lower convolutions, SSIM's among them, unless it is told not to.
+    # A product of float32 numbers is float32 everywhere, but where a field lowers its own (matmul_precision.py). cuDNN
+    # would lower convolutions, SSIM's among them, unless it is told not to.
     torch.set_float32_matmul_precision("highest")
     torch.backends.cudnn.allow_tf32 = False
 

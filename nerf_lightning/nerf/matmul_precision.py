@@ -164,7 +164,7 @@ def tiles_of_rows(rows: int) -> list[slice]:
 def pad_rows(rows: Float[Tensor, "rows any"], dtype: torch.dtype) -> Float[Tensor, "padded any"]:
     """Return rows in a dtype; in bfloat16 with rows of zeros behind them, up to one of a dozen sizes.
 
-    The CPU's bfloat16 product is compiled anew for every number of rows and kept: 0.7 MB each, and packed samples come
+    The CPU's bfloat16 product is compiled anew for every number of rows and kept: 0.7 MB each, and ragged samples come
     in another number each time. Without this, training held 2 GB more.
 
     >>> pad_rows(torch.ones(3, 2), torch.bfloat16).shape, pad_rows(torch.ones(600, 2), torch.bfloat16).shape

@@ -48,7 +48,7 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
         found.append(Check(f"march{into}: rays with other intervals", 0.01, face, partial(_march, device, capacity)))
     for what in BOUNDS:
         compare = partial(_packed, device, what)
-        found.append(Check(f"packed samples: {what}", 8 * PACKED_SAMPLES * ROUNDING, sums, compare))
+        found.append(Check(f"ragged samples: {what}", 8 * PACKED_SAMPLES * ROUNDING, sums, compare))
     for matmul_precision in precisions:
         for what, bound in BOUNDS.items():
             compare, because = (

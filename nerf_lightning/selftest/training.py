@@ -37,7 +37,7 @@ METHODS = {
 }
 """The settings that make models of conf/model small."""
 LAYERS = 6
-"""MatmulPrecision of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
+"""Products of matrices that follow one another in a forward pass, at most: rounding adds up over them."""
 # Over 8 seeds, which change rays, jitter and weights at once, the PSNR of these trainings has a standard deviation of
 # 0.5 to 0.75 dB. What rounding does to a run must be less than that: all of 0.5 dB where products have 8 bits, half
 # where they have 11, and a tenth where only the order of sums differs.

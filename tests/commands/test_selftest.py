@@ -43,7 +43,7 @@ def test_kernels_that_are_off_by_one_percent_or_raise_are_wrong_and_the_rest_goe
     assert result.code == 1
     assert "WRONG: hash grid: features: 0.01 exceeds 9.54e-07 (16 roundings" in result.out
     assert "WRONG: perceptron, float32: gradients: SystemError: unknown opcode" in result.out
-    assert "packed samples: gradients" in result.out
+    assert "ragged samples: gradients" in result.out
     assert json.loads((tmp_path / "out" / "selftest.json").read_text())["right"] is False
 
 

@@ -97,7 +97,7 @@ def test_permute_is_a_bijection_of_any_size(size, key):
 @settings(max_examples=25, deadline=None)
 @given(size=st.integers(10**13 - 10**6, 10**13 + 10**6), start=st.integers(0, 10**13 - 10**6 - 8192))
 def test_permute_of_ten_trillion_places_repeats_none(size, start):
-    """10^13 pixels: 5 million photographs of 1080p. MatmulPrecision and sums must stay far below 2^63."""
+    """10^13 pixels: 5 million photographs of 1080p. Products and sums must stay far below 2^63."""
     index = torch.cat([torch.arange(4096), start + torch.arange(4096), size - 1 - torch.arange(4096)]).unique()
     places = permute(index, size, torch.tensor([fold(0, "rays", 0)]))
     assert int(places.min()) >= 0

@@ -60,8 +60,8 @@ MISTAKES = {
     "march into a fixed capacity: rays with other intervals": (
         torch, "nonzero_static", lambda right: lambda flat, **options: right(flat, **options).flip(0),
     ),
-    "packed samples: value": (ragged_cpu, "integrate", off_by_one_percent),
-    "packed samples: gradients": (ragged_cpu, "integrate_gradient", off_by_one_percent),
+    "ragged samples: value": (ragged_cpu, "integrate", off_by_one_percent),
+    "ragged samples: gradients": (ragged_cpu, "integrate_gradient", off_by_one_percent),
     "perceptron, float32: value": (mlp_cpu, "forward", rounded),
     "perceptron, float32: gradients": (mlp_cpu, "backward", weight_gradients),
 }  # fmt: skip
@@ -85,6 +85,6 @@ def test_a_kernel_that_does_not_compile_is_said_to_be_replaced(device, library, 
 
 
 def test_the_reference_does_not_go_through_what_it_checks(monkeypatch):
-    """On the CPU the twins of march and packed samples are numba's: the reference must be torch."""
+    """On the CPU the twins of march and ragged samples are numba's: the reference must be torch."""
     monkeypatch.setattr(packed, "cpu_twin", lambda *given: None)
-    assert carried_out(CHECKS["packed samples: value"]).outcome == "ok"
+    assert carried_out(CHECKS["ragged samples: value"]).outcome == "ok"

@@ -1,4 +1,4 @@
-"""Volume rendering of packed samples: the quadrature of `rendering.quadrature`, in the other layout."""
+"""Volume rendering of ragged samples: the quadrature of `rendering.quadrature`, in the other layout."""
 
 import torch
 from jaxtyping import Float, Int

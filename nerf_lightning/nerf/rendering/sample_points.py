@@ -33,7 +33,7 @@ def points_along(rays: RayBundle, samples: RaySamples, random: RayRandom | None,
 def ragged_points(
     rays: RayBundle, samples: RaggedSamples, random: RayRandom | None, cones: bool = False, first: int = 0
 ) -> Points:
-    """Return the midpoints of packed samples: one axis.
+    """Return the midpoints of ragged samples: one axis.
 
     The arguments are those of `points_along`; `first` is the number that each ray's first sample has there.
     """

@@ -67,7 +67,7 @@ class RaggedSamples(TensorStruct):
     """Only the intervals that may hold something, ray after ray, each ray's in order.
 
     The arrays have a capacity; what lies beyond the last bound is padding of zero length, spread over the rays, since a
-    GPU adds up what flows back to one ray one by one. It is packed for speed, and has functions of its own
+    GPU adds up what flows back to one ray one by one. It is ragged for speed, and has functions of its own
     (`rendering.ragged`).
     """
 

@@ -1,4 +1,4 @@
-"""Rendering of packed samples: the twins, and the dense quadrature."""
+"""Rendering of ragged samples: the twins, and the dense quadrature."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What GPUs do with packed samples, without one: a fixed capacity, no number read, nothing sent there within a step.
+"""What GPUs do with ragged samples, without one: a fixed capacity, no number read, nothing sent there within a step.
 
 On the meta device nothing has a value, so whatever reads one is refused; and what goes from the host to it is seen.
 """

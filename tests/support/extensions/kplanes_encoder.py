@@ -1,4 +1,4 @@
-"""MatmulPrecision of the features of three planes, kept smooth by their total variation (K-Planes, arXiv 2301.10241)."""
+"""Products of the features of three planes, kept smooth by their total variation (K-Planes, arXiv 2301.10241)."""
 
 import torch
 from torch import nn

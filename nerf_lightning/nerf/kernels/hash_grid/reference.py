@@ -39,7 +39,7 @@ def _corners(device: torch.device) -> Int[Tensor, "8 3"]:
 def _entries(vertex: Int[Tensor, "points 8 3"], level: int, layout: "HashGridLayout") -> Int[Tensor, "points 8"]:
     x, y, z = vertex.unbind(-1)
     if layout.is_hashed(level):
-        # MatmulPrecision of at most 2^32 and a few thousand stay below 2^63.
+        # Products of at most 2^32 and a few thousand stay below 2^63.
         index = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (layout.table_size - 1)
     else:
         side = layout.resolutions[level] + 1

@@ -1,7 +1,7 @@
 """The perceptron for the CPU: a few rows at a time go through all layers, in the cache.
 
 What is lost elsewhere is not arithmetic but the way between layers: a framework writes, casts and reads again what here
-stays in 128 rows of activations. MatmulPrecision are of float32 numbers, or, on CPUs with AVX512-BF16, of bfloat16 ones and
+stays in 128 rows of activations. Products are of float32 numbers, or, on CPUs with AVX512-BF16, of bfloat16 ones and
 exact; the weights' dtype says which. Sums are float32.
 
 The last layer's width is padded to whole vectors. Words and kinds are those of `vectors.py`.

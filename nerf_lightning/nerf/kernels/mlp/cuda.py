@@ -1,6 +1,6 @@
 """The perceptron in bfloat16 for CUDA: a block of rows goes through all layers without leaving the registers.
 
-A framework writes and reads the activations of each layer; here only what the way back needs is written. MatmulPrecision are
+A framework writes and reads the activations of each layer; here only what the way back needs is written. Products are
 of bfloat16 numbers, sums are float32. `TRITON_INTERPRET=1` runs the kernels without a GPU.
 """
 

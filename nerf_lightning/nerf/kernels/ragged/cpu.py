@@ -1,4 +1,4 @@
-"""Rendering of packed samples for the CPU: one loop over the samples of each ray, forward and backward."""
+"""Rendering of ragged samples for the CPU: one loop over the samples of each ray, forward and backward."""
 
 import math
 from typing import no_type_check

@@ -1,4 +1,4 @@
-"""Volume rendering of packed samples, and where rays become opaque.
+"""Volume rendering of ragged samples, and where rays become opaque.
 
 Letters as in `rendering.quadrature`. With g_j the loss's derivative by w_j, that by density is
 delta_i (T_{i+1} g_i - sum_{j>i} w_j g_j).

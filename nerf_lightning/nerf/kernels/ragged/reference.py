@@ -1,4 +1,4 @@
-"""Rendering of packed samples in plain torch: the reference, and what runs on GPUs."""
+"""Rendering of ragged samples in plain torch: the reference, and what runs on GPUs."""
 
 import torch
 from jaxtyping import Float
