@@ -87,7 +87,7 @@ def test_what_a_run_measured_is_kept_but_does_not_overrule():
     assert named.inference_tile_points == 99
 
 
-@pytest.mark.parametrize(("precision", "products"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
+@pytest.mark.parametrize(("precision", "matmul_precision"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
 def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_precision):
     model = TrainerSettings(accelerator="cpu", precision=precision).prepare(tiny_model())
     layers = [module for module in model.modules() if isinstance(module, Linear)]

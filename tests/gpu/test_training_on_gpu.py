@@ -40,7 +40,7 @@ def test_every_model_follows_the_cpu(model, device):
     assert float(expected[-10:].mean()) < float(expected[:3].mean())
 
 
-@pytest.mark.parametrize("products", ["float32", "tf32", "bfloat16"])
+@pytest.mark.parametrize("matmul_precision", ["float32", "tf32", "bfloat16"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_precision_learns_what_the_cpu_learns(method, matmul_precision, device):
     chosen = training.checks(device, (matmul_precision,), compiles=False)

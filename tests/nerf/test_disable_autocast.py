@@ -361,5 +361,5 @@ def test_who_multiplies_matrices_says_in_which_precision():
 
 def test_nothing_opens_autocast():
     for file in sorted(PACKAGE.rglob("*.py")):
-        if file.name != "products.py":
-            assert "autocast" not in file.read_text(encoding="utf-8"), f"{file}: see products.py"
+        text = file.read_text(encoding="utf-8").replace("disable_autocast", "")
+        assert file.name == "matmul_precision.py" or "autocast" not in text, f"{file}: see matmul_precision.py"

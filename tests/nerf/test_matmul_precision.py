@@ -64,7 +64,7 @@ def test_a_cpu_without_bfloat16_rounds_where_one_with_it_does(monkeypatch):
 
 
 def test_a_cpu_that_may_not_use_what_it_has_counts_as_one_without():
-    ask = "from nerf_lightning.nerf import products; print(products.cpu_multiplies_bfloat16())"
+    ask = "from nerf_lightning.nerf import matmul_precision; print(matmul_precision.cpu_multiplies_bfloat16())"
     ran = subprocess.run(
         [sys.executable, "-c", ask], env=os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}, capture_output=True, text=True
     )
@@ -131,7 +131,7 @@ import torch
 from nerf_lightning.nerf.matmul_precision import Linear
 for products in ("float32", "tf32", "bfloat16"):
     made, features = Linear(48, 40), torch.randn(16, 48)
-    made.products = products
+    made.matmul_precision = products
     compiled = torch.compile(made, backend="aot_eager", fullgraph=True, dynamic=False)
     torch.testing.assert_close(compiled(features), made(features), atol=1e-3, rtol=1.6e-2)
     compiled(features).float().sum().backward()

@@ -39,7 +39,8 @@ class Field(Part, ABC):
 
     matmul_precision: MatmulPrecision = "float32"
     """The precision of the products with the field's weights, and of nothing else: layers are
-    `matmul_precision.Linear`, and kernels are given this. A field that does neither multiplies in float32 everywhere, which is slow and right."""
+    `matmul_precision.Linear`, and kernels are given this. A field that does neither multiplies in float32 everywhere,
+    which is slow and right."""
 
     def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the field's weights; positions, densities and colours stay float32."""

@@ -29,7 +29,7 @@ def far_apart(found, expected):
 
 @pytest.mark.parametrize("jitter", [True, False])
 @pytest.mark.parametrize(
-    ("products", "most"), [("float32", 2e-4), pytest.param("bfloat16", 0.02, marks=needs_bfloat16)]
+    ("matmul_precision", "most"), [("float32", 2e-4), pytest.param("bfloat16", 0.02, marks=needs_bfloat16)]
 )
 @pytest.mark.parametrize(("features", "color_layers"), [(2, 1), (4, 2)])
 @pytest.mark.parametrize(("opaque_below", "bias"), [(0.0, 1.0), (1e-3, 4.0)])

@@ -18,7 +18,7 @@ def rendered(level, rays, background=None):
         return level(rays, background, [], None)
 
 
-@pytest.mark.parametrize("products", ["float32", pytest.param("bfloat16", marks=needs_bfloat16)])
+@pytest.mark.parametrize("matmul_precision", ["float32", pytest.param("bfloat16", marks=needs_bfloat16)])
 @pytest.mark.parametrize("features", [2, 4])
 @pytest.mark.parametrize("opaque_below", [0.0, 0.05])
 @pytest.mark.parametrize("bias", [1.0, 4.0])
