@@ -7,7 +7,7 @@ from jaxtyping import Int
 from packaging.version import Version
 from torch import Tensor
 
-from nerf_lightning.checkpoints.packing import Packed
+from nerf_lightning.checkpoints.quantization import Quantized
 from nerf_lightning.compute.cores import MOST_THREADS
 from nerf_lightning.data.captures.checks import check_cameras, check_scene
 from nerf_lightning.files.trust import Mismatch, require_fit
@@ -39,7 +39,7 @@ OF_A_RUN: dict[str, Any] = {
     "num_threads": Annotated[int, 1, MOST_THREADS],
     "world_size": int,
 }
-OPTIONAL: dict[str, Any] = {"refined": Cameras, "pixels": Int[Tensor, "views"], "packed": Packed}
+OPTIONAL: dict[str, Any] = {"refined": Cameras, "pixels": Int[Tensor, "views"], "quantized": Quantized}
 FILE: dict[str, Any] = {"state_dict": dict[str, Tensor], "global_step": int, KEY: object}
 TRAINING: dict[str, Any] = {
     "epoch": int,

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import FORMAT, KEY, require_checkpoint, scene_of
-from nerf_lightning.checkpoints.packing import unpacked
+from nerf_lightning.checkpoints.quantization import dequantized
 from nerf_lightning.data.captures.checks import check_scene
 from nerf_lightning.files.tensor_files import load_tensors
 from nerf_lightning.files.trust import Mismatch, reading, shown
@@ -98,7 +98,7 @@ def read_checkpoint(path: str | Path, to_resume: bool = False) -> Checkpoint:
         _Kept.content = _identity(path), content
     record, prefix = content[KEY], "model."
     with reading(path, _instead_of(path)):
-        state = content["state_dict"] | (unpacked(record["packed"], str(path)) if "packed" in record else {})
+        state = content["state_dict"] | (dequantized(record["quantized"], str(path)) if "quantized" in record else {})
     scene, refined = scene_of(record), Cameras(**record["refined"]) if "refined" in record else None
     return Checkpoint(
         path=path,

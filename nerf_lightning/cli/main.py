@@ -20,7 +20,7 @@ from nerf_lightning.cli.process import ends_quietly
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.cli.working_directory import require_no_settings_here
 from nerf_lightning.config.manual.suggestions import did_you_mean
-from nerf_lightning.files.budgets import Budgets, allow, allow_as_typed
+from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
@@ -138,7 +138,7 @@ def _run(command: str, arguments: list[str]) -> None:
         with quick_imports():
             module = command_module(command)
         # A job of a sweep may be in another process than the command line was read in.
-        allow(Budgets(**config.budgets))
+        set_limits(Budgets(**config.budgets))
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             from nerf_lightning.runs.sweep_job import run_job
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from nerf_lightning.cli.main import command_module, explained
 from nerf_lightning.cli.process import quick_end
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 
 
 def main() -> None:
@@ -33,7 +33,7 @@ def _run(command: str, folder: Path, launcher: int) -> None:
     end_with(launcher)
     setup_globals()
     config = OmegaConf.load(folder / "config.yaml")
-    allow(Budgets(**config.budgets))
+    set_limits(Budgets(**config.budgets))
     hydra = OmegaConf.merge(OmegaConf.structured(HydraConf), OmegaConf.load(folder / "hydra.yaml"))
     HydraConfig.instance().set_config(OmegaConf.create({"hydra": hydra}))
     configure_log(hydra.job_logging)

@@ -9,7 +9,7 @@ import yaml
 from hydra.utils import get_class
 
 from nerf_lightning.files.folders import conf_folder
-from nerf_lightning.nerf.kernels.backends import CPU_TWINS, KERNELS, twin
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, KERNELS, backend
 
 
 def exporter_class(name: str) -> Any:
@@ -22,9 +22,9 @@ def kernel_modules() -> list[str]:
     """Return the full names of the modules of CPU kernels: those of models and trainings, then each exporter's."""
     exporters = (exporter_class(file.stem) for file in sorted((conf_folder() / "what").glob("*.yaml")))
     of_exporters = [module for exporter in exporters for module in getattr(exporter, "kernels", ())]
-    return [*(f"{KERNELS}.{module}" for module in CPU_TWINS), *of_exporters]
+    return [*(f"{KERNELS}.{module}" for module in CPU_BACKENDS), *of_exporters]
 
 
 if __name__ == "__main__":
     for module in kernel_modules():
-        twin(module)
+        backend(module)

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from nerf_lightning.checkpoints.reading import Checkpoint
 from nerf_lightning.checkpoints.trusted_classes import require_trusted
 from nerf_lightning.config.instantiate import require_fitting_values
-from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.trust import reading, require_like
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.messages.errors import InputError
@@ -74,7 +74,7 @@ def hold_to_budgets(model: Model, where: str) -> None:
     """
     for part in model.modules():
         if isinstance(part, Sampler):
-            part.max_intervals = allowed().intervals
+            part.max_intervals = limits().intervals
     if not model.level_names:
         raise InputError(f"{where} has no level (model.levels is empty), and one at least makes the picture.")
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")

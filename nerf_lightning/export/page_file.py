@@ -16,7 +16,7 @@ from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.export.baking.baked_field import BakedField, described, packed, unpacked
+from nerf_lightning.export.baking.baked_field import BakedField, described, deserialized, serialized
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.base import PageExtras
@@ -70,7 +70,7 @@ def page_of(
     marcher: Marcher, record: SceneRecord, beside: PageExtras, max_photographs: int, facts: list[tuple[str, str]]
 ) -> Page:
     """Return the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
-    field = packed(marcher.baked)
+    field = serialized(marcher.baked)
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
     middle, radius = _middle(marcher.baked, record)
     up = record.cameras.c2w[:, :, 1].mean(dim=0)
@@ -130,7 +130,7 @@ def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
         raise InputError(f"{path} is no page of this program, or cut off. Export it again.")
     try:
         about = json.loads(found[0][1])
-        return about, unpacked(about, base64.b64decode(found[1][1], validate=True))
+        return about, deserialized(about, base64.b64decode(found[1][1], validate=True))
     except (ValueError, binascii.Error) as error:
         raise InputError(f"The page {path} is damaged: {error}. Export it again.") from error
 

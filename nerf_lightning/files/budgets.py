@@ -65,12 +65,12 @@ class _Now:
     budgets = Budgets()
 
 
-def allowed() -> Budgets:
+def limits() -> Budgets:
     """Return the budgets that hold in this process."""
     return _Now.budgets
 
 
-def allow(budgets: Budgets) -> None:
+def set_limits(budgets: Budgets) -> None:
     """Let these budgets hold from now on."""
     _Now.budgets = budgets
 
@@ -89,7 +89,7 @@ def allow_as_typed(arguments: Iterable[str]) -> None:
             if not value.isdecimal():
                 raise InputError(f"{key}={value}: give a whole number above 0.")
             typed[name] = int(value)
-    allow(Budgets(**typed))
+    set_limits(Budgets(**typed))
 
 
 def require_within(name: str, found: int, where: str, what: str) -> None:
@@ -104,7 +104,7 @@ def require_within(name: str, found: int, where: str, what: str) -> None:
     Raises:
         InputError: it is more than the budget, which the message names.
     """
-    most = getattr(allowed(), name)
+    most = getattr(limits(), name)
     if found > most:
         raise InputError(
             f"{where} has {found:,} {what}, and more than {most:,} are not taken from a file unasked. If you trust it, "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -23,7 +23,7 @@ def read_json(path: Path) -> Any:
         InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
     """
     try:
-        text = read_text(path, allowed().json_bytes, CURE, "utf-8-sig")
+        text = read_text(path, limits().json_bytes, CURE, "utf-8-sig")
         require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
         content = json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:
@@ -47,7 +47,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _require_flat(content: object, path: Path) -> None:
     # What follows walks through the content, and prints parts of it, by recursion.
-    level, most = [content], allowed().json_depth
+    level, most = [content], limits().json_depth
     for _ in range(most):
         level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
         if not level:

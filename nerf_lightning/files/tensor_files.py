@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
@@ -40,7 +40,7 @@ def load_tensors(path: Path) -> Any:
         pickle.UnpicklingError: it holds anything else than tensors and plain containers.
         Exception: whatever torch, zipfile and pickle raise for a file that is damaged, or of another kind.
     """
-    with open_regular(path, allowed().tensor_bytes) as file:
+    with open_regular(path, limits().tensor_bytes) as file:
         if zipfile.is_zipfile(file):
             pickles: list[Any] = [_objects_of_archive(file, path)]
         else:

@@ -3,7 +3,7 @@
 * Nothing in a file runs. PyTorch files are read with `weights_only`, yaml and json as data; classes come from an
   allow-list (`checkpoints.trusted_classes`), settings from an allow-list by group (`config.key_meanings`).
 * Weights and optimizer state must have the keys, shapes and dtypes of a template, which is what this config builds, and
-  be finite (`require_like`). Packed weights are unpacked within `budgets.unpacked_bytes` first.
+  be finite (`require_like`). Quantized weights are unpacked within `budgets.unpacked_bytes` first.
 * What stands beside them has the keys and kinds of its annotations (`require_fit`); a scene also passes the checks of
   every capture (`data.captures.checks.check_scene`).
 * Integers that index or size memory are checked against their range, where they are used.

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.messages.errors import InputError
 
@@ -27,8 +27,8 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it holds references (*name), which are not read from files")
         self.depth += 1
-        if self.depth > allowed().yaml_depth:
-            raise yaml.YAMLError(f"it nests more than {allowed().yaml_depth} deep")
+        if self.depth > limits().yaml_depth:
+            raise yaml.YAMLError(f"it nests more than {limits().yaml_depth} deep")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -45,7 +45,7 @@ def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
     Raises:
         InputError: it is no yaml, too long, or holds references.
     """
-    if len(text) > allowed().yaml_characters:
+    if len(text) > limits().yaml_characters:
         raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
     try:
         content = yaml.load(text, Loader=_PlainLoader)
@@ -63,7 +63,7 @@ def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
     Raises:
         InputError: it cannot be read, or `plain_yaml` refuses it.
     """
-    return plain_yaml(read_text(path, 4 * allowed().yaml_characters, cure), str(path), cure)
+    return plain_yaml(read_text(path, 4 * limits().yaml_characters, cure), str(path), cure)
 
 
 def _require_plain(content: Any) -> None:

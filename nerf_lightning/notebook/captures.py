@@ -8,7 +8,7 @@ from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import quoted
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.nerf.types.scene import Scene
 
 
@@ -40,6 +40,6 @@ def read(capture: str | os.PathLike[str] | None = None, *, scene: str = "auto", 
     overrides = [f"scene={scene}", *(f"scene.{key}={quoted(value)}" for key, value in given.items())]
     with in_words("train"):
         config, _ = compose_config("train", overrides)
-        allow(Budgets(**config.budgets))
+        set_limits(Budgets(**config.budgets))
         result: Scene = build(config.scene).read()
     return result

@@ -15,7 +15,7 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint
 from nerf_lightning.config.overrides import quoted
 from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.looking import show_photographs
@@ -132,7 +132,7 @@ def load(run: str | os.PathLike[str], *overrides: str) -> TrainedModel:
     """
     with in_words("render"):
         config, _ = compose_config("render", [f"ckpt={quoted(run)}", *overrides])
-        allow(Budgets(**config.budgets))
+        set_limits(Budgets(**config.budgets))
         opened = open_checkpoint(config)
     return TrainedModel(opened.model.eval(), opened.checkpoint, opened.tile_points)
 

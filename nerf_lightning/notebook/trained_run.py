@@ -10,7 +10,7 @@ from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.config.compose import composed_job
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.config.messages import in_words
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.notebook.trained_model import TrainedModel, load
@@ -48,7 +48,7 @@ def train(*overrides: str) -> TrainedRun:
         KeyboardInterrupt: the run was stopped; its checkpoint is saved.
     """
     with in_words("train"), composed_job("train", prepared("train", list(overrides))) as config:
-        allow(Budgets(**config.budgets))
+        set_limits(Budgets(**config.budgets))
         _require_one_process(config.trainer)
         try:
             done = train_in_folder(config)

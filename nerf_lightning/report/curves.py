@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.html import data_address
 from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
@@ -150,7 +150,7 @@ def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:
 
 
 def _copy(files: list[Path], folder: Path) -> None:
-    left = allowed().event_bytes
+    left = limits().event_bytes
     for file in files:
         content = read_bytes(file, left, "Leave it out of the folder.")
         left -= len(content)

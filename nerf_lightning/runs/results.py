@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from nerf_lightning.config.key_meanings import PLACES, meaning_of
 from nerf_lightning.evaluation.metrics_files import METRICS
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.json_files import number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
@@ -106,9 +106,9 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
 
 def _runs_below(folder: Path) -> Iterator[Path]:
     for count, (base, below, names) in enumerate(walk(folder)):
-        if count > allowed().folders:
+        if count > limits().folders:
             raise InputError(
-                f"{folder} holds more than {allowed().folders:,} folders. Name the runs more closely, or add "
+                f"{folder} holds more than {limits().folders:,} folders. Name the runs more closely, or add "
                 "budgets.folders=N."
             )
         below.sort()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.kernels import backends
-from nerf_lightning.nerf.kernels.backends import CPU_TWINS
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import interpolate
 from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
@@ -35,11 +35,12 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
 
     The others (Adam, carving, search, where rays become opaque) are part of the trainings that `training` compares.
     """
-    twins, library = (("hash_grid.cuda", "mlp.cuda"), "triton") if device.type == "cuda" else (CPU_TWINS, "numba")
+    names, library = (("hash_grid.cuda", "mlp.cuda"), "triton") if device.type == "cuda" else (CPU_BACKENDS, "numba")
     face = "the share of rays of which a midpoint lies on a cell's face to the last bits: about 1 in 1000"
     sums = f"sums of at most {PACKED_SAMPLES} terms, whose transmittances are exponentials of such sums"
     found = [
-        Check(f"{twin} ({library}): compiles and runs", 0.0, "or torch works", partial(_loads, twin)) for twin in twins
+        Check(f"{backend} ({library}): compiles and runs", 0.0, "or torch works", partial(_loads, backend))
+        for backend in names
     ]
     for place, (what, terms) in enumerate(HASH_GRID_SUMS.items()):
         compare = partial(_hash_grid, device, place)
@@ -61,10 +62,10 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
     return found
 
 
-def _loads(twin: str) -> float:
-    if backends.twin(f"{backends.KERNELS}.{twin}") is None:
+def _loads(backend: str) -> float:
+    if backends.backend(f"{backends.KERNELS}.{backend}") is None:
         raise CannotRun(
-            f"{backends.why_not(f'{backends.KERNELS}.{twin}')}: plain torch does its work, many times slower"
+            f"{backends.why_not(f'{backends.KERNELS}.{backend}')}: plain torch does its work, many times slower"
         )
     return 0.0
 

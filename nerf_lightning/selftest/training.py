@@ -11,7 +11,7 @@ from nerf_lightning.data.pixels.placement import on_device
 from nerf_lightning.data.ray_batches import FixedRays, RayBatches
 from nerf_lightning.evaluation.metrics import RayErrors
 from nerf_lightning.nerf.encoders.base import tables_of
-from nerf_lightning.nerf.kernels.backends import CPU_TWINS, can_compile, without
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, can_compile, without
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.selftest.check import CannotRun, Check, gradient_bound, norm_apart
@@ -113,14 +113,14 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision], compiles
 @cache
 def reference_gradients(method: str) -> dict[str, Tensor]:
     """Return the gradients of the first batch, by plain torch on the CPU, in float32, without tiles."""
-    with without(*CPU_TWINS):
+    with without(*CPU_BACKENDS):
         return Training(method, CPU, "float32", None).gradients()
 
 
 @cache
 def reference_psnr(method: str) -> float:
     """Return the PSNR of a training by the same."""
-    with without(*CPU_TWINS):
+    with without(*CPU_BACKENDS):
         return Training(method, CPU, "float32", None).psnr()
 
 

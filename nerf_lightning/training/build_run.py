@@ -16,7 +16,7 @@ from nerf_lightning.config.instantiate import build, required_path
 from nerf_lightning.config.overrides import key_of
 from nerf_lightning.data.datamodule import RayDataModule
 from nerf_lightning.data.pixels.decoding import photograph_hashes
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.models.base import Model
@@ -69,7 +69,7 @@ def build_run(*overrides: str, model: Model | None = None, loss: Loss | None = N
     """
     _refuse_settings_of_the_trainer(overrides)
     config, choices = compose_config("train", overrides)
-    allow(Budgets(**config.budgets))
+    set_limits(Budgets(**config.budgets))
     settings: TrainerSettings = build(config.trainer)
     settings.prepare_machine()
     scene: Scene = build(config.scene).read()

@@ -15,10 +15,10 @@ from nerf_lightning.export.baking.baked_field import (
     EXPONENT_STEP,
     LEAST_EXPONENT,
     described,
-    packed,
+    deserialized,
+    serialized,
     tiles_of,
     to_bytes_of_density,
-    unpacked,
 )
 from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.export.baking.cost import measured_cost
@@ -122,17 +122,17 @@ def test_a_tile_borders_on_the_first_values_of_the_next_blocks():
 @pytest.mark.parametrize("given", [{}, {"contraction": Contraction((1.0, -2.0, 0.5), 3.0, 0.1), "closed": True}])
 def test_what_is_packed_comes_back(baked, given):
     baked = replace(baked, **given)
-    again = unpacked(described(baked), packed(baked))
+    again = deserialized(described(baked), serialized(baked))
     for name, value in vars(baked).items():
         np.testing.assert_array_equal(getattr(again, name), value)
-    assert packed(baked) == packed(again)
+    assert serialized(baked) == serialized(again)
 
 
 @pytest.mark.parametrize("harm", [lambda b: b[:-9], lambda b: b[:40] + b"\0\0\0" + b[43:], lambda b: b""])
 def test_a_damaged_field_is_refused(baked, harm):
-    refused(unpacked, described(baked), harm(packed(baked)), parts=("damaged or cut off", "Export it again"))
+    refused(deserialized, described(baked), harm(serialized(baked)), parts=("damaged or cut off", "Export it again"))
     for key in ("blocks", "lower", "harmonics"):
-        refused(unpacked, described(baked) | {key: 1}, packed(baked), parts=("damaged or cut off",))
+        refused(deserialized, described(baked) | {key: 1}, serialized(baked), parts=("damaged or cut off",))
 
 
 def test_normalised_device_coordinates_are_baked_as_they_are():

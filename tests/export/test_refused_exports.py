@@ -114,7 +114,7 @@ def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, library
 
 
 def test_without_numba_a_fused_surface_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(layout, "twin", lambda module: None)
+    monkeypatch.setattr(layout, "backend", lambda module: None)
     with pytest.raises(InputError, match=r"what\.surface=tsdf needs numba.*take what\.surface=density"):
         exported(tmp_path, MeshExport(16, "tsdf"))
 

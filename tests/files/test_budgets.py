@@ -7,14 +7,14 @@ from omegaconf import OmegaConf
 from support.configs import composed, loaded
 
 from nerf_lightning.cli.main import find_commands
-from nerf_lightning.files.budgets import Budgets, allow, allow_as_typed, allowed, require_within
+from nerf_lightning.files.budgets import Budgets, allow_as_typed, limits, require_within, set_limits
 from nerf_lightning.messages.errors import InputError
 
 
 @pytest.fixture(autouse=True)
 def _defaults_afterwards():
     yield
-    allow(Budgets())
+    set_limits(Budgets())
 
 
 def test_the_yaml_has_the_table_that_the_code_has():
@@ -28,9 +28,9 @@ def test_every_command_has_it(command):
 
 def test_a_limit_is_raised_by_what_is_typed_and_by_nothing_else():
     allow_as_typed(["scene=npz", "budgets.views=7", "xbudgets.json_depth=3", "budgets.nothing=4"])
-    assert allowed() == Budgets(views=7)
+    assert limits() == Budgets(views=7)
     allow_as_typed([])
-    assert allowed() == Budgets()
+    assert limits() == Budgets()
 
 
 @pytest.mark.parametrize("value", ["0", "-3", "many", "1.5", ""])

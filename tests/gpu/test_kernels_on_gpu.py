@@ -40,7 +40,7 @@ def test_tritons_perceptron_agrees_on_whole_numbers(cuda):
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 1 << 20])
 def test_triton_takes_any_number_of_points(count, cuda, generator):
     kernels = "nerf_lightning.nerf.kernels.hash_grid.cuda"
-    assert backends.twin(kernels) is not None, backends.why_not(kernels)
+    assert backends.backend(kernels) is not None, backends.why_not(kernels)
     layout = hash_grid_layout(16, 19, 16, 2048)  # model=fast_large: the last entry's place takes 24 bits
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.randint(0, 4096, (count, 3), generator=generator) / 4096.0
@@ -72,6 +72,6 @@ def test_where_triton_does_not_compile_plain_torch_does_its_work(device, generat
     table = torch.randn(layout.offsets[-1], 2, generator=generator)
     points = torch.rand(500, 3, generator=generator)
     expected = interpolate(table.double(), points.double(), layout)
-    monkeypatch.setattr("nerf_lightning.nerf.kernels.hash_grid.interpolate.cuda_twin", lambda *given: None)
+    monkeypatch.setattr("nerf_lightning.nerf.kernels.hash_grid.interpolate.cuda_backend", lambda *given: None)
     found = interpolate(table.to(device), points.to(device), layout)
     torch.testing.assert_close(found.cpu().double(), expected, rtol=0, atol=1e-4)

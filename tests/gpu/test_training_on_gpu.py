@@ -5,7 +5,7 @@ import torch
 from support.configs import options
 from support.gpu_training import step_by_step
 
-from nerf_lightning.nerf.kernels.backends import CPU_TWINS, without
+from nerf_lightning.nerf.kernels.backends import CPU_BACKENDS, without
 from nerf_lightning.selftest import training
 from nerf_lightning.selftest.check import carried_out
 from nerf_lightning.selftest.training import METHODS
@@ -30,7 +30,7 @@ def losses(model, device, tile_points=None):
 def test_every_model_follows_the_cpu(model, device):
     """For 50 steps, within ten times what another order of sums does to the CPU's own losses up to that step."""
     expected = losses(model, CPU)
-    with without(*CPU_TWINS):
+    with without(*CPU_BACKENDS):
         otherwise = losses(model, CPU, TILE_POINTS)
     found = losses(model, device, TILE_POINTS)
     apart = ((otherwise - expected).abs() / expected).cummax(0).values

@@ -76,7 +76,7 @@ def test_a_kernel_that_is_off_by_one_percent_or_lowers_its_precision_is_wrong(na
 
 @pytest.mark.parametrize(("device", "library"), [("cpu", "numba"), ("cuda", "triton")])
 def test_a_kernel_that_does_not_compile_is_said_to_be_replaced(device, library, monkeypatch):
-    monkeypatch.setattr(backends, "twin", lambda module: None)
+    monkeypatch.setattr(backends, "backend", lambda module: None)
     monkeypatch.setattr(backends, "why_not", lambda module: "ModuleNotFoundError: it is not there")
     found = [each for each in checks(torch.device(device), ("float32",)) if f"({library})" in each.name]
     rows = [carried_out(each) for each in found]
@@ -86,5 +86,5 @@ def test_a_kernel_that_does_not_compile_is_said_to_be_replaced(device, library, 
 
 def test_the_reference_does_not_go_through_what_it_checks(monkeypatch):
     """On the CPU the twins of march and ragged samples are numba's: the reference must be torch."""
-    monkeypatch.setattr(packed, "cpu_twin", lambda *given: None)
+    monkeypatch.setattr(packed, "cpu_backend", lambda *given: None)
     assert carried_out(CHECKS["ragged samples: value"]).outcome == "ok"

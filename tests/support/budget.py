@@ -3,15 +3,15 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from nerf_lightning.files.budgets import Budgets, allow, allowed
+from nerf_lightning.files.budgets import Budgets, limits, set_limits
 
 
 @contextmanager
-def budget(**limits: int) -> Iterator[None]:
+def budget(**changed: int) -> Iterator[None]:
     """Let other limits hold within the block."""
-    before = allowed()
-    allow(Budgets(**limits))
+    before = limits()
+    set_limits(Budgets(**changed))
     try:
         yield
     finally:
-        allow(before)
+        set_limits(before)

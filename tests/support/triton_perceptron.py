@@ -21,12 +21,12 @@ def _weight(outer, inner, generator):
 
 
 def check_perceptron(device, counts):
-    from nerf_lightning.nerf.kernels.mlp import cuda as twin
+    from nerf_lightning.nerf.kernels.mlp import cuda as backend
 
-    twin.trial(device)
+    backend.trial(device)
     generator = torch.Generator().manual_seed(7)
     for sizes in SIZES:
-        assert twin.takes(sizes, torch.device(device))
+        assert backend.takes(sizes, torch.device(device))
         weights = [_weight(outer, inner, generator).to(device) for inner, outer in pairwise(sizes)]
         for count in counts:
             points = torch.randint(-3, 4, (count, sizes[0]), generator=generator).float().to(device)
@@ -34,12 +34,12 @@ def check_perceptron(device, counts):
             leaves = [each.clone().requires_grad_() for each in (points, *weights)]
             expected = mlp_torch(leaves[0], leaves[1:])
             expected.backward(grad)
-            out, kept = twin.forward(points, weights, keep=True)
-            of_points, of_weights = twin.backward(grad, weights, kept, wants_points=True)
+            out, kept = backend.forward(points, weights, keep=True)
+            of_points, of_weights = backend.backward(grad, weights, kept, wants_points=True)
             assert torch.equal(out, expected.detach()), (sizes, count)
             for found, leaf in zip((of_points, *of_weights), leaves, strict=True):
                 assert torch.equal(found, leaf.grad), (sizes, count, found.shape)
-            assert torch.equal(twin.forward(points, weights, keep=False)[0], out)
-            assert twin.backward(grad, weights, kept, wants_points=False)[0] is None
-    assert not twin.takes((32, 3), torch.device(device))
-    assert not twin.takes((32, 256, 3), torch.device(device))
+            assert torch.equal(backend.forward(points, weights, keep=False)[0], out)
+            assert backend.backward(grad, weights, kept, wants_points=False)[0] is None
+    assert not backend.takes((32, 3), torch.device(device))
+    assert not backend.takes((32, 256, 3), torch.device(device))

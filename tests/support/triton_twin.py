@@ -8,9 +8,9 @@ from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 
 def check_against_the_reference(device: str, count: int) -> None:
     """Compare values and gradients, of tables in float32 and in half precision."""
-    from nerf_lightning.nerf.kernels.hash_grid import cuda as twin
+    from nerf_lightning.nerf.kernels.hash_grid import cuda as backend
 
-    twin.trial(device)
+    backend.trial(device)
     # Each has dense levels and hashed ones.
     for features, levels, size in ((2, 2, 10), (4, 3, 12)):
         layout = hash_grid_layout(levels, size, 4, 64)
@@ -20,9 +20,9 @@ def check_against_the_reference(device: str, count: int) -> None:
         leaf = table.clone().requires_grad_()
         expected = interpolate_torch(leaf, points, layout)
         expected.backward(grad)
-        found, gradient = twin.forward(table, points, layout), torch.zeros_like(table)
-        twin.add_table_gradient(gradient, points, grad, layout)
+        found, gradient = backend.forward(table, points, layout), torch.zeros_like(table)
+        backend.add_table_gradient(gradient, points, grad, layout)
         assert float((found - expected.detach()).norm() / expected.detach().norm()) < 1e-5
         assert float((gradient - leaf.grad).norm() / leaf.grad.norm()) < 1e-5
-        half = twin.forward(table.half(), points, layout)
+        half = backend.forward(table.half(), points, layout)
         assert 1e-6 < float((half - expected.detach()).norm() / expected.detach().norm()) < 2e-3

@@ -88,16 +88,16 @@ def _prepared(function: types.FunctionType, typechecker: Any) -> Callable:
     # Axes that are named by arguments; and what beartype would look at only when the first value is taken.
     if any("{" in array.dim_str for array in arrays) or inspect.isgeneratorfunction(function):
         return slowly_checked(function, typechecker=typechecker)
-    twin = types.FunctionType(
+    backend = types.FunctionType(
         function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
-    twin.__kwdefaults__, twin.__module__ = function.__kwdefaults__, function.__module__
-    twin.__qualname__, twin.__annotations__ = function.__qualname__, hints
+    backend.__kwdefaults__, backend.__module__ = function.__kwdefaults__, function.__module__
+    backend.__qualname__, backend.__annotations__ = function.__qualname__, hints
     if not arrays:
-        return beartype(twin, conf=CONF)
+        return beartype(backend, conf=CONF)
     if all(map(_follows_from_shapes, hints.values())):
-        return _once_for_shapes(twin)
-    quick = beartype(twin, conf=CONF)
+        return _once_for_shapes(backend)
+    quick = beartype(backend, conf=CONF)
 
     def within(*arguments: Any, **named: Any) -> Any:
         with slowly_checked("context"):

@@ -151,8 +151,8 @@ def test_what_starts_the_cuda_kernels_does_not_wait(model, monkeypatch):
     for module, (forward, backward) in kernels.items():
         monkeypatch.setattr(module, "_forward", forward)
         monkeypatch.setattr(module, "_backward", backward)
-    twins = {module.__name__: module for module in (hash_grid, mlp)}
-    monkeypatch.setattr(backends, "twin", twins.get)
+    known = {module.__name__: module for module in (hash_grid, mlp)}
+    monkeypatch.setattr(backends, "backend", known.get)
     with StandInDevice("cuda") as there:
         run = run_on(there, model, "bf16-mixed")
         step_and_render(there, run, named_waits(run.training.model))

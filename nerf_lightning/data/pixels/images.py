@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.bands import bands
@@ -213,13 +213,13 @@ def open_picture(path: Path) -> BufferedReader:
         InputError: it is no regular file, or is larger than any picture of `budgets.megapixels`.
         OSError: it cannot be opened.
     """
-    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * allowed().megapixels, CURE)
+    return open_regular(path, BYTES_PER_PIXEL * 1_000_000 * limits().megapixels, CURE)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the file, read its header, and refuse what has no one plain reading."""
-    most = allowed().megapixels
+    most = limits().megapixels
     with ExitStack() as opened:
         try:
             file = opened.enter_context(open_picture(path))

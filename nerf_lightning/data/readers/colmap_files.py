@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from nerf_lightning.files.budgets import allowed, require_within
+from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 
@@ -204,7 +204,7 @@ def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
 
 def _within(lines: Iterator[tuple[str, str]], budget: str, path: Path) -> Iterator[tuple[str, str]]:
     """Return the lines, and refuse more than a budget allows: a text does not say how many there are."""
-    most = getattr(allowed(), budget)
+    most = getattr(limits(), budget)
     for number, line in enumerate(lines):
         if number == most:
             raise InputError(

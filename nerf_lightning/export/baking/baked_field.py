@@ -130,7 +130,7 @@ def described(baked: BakedField) -> dict[str, Any]:
     }
 
 
-def packed(baked: BakedField) -> bytes:
+def serialized(baked: BakedField) -> bytes:
     """Return the bytes, compressed: blocks' numbers, densities, which values are coloured (bits), then each channel."""
     parts = (
         baked.blocks.astype("<i4"),
@@ -142,8 +142,8 @@ def packed(baked: BakedField) -> bytes:
     return gzip.compress(b"".join(part.tobytes() for part in parts), LEVEL, mtime=0)
 
 
-def unpacked(about: dict[str, Any], content: bytes) -> BakedField:
-    """Return the field that `described` and `packed` have made these of.
+def deserialized(about: dict[str, Any], content: bytes) -> BakedField:
+    """Return the field that `described` and `serialized` have made these of.
 
     Raises:
         InputError: they have not, or not all of it is there.

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.kernels.backends import twin, why_not
+from nerf_lightning.nerf.kernels.backends import backend, why_not
 
 ROOM = "nerf_lightning.export.voxel_kernels"
 SIDE = 8
@@ -54,7 +54,7 @@ def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.
         InputError: they cannot be compiled here.
     """
     name = f"{ROOM}.{module}"
-    found = twin(name)
+    found = backend(name)
     if found is None:
         raise InputError(f"{asked_by} needs numba, which cannot be used here: {why_not(name)}. {cure}")
     return found

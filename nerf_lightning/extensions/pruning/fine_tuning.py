@@ -12,7 +12,7 @@ from nerf_lightning.config.auto_settings import AUTO
 from nerf_lightning.config.compose import compose_config, composed_job
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.overrides import open_sections, quoted
-from nerf_lightning.files.budgets import Budgets, allow
+from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs.output_folder import beside_checkpoint
@@ -59,7 +59,7 @@ def fine_tune(overrides: list[str], checkpoint: Path, folder: Path) -> float | N
     """Train as `fine_tuning` says from a checkpoint into a run folder of its own; return the PSNR (dB)."""
     places = [f"init_from={quoted(str(checkpoint))}", f"paths.output_dir={quoted(str(folder))}"]
     with in_words("train"), composed_job("train", [*overrides, *places]) as config:
-        allow(Budgets(**config.budgets))
+        set_limits(Budgets(**config.budgets))
         return train(config)
 
 

@@ -21,7 +21,7 @@ import torch
 
 ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
-CPU_TWINS = (
+CPU_BACKENDS = (
     *("hash_grid.cpu", "march.cpu", "ragged.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
     *("render.cpu", "render.gradients"),
 )
@@ -37,7 +37,7 @@ _reasons: dict[str, str] = {}
 
 
 @functools.cache
-def twin(module: str) -> ModuleType | None:
+def backend(module: str) -> ModuleType | None:
     """Import and try a module of compiled kernels; None, and one warning with the cause, where that is impossible.
 
     Args:
@@ -83,7 +83,7 @@ def _tell_once(library: str) -> None:
 
 
 def why_not(module: str) -> str:
-    """Return why there is no twin, once `twin` has said so."""
+    """Return why there is no twin, once `backend` has said so."""
     return _reasons.get(module, "unknown")
 
 
@@ -183,16 +183,16 @@ def is_on(module: str) -> bool:
     return module not in _switched_off
 
 
-def cpu_twin(module: str, device: torch.device) -> ModuleType | None:
+def cpu_backend(module: str, device: torch.device) -> ModuleType | None:
     """Return a numba module of this room (`march.cpu`) for tensors on the CPU; else None."""
     if device.type != "cpu" or not is_on(module):
         return None
-    return twin(f"{KERNELS}.{module}")
+    return backend(f"{KERNELS}.{module}")
 
 
-def cuda_twin(module: str, device: torch.device) -> ModuleType | None:
+def cuda_backend(module: str, device: torch.device) -> ModuleType | None:
     """Return a triton module of this room for tensors on a CUDA device; else None."""
-    return twin(f"{KERNELS}.{module}") if device.type == "cuda" and is_on(module) else None
+    return backend(f"{KERNELS}.{module}") if device.type == "cuda" and is_on(module) else None
 
 
 def can_compile(device: torch.device) -> bool:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
-from nerf_lightning.nerf.kernels.backends import cpu_twin
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.kernels.carving import reference as carving_reference
 from nerf_lightning.nerf.types.scene import Scene
 
@@ -57,7 +57,7 @@ def possible_cells(
 
 def _steps(scene: Scene, centers: Tensor) -> ModuleType:
     plain = scene.cameras.lens_model == "pinhole" and centers.dtype == scene.cameras.c2w.dtype == torch.float32
-    twin = cpu_twin("carving.cpu", centers.device) if plain else None
+    twin = cpu_backend("carving.cpu", centers.device) if plain else None
     return carving_reference if twin is None else twin
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import points_from_user, unit_of
@@ -155,7 +155,7 @@ class CameraPath(ABC):
 
     def __post_init__(self) -> None:
         width, height, fov = self.width, self.height, self.fov
-        most = allowed().film_frames
+        most = limits().film_frames
         check_setting("num_frames", self.num_frames, self.num_frames >= 1, "at least 1")
         limit = f"at most {most:,} (more with budgets.film_frames)"
         check_setting("num_frames", self.num_frames, self.num_frames <= most, limit)

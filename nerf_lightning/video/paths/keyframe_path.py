@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from nerf_lightning.files.budgets import allowed
+from nerf_lightning.files.budgets import limits
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.paths.base import CameraPath, PathFrame
@@ -76,10 +76,10 @@ class KeyframePath(CameraPath):
         return max(1, round(self.times[-1] * self.fps) + (not self.closed))
 
     def _check_length(self, file: str) -> None:
-        if self._count() > allowed().film_frames:
+        if self._count() > limits().film_frames:
             raise InputError(
                 f"{file}: the times of its keyframes last {self.times[-1]:,.6g} seconds, which makes {self._count():,} "
-                f"frames at path.fps={self.fps}; more than {allowed().film_frames:,} are not taken from times. "
+                f"frames at path.fps={self.fps}; more than {limits().film_frames:,} are not taken from times. "
                 "Give them in seconds, or the number of frames with path.num_frames."
             )
 

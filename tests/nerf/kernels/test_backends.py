@@ -21,7 +21,7 @@ def anew(monkeypatch):
     former = numba.config.CACHE_DIR
 
     def forget():
-        for cached in (backends.twin, backends._warn_once, backends._tell_once, backends._cache_elsewhere):
+        for cached in (backends.backend, backends._warn_once, backends._tell_once, backends._cache_elsewhere):
             cached.cache_clear()
         backends._reasons.clear()
 
@@ -62,16 +62,16 @@ def test_whoever_waits_for_the_compiler_is_told_once(anew, monkeypatch, caplog, 
     monkeypatch.setattr(backends.importlib, "import_module", lambda name: slow)
     monkeypatch.setattr(backends, "LONG_SECONDS", 0.05)
     with caplog.at_level(logging.INFO):
-        backends.twin("nerf_lightning.nerf.kernels.hash_grid.cpu")
-        backends.twin("nerf_lightning.nerf.kernels.march.cpu")
+        backends.backend("nerf_lightning.nerf.kernels.hash_grid.cpu")
+        backends.backend("nerf_lightning.nerf.kernels.march.cpu")
     assert [each.count("the first time only") for each in caplog.messages] == [1] * said
 
 
 def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, caplog):
     monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial("PTX assembly failed"))
-    assert backends.cuda_twin("hash_grid.cuda", torch.device("cuda")) is None
+    assert backends.cuda_backend("hash_grid.cuda", torch.device("cuda")) is None
     assert "triton cannot be used here (RuntimeError: PTX assembly failed)" in caplog.text
-    assert backends.cuda_twin("hash_grid.cuda", torch.device("cpu")) is None
+    assert backends.cuda_backend("hash_grid.cuda", torch.device("cpu")) is None
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, c
 )
 def test_without_a_c_compiler_or_its_headers_the_message_names_them(words, anew, monkeypatch, caplog):
     monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial(words))
-    assert backends.cuda_twin("hash_grid.cuda", torch.device("cuda")) is None
+    assert backends.cuda_backend("hash_grid.cuda", torch.device("cuda")) is None
     assert "apt install gcc python3-dev" in caplog.text
     assert "Reinstall" not in caplog.text
 
@@ -100,8 +100,8 @@ def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(ane
     numba.config.CACHE_DIR = ""
     monkeypatch.setattr(backends.importlib, "import_module", without_cache)
     with caplog.at_level(logging.WARNING):
-        assert backends.twin("nerf_lightning.nerf.kernels.march.cpu") is found
-        assert backends.twin("nerf_lightning.nerf.kernels.adam.cpu") is found
+        assert backends.backend("nerf_lightning.nerf.kernels.march.cpu") is found
+        assert backends.backend("nerf_lightning.nerf.kernels.adam.cpu") is found
     assert len(asked) == 3
     assert os.access(numba.config.CACHE_DIR, os.W_OK)
     assert [record.getMessage().partition(" (")[0] for record in caplog.records] == [
@@ -114,7 +114,7 @@ def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
     (tmp_path / "file").touch()
     places = {"NUMBA_CACHE_DIR": f"{tmp_path}/file/below", "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
     program = (
-        "from nerf_lightning.nerf.kernels.backends import twin; print(twin('nerf_lightning.nerf.kernels.adam.cpu'))"
+        "from nerf_lightning.nerf.kernels.backends import backend; print(backend('nerf_lightning.nerf.kernels.adam.cpu'))"
     )
     result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
     assert "adam/cpu.py" in result.stdout, result.stderr
@@ -124,8 +124,8 @@ def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
 KEPT = """
 import logging
 logging.basicConfig()
-from nerf_lightning.nerf.kernels.backends import twin
-print(twin("nerf_lightning.nerf.kernels.adam.cpu"))
+from nerf_lightning.nerf.kernels.backends import backend
+print(backend("nerf_lightning.nerf.kernels.adam.cpu"))
 """
 
 

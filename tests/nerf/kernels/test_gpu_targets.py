@@ -91,7 +91,7 @@ def test_a_kernel_that_does_not_fit_leaves_the_work_to_torch_and_says_so_once(mo
     points, weights = torch.rand(5, 32), [torch.rand(64, 32), torch.rand(3, 64)]
     expected = mlp_torch(points, weights, "bfloat16")
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
-    monkeypatch.setattr("nerf_lightning.nerf.kernels.mlp.mlp.cuda_twin", lambda module, device: mlp)
+    monkeypatch.setattr("nerf_lightning.nerf.kernels.mlp.mlp.cuda_backend", lambda module, device: mlp)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             assert torch.equal(any_mlp(points, weights, "bfloat16"), expected)

@@ -33,7 +33,7 @@ def values_and_gradients(fn, table, points, grad, layout):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("features", [1, 2, 4])
 def test_the_numba_twin_equals_the_reference(layout, features):
-    assert backends.twin("nerf_lightning.nerf.kernels.hash_grid.cpu") is not None
+    assert backends.backend("nerf_lightning.nerf.kernels.hash_grid.cpu") is not None
     given = inputs(layout, features, reach=1.2)  # some points lie outside
     fast = values_and_gradients(interpolate, *given, layout)
     slow = values_and_gradients(interpolate_torch, *given, layout)
@@ -98,16 +98,16 @@ def test_without_numba_the_torch_twin_runs_after_one_warning(monkeypatch, caplog
         raise OSError("libLLVM is missing")
 
     monkeypatch.setattr(backends.importlib, "import_module", broken)
-    backends.twin.cache_clear()
+    backends.backend.cache_clear()
     backends._warn_once.cache_clear()
     try:
         layout = LAYOUTS[0]
         given = inputs(layout, 2)
         found = values_and_gradients(interpolate, *given, layout)
-        backends.twin.cache_clear()
+        backends.backend.cache_clear()
         values_and_gradients(interpolate, *given, layout)
     finally:
-        backends.twin.cache_clear()
+        backends.backend.cache_clear()
         backends._warn_once.cache_clear()
     expected = values_and_gradients(interpolate_torch, *given, layout)
     for one, other in zip(found, expected, strict=True):

@@ -22,7 +22,7 @@ ROWS = [0, 1, 2, 127, 128, 129, TILE_ROWS + 17]
 
 @pytest.fixture
 def kernels():
-    return backends.twin("nerf_lightning.nerf.kernels.mlp.cpu")
+    return backends.backend("nerf_lightning.nerf.kernels.mlp.cpu")
 
 
 @pytest.fixture(params=["float32", pytest.param("bfloat16", marks=needs_bfloat16)])

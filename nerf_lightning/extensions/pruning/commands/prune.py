@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning import __version__
 from nerf_lightning.checkpoints.format import KEY
-from nerf_lightning.checkpoints.packing import NumberType
+from nerf_lightning.checkpoints.quantization import NumberType
 from nerf_lightning.checkpoints.reading import LAST, Checkpoint, read_content
 from nerf_lightning.checkpoints.writing import write_checkpoint
 from nerf_lightning.config.instantiate import require_fitting
@@ -17,8 +17,8 @@ from nerf_lightning.config.open_checkpoint import open_checkpoint, trusted_modul
 from nerf_lightning.config.overrides import to_type
 from nerf_lightning.extensions.pruning.fine_tuning import fine_tune, fine_tuning
 from nerf_lightning.extensions.pruning.narrower_model import shapes_of, widths_of, with_widths
-from nerf_lightning.extensions.pruning.packed_weights import packed_weights
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
+from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights
 from nerf_lightning.files.made_folders import below, make_folder
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
@@ -58,7 +58,7 @@ def run(config: DictConfig) -> float | None:
     text = with_widths(wide, after)
     weights = prune(model, shapes_of(wide, text), pruning, wide.scene, opened.tile_points)
     narrow = replace(wide, config=text, weights=weights)
-    packed = packed_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
+    quantized = quantized_weights(load_model(narrow, trusted_modules(config.trust)), config.tables, config.drop_empty)
     tuning = fine_tuning(wide, after, config.finetune_steps)
     with filled_folder(config.paths.output_dir, beside_checkpoint(wide.path, "pruned")) as folder:
         target, run = make_folder(folder, "checkpoints") / LAST, below(folder, "finetuned")
@@ -69,7 +69,7 @@ def run(config: DictConfig) -> float | None:
                 f"{run} holds a fine-tuning already. Go on with that one with nerf train {going_on}, or give another "
                 "folder with paths.output_dir=DIR."
             )
-        write_checkpoint(_content(narrow, packed), target)
+        write_checkpoint(_content(narrow, quantized), target)
         say(*(f"{name}  {before[name]} -> {width} neurons wide" for name, width in after.items()), _sizes(wide, target))
         return None if tuning is None else fine_tune(tuning, target, run)
 
@@ -87,12 +87,12 @@ def _require_own(target: Path) -> None:
         )
 
 
-def _content(narrow: Checkpoint, packed: dict[str, Any]) -> dict[str, Any]:
+def _content(narrow: Checkpoint, quantized: dict[str, Any]) -> dict[str, Any]:
     """Return what the file holds; training cannot go on from it, since an optimizer's state has the wider shapes."""
-    elsewhere = {name for part in packed.values() for name in part}
+    elsewhere = {name for part in quantized.values() for name in part}
     state = {f"model.{name}": tensor for name, tensor in narrow.weights.items()}
     record = {key: narrow.record[key] for key in KEPT if key in narrow.record}
-    record |= {"version": __version__, "config": narrow.config} | ({"packed": packed} if elsewhere else {})
+    record |= {"version": __version__, "config": narrow.config} | ({"quantized": quantized} if elsewhere else {})
     kept = {name: tensor for name, tensor in state.items() if name not in elsewhere}
     return {"state_dict": kept, "global_step": narrow.step, KEY: record}
 

@@ -13,8 +13,8 @@ from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.load_model import load_model
-from nerf_lightning.extensions.pruning.packed_weights import packed_weights, reached_entries
 from nerf_lightning.extensions.pruning.prune import Pruning, prunable_fields, prune
+from nerf_lightning.extensions.pruning.quantized_weights import quantized_weights, reached_entries
 from nerf_lightning.extensions.pruning.selection import Neurons, choose, coreset, importance
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -75,7 +75,9 @@ def test_rays_see_the_same_whatever_stands_where_they_look_nothing_up():
         assert torch.equal(before.rgb, model(rays, None, None)[-1].rgb)
         table[reached] = 100.0
         assert not torch.equal(before.rgb, model(rays, None, None)[-1].rgb)
-    refused(packed_weights, tiny_model(), "float32", True, parts=("drop_empty=true: this model has no occupancy grid",))
+    refused(
+        quantized_weights, tiny_model(), "float32", True, parts=("drop_empty=true: this model has no occupancy grid",)
+    )
 
 
 def test_a_narrower_checkpoint_is_one_like_others_and_only_it_is_written_over(nerf, tmp_path):

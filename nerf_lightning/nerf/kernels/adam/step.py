@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_twin
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 
 
 def adam_step(
@@ -30,9 +30,9 @@ def adam_step(
         eps: keeps the quotient finite.
     """
     arrays = (parameter.detach(), grad, first, second)
-    twin = cpu_twin("adam.cpu", parameter.device)
-    if twin is not None and all(x.is_contiguous() and x.dtype == torch.float32 for x in arrays):
-        twin.adam_step(*arrays, step_size, root_scale, betas, eps)
+    backend = cpu_backend("adam.cpu", parameter.device)
+    if backend is not None and all(x.is_contiguous() and x.dtype == torch.float32 for x in arrays):
+        backend.adam_step(*arrays, step_size, root_scale, betas, eps)
     else:
         adam_step_torch(*arrays, step_size, root_scale, betas, eps)
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
 from nerf_lightning.nerf.kernels.hash_grid.reference import interpolate_torch
 
@@ -37,10 +37,10 @@ def interpolate(
         layout: where the levels' entries lie.
         known: what this function returned for the same arguments without gradients: it is not computed again.
     """
-    twin = cpu_twin("hash_grid.cpu", points.device) or cuda_twin("hash_grid.cuda", points.device)
-    if twin is None or table.dtype == torch.float64:
+    backend = cpu_backend("hash_grid.cpu", points.device) or cuda_backend("hash_grid.cuda", points.device)
+    if backend is None or table.dtype == torch.float64:
         return interpolate_torch(table, points, layout)
-    return _Interpolate.apply(table, points.float().contiguous(), layout, twin, known)
+    return _Interpolate.apply(table, points.float().contiguous(), layout, backend, known)
 
 
 @dataclass(frozen=True)
@@ -114,20 +114,20 @@ _held = _Held()
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, twin: Any, known: Any) -> Tensor:
+    def forward(ctx: Any, table: Tensor, points: Tensor, layout: HashGridLayout, backend: Any, known: Any) -> Tensor:
         ctx.save_for_backward(table, points)
-        ctx.layout, ctx.twin = layout, twin
+        ctx.layout, ctx.backend = layout, backend
         if known is not None:
             return known.view_as(known)
-        return twin.forward(table.detach(), points.detach(), layout)
+        return backend.forward(table.detach(), points.detach(), layout)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         table, points = ctx.saved_tensors  # type: ignore[attr-defined]
-        layout, twin = ctx.layout, ctx.twin  # type: ignore[attr-defined]
+        layout, backend = ctx.layout, ctx.backend  # type: ignore[attr-defined]
         wants_table, wants_points = ctx.needs_input_grad[:2]  # type: ignore[attr-defined]
         grad = grad.float().contiguous()
-        grad_table = table_gradient(table, points, grad, layout, twin) if wants_table else None
-        grad_points = twin.point_gradient(table.detach(), points, grad, layout) if wants_points else None
+        grad_table = table_gradient(table, points, grad, layout, backend) if wants_table else None
+        grad_points = backend.point_gradient(table.detach(), points, grad, layout) if wants_points else None
         return grad_table, grad_points, None, None, None

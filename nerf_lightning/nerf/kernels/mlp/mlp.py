@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_twin, cuda_twin, is_on
+from nerf_lightning.nerf.kernels.backends import cpu_backend, cuda_backend, is_on
 from nerf_lightning.nerf.kernels.mlp import tiles
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision, linear
 
@@ -46,14 +46,14 @@ def _kernels_for(
     if points.dtype == torch.float64:
         return None
     if points.is_cuda:
-        kernels = cuda_twin("mlp.cuda", points.device) if matmul_precision == "bfloat16" else None
+        kernels = cuda_backend("mlp.cuda", points.device) if matmul_precision == "bfloat16" else None
         sizes = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
         takes = kernels is not None and kernels.takes(sizes, points.device)
         return (kernels, torch.float32) if kernels is not None and takes else None  # it rounds by itself
     if not points.is_cpu or not is_on("mlp.cpu"):
         return None
     kernels, dtype = (
-        cpu_twin("mlp.cpu", points.device),
+        cpu_backend("mlp.cpu", points.device),
         torch.bfloat16 if matmul_precision == "bfloat16" else points.dtype,
     )
     return (kernels if kernels is not None and kernels.takes(weights, dtype) else tiles), dtype

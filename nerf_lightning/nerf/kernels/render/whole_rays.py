@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.nerf.kernels.backends import cpu_twin, is_on
+from nerf_lightning.nerf.kernels.backends import cpu_backend, is_on
 from nerf_lightning.nerf.kernels.march.grid import GridMarch
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
@@ -39,12 +39,12 @@ def has_kernel(
         gradients: whether they are wanted, for the field's parameters alone.
     """
     module = LEARNING if gradients else RENDERING
-    perceptrons = cpu_twin("mlp.cpu", device) if field is not None and is_on(module) else None
+    perceptrons = cpu_backend("mlp.cpu", device) if field is not None and is_on(module) else None
     if field is None or perceptrons is None or field.table.dtype != torch.float32:
         return False
     if not all(perceptrons.takes(each, _dtype(matmul_precision)) for each in field.weights):
         return False
-    return cpu_twin(module, device) is not None
+    return cpu_backend(module, device) is not None
 
 
 def render_whole_rays(
@@ -67,7 +67,7 @@ def render_whole_rays(
         least_alpha: in rendering, samples less opaque than this have no colour.
         samples_per_ray: how many are expected in training; None: render without gradients.
     """
-    kernels: Any = cpu_twin(RENDERING if samples_per_ray is None else LEARNING, rays.near.device)
+    kernels: Any = cpu_backend(RENDERING if samples_per_ray is None else LEARNING, rays.near.device)
     if samples_per_ray is None:
         rgb, opacity, depth = kernels.render(rays, field, *march, least_alpha, opaque_below, _dtype(matmul_precision))
         return WholeRays(rgb, opacity, depth, samples=0)

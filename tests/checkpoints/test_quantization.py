@@ -6,7 +6,7 @@ from support.budget import budget
 from support.planted import write_checkpoint
 from support.running import refused
 
-from nerf_lightning.checkpoints.packing import pack_rows, pack_switches, unpacked
+from nerf_lightning.checkpoints.quantization import quantize_rows, quantize_switches, dequantized
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.load_model import load_model
 
@@ -22,8 +22,8 @@ def table(seed=0):
 
 
 def round_trip(rows, *how, **more):
-    packed = pack_rows(rows, *how, **more)
-    return unpacked({"rows": {"model.t": packed}, "switches": {}}, "a file")["model.t"], packed
+    packed = quantize_rows(rows, *how, **more)
+    return dequantized({"rows": {"model.t": packed}, "switches": {}}, "a file")["model.t"], packed
 
 
 def test_float32_comes_back_to_the_bit():
@@ -55,9 +55,9 @@ def test_rows_that_are_left_out_come_back_as_their_levels_mean():
 
 def test_switches_are_bits():
     for switches in (torch.rand(1, 5, 5) > 0.5, (torch.rand(17) > 0.5).to(torch.uint8)):
-        packed = pack_switches(switches)
+        packed = quantize_switches(switches)
         assert packed["bits"].numel() == -(-switches.numel() // 8)
-        back = unpacked({"rows": {}, "switches": {"model.s": packed}}, "a file")["model.s"]
+        back = dequantized({"rows": {}, "switches": {"model.s": packed}}, "a file")["model.s"]
         assert back.dtype == switches.dtype
         assert torch.equal(back, switches)
 
@@ -65,9 +65,9 @@ def test_switches_are_bits():
 def planted(path, change):
     def pack(content):
         state, name = content["state_dict"], "model.levels.coarse.field.feature.weight"
-        packed = {"rows": {name: pack_rows(state.pop(name), "int8", (0, 8), torch.arange(32) < 30)}, "switches": {}}
+        packed = {"rows": {name: quantize_rows(state.pop(name), "int8", (0, 8), torch.arange(32) < 30)}, "switches": {}}
         change(packed["rows"][name])
-        content["nerf_lightning"]["packed"] = packed
+        content["nerf_lightning"]["quantized"] = packed
 
     return write_checkpoint(path / "packed.ckpt", pack)
 
@@ -80,7 +80,7 @@ WRONG = {
     "infinite": ({"scales": torch.tensor([1.0, float("inf")])}, "scales holds NaN or infinity"),
     "large": ({"scales": torch.full((2,), 3e38)}, "coarse.field.feature.weight holds NaN or infinity"),
     "another shape": ({"shape": [1, 1024]}, "in a table of [1, 1024]"),
-    "a bomb": ({"shape": [1 << 30, 32]}, "bytes of packed weights, once they are unpacked"),
+    "a bomb": ({"shape": [1 << 30, 32]}, "bytes of quantized weights, once they are dequantized"),
     "a key": ({"more": "words"}, "which no file of this program does"),
 }
 
@@ -98,9 +98,9 @@ def test_what_is_sound_is_read(tmp_path):
     with budget(unpacked_bytes=4 * 32 * 32):
         read_checkpoint(path)
     with budget(unpacked_bytes=4 * 32 * 32 - 1):
-        refused(read_checkpoint, path, parts=("4,096 bytes of packed weights", "budgets.unpacked_bytes=4096"))
+        refused(read_checkpoint, path, parts=("4,096 bytes of quantized weights", "budgets.unpacked_bytes=4096"))
 
 
 def test_a_budget_is_held_before_anything_is_made():
-    huge = pack_switches(torch.ones(8, dtype=torch.bool)) | {"shape": [1 << 40, 1 << 40]}
-    refused(unpacked, {"rows": {}, "switches": {"model.s": huge}}, "a file", parts=("budgets.unpacked_bytes",))
+    huge = quantize_switches(torch.ones(8, dtype=torch.bool)) | {"shape": [1 << 40, 1 << 40]}
+    refused(dequantized, {"rows": {}, "switches": {"model.s": huge}}, "a file", parts=("budgets.unpacked_bytes",))

@@ -24,8 +24,8 @@ LARGEST_INT8 = 127
 
 
 @dataclass(frozen=True)
-class PackedRows:
-    """A table in a checkpoint, as `pack_rows` has it."""
+class QuantizedRows:
+    """A table in a checkpoint, as `quantize_rows` has it."""
 
     shape: list[int]
     starts: list[int]
@@ -36,8 +36,8 @@ class PackedRows:
 
 
 @dataclass(frozen=True)
-class PackedSwitches:
-    """A tensor of zeros and ones in a checkpoint, as `pack_switches` has it."""
+class QuantizedSwitches:
+    """A tensor of zeros and ones in a checkpoint, as `quantize_switches` has it."""
 
     shape: list[int]
     type: Literal["bool", "uint8"]
@@ -45,14 +45,14 @@ class PackedSwitches:
 
 
 @dataclass(frozen=True)
-class Packed:
+class Quantized:
     """All of them, by the names of the weights."""
 
-    rows: dict[str, PackedRows]
-    switches: dict[str, PackedSwitches]
+    rows: dict[str, QuantizedRows]
+    switches: dict[str, QuantizedSwitches]
 
 
-def pack_rows(
+def quantize_rows(
     table: Float[Tensor, "..."],
     number: NumberType,
     starts: Sequence[int] = (0,),
@@ -84,7 +84,7 @@ def pack_rows(
     }
 
 
-def pack_switches(switches: Tensor) -> dict[str, Any]:
+def quantize_switches(switches: Tensor) -> dict[str, Any]:
     """Return a tensor of zeros and ones, of type bool or uint8, as it is kept."""
     kind = next(name for name, dtype in SWITCHES.items() if dtype == switches.dtype)
     return {"shape": list(switches.shape), "type": kind, "bits": to_bits(switches.flatten().bool().cpu())}
@@ -104,30 +104,30 @@ def from_bits(bits: UInt8[Tensor, "bytes"], count: int) -> Bool[Tensor, "count"]
     return torch.from_numpy(np.unpackbits(bits.numpy(), count=count, bitorder="little")).bool()
 
 
-def unpacked(packed: Mapping[str, Any], where: str) -> dict[str, Tensor]:
-    """Return the tensors that a record of packed weights stands for; whoever loads them compares them with a template.
+def dequantized(quantized: Mapping[str, Any], where: str) -> dict[str, Tensor]:
+    """Return the tensors that quantized weights stand for; whoever loads them compares them with a template.
 
     Args:
-        packed: as `Packed` describes it.
+        quantized: as `Quantized` describes it.
         where: the file, for messages.
 
     Raises:
         Mismatch: its parts do not fit each other.
         InputError: it would take more memory than a person has agreed to.
     """
-    rows = {name: PackedRows(**table) for name, table in packed["rows"].items()}
-    switches = {name: PackedSwitches(**each) for name, each in packed["switches"].items()}
+    rows = {name: QuantizedRows(**table) for name, table in quantized["rows"].items()}
+    switches = {name: QuantizedSwitches(**each) for name, each in quantized["switches"].items()}
     size = sum(4 * math.prod(each.shape) for each in rows.values())
     size += sum(math.prod(each.shape) for each in switches.values())
-    require_within("unpacked_bytes", size, where, "bytes of packed weights, once they are unpacked")
-    tables = {name: _table(each, f"packed.rows.{name}") for name, each in rows.items()}
+    require_within("unpacked_bytes", size, where, "bytes of quantized weights, once they are unpacked")
+    tables = {name: _table(each, f"quantized.rows.{name}") for name, each in rows.items()}
     return tables | {
         name: from_bits(each.bits, math.prod(each.shape)).to(SWITCHES[each.type]).view(each.shape)
         for name, each in switches.items()
     }
 
 
-def _table(table: PackedRows, place: str) -> Tensor:
+def _table(table: QuantizedRows, place: str) -> Tensor:
     width = table.shape[1] if len(table.shape) == 2 else 1
     count = math.prod(table.shape) // max(1, width)
     if table.values.shape[1:] != (width,) or table.means.shape != (len(table.starts), width):

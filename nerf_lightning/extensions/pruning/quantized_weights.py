@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.checkpoints.packing import NumberType, pack_rows, pack_switches
+from nerf_lightning.checkpoints.quantization import NumberType, quantize_rows, quantize_switches
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
@@ -28,8 +28,8 @@ MARGIN = 0.01
 AT_ONCE = 1 << 18
 
 
-def packed_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[str, Any]:
-    """Return a model's weights that are not kept as they are, as `checkpoints.packing` has them.
+def quantized_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[str, Any]:
+    """Return a model's weights that are not kept as they are, as `checkpoints.quantization` has them.
 
     Args:
         model: with its weights, on the CPU.
@@ -60,11 +60,11 @@ def packed_weights(model: Model, tables: NumberType, drop_empty: bool) -> dict[s
                 f"tables=float16 holds numbers up to {LARGEST_FLOAT16:g}, and {name} has larger: int8 does."
             )
         starts = encoder.layout.offsets[:-1]
-        rows[f"model.{name}.table"] = pack_rows(encoder.table, tables, starts, reached.get(name))
+        rows[f"model.{name}.table"] = quantize_rows(encoder.table, tables, starts, reached.get(name))
     for name, grid in grids.items() if drop_empty else ():
         kept = grid.cells.flatten().bool()
-        rows[f"model.{name}.density"] = pack_rows(grid.density, "float32", kept=kept)
-        switches |= {f"model.{name}.{each}": pack_switches(getattr(grid, each)) for each in SWITCHES}
+        rows[f"model.{name}.density"] = quantize_rows(grid.density, "float32", kept=kept)
+        switches |= {f"model.{name}.{each}": quantize_switches(getattr(grid, each)) for each in SWITCHES}
     return {"rows": rows, "switches": switches}
 
 
