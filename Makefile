@@ -77,7 +77,7 @@ test-gpu: setup ## Run the tests that need a GPU; skipped where there is none
 # Machines of one kind can be tried as another: without AVX512 where there is, with bfloat16 where there is none.
 OTHER := $(if $(shell grep -om1 avx512_bf16 /proc/cpuinfo 2>/dev/null),ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2,NERF_LIGHTNING_PRECISION=bf16-mixed)
 OTHER_TESTS := tests/nerf/test_matmul_precision.py tests/nerf/test_disable_autocast.py tests/nerf/kernels tests/nerf/fields \
-	tests/nerf/models tests/nerf/rendering tests/nerf/samplers tests/training/test_step.py tests/training/test_memory_plan.py \
+	tests/nerf/models tests/nerf/rendering tests/nerf/samplers tests/training/test_step.py tests/commands/test_memory_plan.py \
 	tests/commands/test_trainer_settings.py tests/commands/test_train_eval_render.py tests/commands/test_processes.py \
 	tests/commands/test_fast_path.py
 test-other: setup ## Run a part of the tests as on the other kind of CPU (bfloat16 on or off), with one thread

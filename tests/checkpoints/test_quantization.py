@@ -6,7 +6,7 @@ from support.budget import budget
 from support.planted import write_checkpoint
 from support.running import refused
 
-from nerf_lightning.checkpoints.quantization import quantize_rows, quantize_switches, dequantized
+from nerf_lightning.checkpoints.quantization import dequantized, quantize_rows, quantize_switches
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.load_model import load_model
 
@@ -80,7 +80,7 @@ WRONG = {
     "infinite": ({"scales": torch.tensor([1.0, float("inf")])}, "scales holds NaN or infinity"),
     "large": ({"scales": torch.full((2,), 3e38)}, "coarse.field.feature.weight holds NaN or infinity"),
     "another shape": ({"shape": [1, 1024]}, "in a table of [1, 1024]"),
-    "a bomb": ({"shape": [1 << 30, 32]}, "bytes of quantized weights, once they are dequantized"),
+    "a bomb": ({"shape": [1 << 30, 32]}, "bytes of quantized weights, once they are unpacked"),
     "a key": ({"more": "words"}, "which no file of this program does"),
 }
 

@@ -114,7 +114,8 @@ def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
     (tmp_path / "file").touch()
     places = {"NUMBA_CACHE_DIR": f"{tmp_path}/file/below", "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
     program = (
-        "from nerf_lightning.nerf.kernels.backends import backend; print(backend('nerf_lightning.nerf.kernels.adam.cpu'))"
+        "from nerf_lightning.nerf.kernels.backends import backend; "
+        "print(backend('nerf_lightning.nerf.kernels.adam.cpu'))"
     )
     result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
     assert "adam/cpu.py" in result.stdout, result.stderr
