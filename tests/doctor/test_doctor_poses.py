@@ -6,7 +6,7 @@ from support.corner import corner_poses
 from support.doctor_scene import VIEWS, corner_evidence, corner_scene, outcome, with_pictures, with_poses
 
 from nerf_lightning.doctor import poses
-from nerf_lightning.doctor.conventions import axes, inverted, numeric_order, transposed
+from nerf_lightning.doctor.conventions import axes, inverted, transposed
 from nerf_lightning.doctor.epipolar import agreeing, distances, parallax, places
 from nerf_lightning.doctor.examine import gather_evidence
 from nerf_lightning.doctor.matches import Matches
@@ -84,11 +84,6 @@ def test_rows_in_numeric_order_are_named():
     check = judged("order of photographs", evidence)
     assert check.verdict == "wrong"
     assert "numbers in the photographs' names" in check.message
-
-
-def test_numeric_order_undoes_the_mistake():
-    cameras = corner_scene().cameras
-    assert numeric_order(cameras, ("1", "10", "2")).tolist() == [0, 2, 1]
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

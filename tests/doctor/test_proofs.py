@@ -10,7 +10,7 @@ from support.planted_poses import rotation_about
 from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
 from nerf_lightning.doctor.features import Corners
-from nerf_lightning.doctor.picture import MOST_DETAILS, proof_picture, spread_out
+from nerf_lightning.doctor.picture import proof_picture
 from nerf_lightning.doctor.poses import axes_convention, poses_and_pixels, single_poses
 from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 
@@ -130,10 +130,3 @@ def test_the_picture_has_a_row_for_each_proof():
     assert one.shape[1] == two.shape[1]
     assert two.shape[0] > 1.8 * one.shape[0]
     assert int(one.float().std()) > 10
-
-
-def test_details_that_are_shown_lie_apart():
-    (proof,) = single_poses(turned(5.0)).proofs
-    shown = spread_out(proof.matches, MOST_DETAILS)
-    assert len(shown.view) == MOST_DETAILS
-    assert float(torch.pdist(shown.plane[:, 0]).min()) > 2.0 * float(torch.pdist(proof.matches.plane[:, 0]).min())

@@ -12,7 +12,6 @@ from nerf_lightning.evaluation.color_fit import color_corrected, exposure_fitted
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.evaluation.protocol import differences
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.rendering.linear_light import scale_light
@@ -113,12 +112,3 @@ def test_older_numbers_are_raw_and_only_raw_ones_are_compared_with_them(scored):
     older = {key: value for key, value in raw.items() if key not in ("colors", "cc_psnr")}
     assert differences(older, raw) == differences(raw, older) == []
     assert differences(older, half, same_scene=False) == [f"colors: raw and {half['colors']}"]
-
-
-def test_another_word_is_refused():
-    from support.configs import composed
-
-    from nerf_lightning.config.instantiate import build
-
-    with pytest.raises(InputError, match=r"evaluation\.colors=best"):
-        build(composed("train", "evaluation.colors=best").evaluation)

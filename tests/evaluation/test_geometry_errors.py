@@ -52,11 +52,6 @@ def test_depth_is_scored_where_the_scene_covers_the_pixel():
     assert depth_error(depth, opacity, far, truth, torch.zeros(4)) is None
 
 
-def test_a_hole_counts_as_far():
-    one, zero = torch.ones(1), torch.zeros(1)
-    assert depth_error(FAR * one, zero, FAR * one, 2 * one, one) == pytest.approx(FAR - 2)
-
-
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.6, 0.2), (-0.1, 0.9, -0.4)])
 def test_a_plane_has_its_normal_exactly(normal):
     rays = picture_rays(16, focal=200.0)

@@ -34,15 +34,10 @@ def test_names_and_shapes_are_torchvisions(net, shapes):
     assert {name: tuple(t.shape) for name, t in LPIPS(net).state_dict().items()} == wanted
 
 
-def test_equal_pictures_have_no_distance(lpips):
-    picture = torch.rand(48, 64, 3)
-    assert lpips(picture, picture) == 0.0
-    assert not any(parameter.requires_grad for parameter in lpips.parameters())
-
-
 def test_distance_is_symmetric_positive_and_grows_with_noise(lpips):
     torch.manual_seed(0)
     truth, noise = torch.rand(48, 64, 3) * 0.5 + 0.25, torch.randn(48, 64, 3)
+    assert lpips(truth, truth) == 0.0
     scores = [lpips.score(truth + level * noise, truth) for level in (0.01, 0.05, 0.2)]
     assert 0 < scores[0] < scores[1] < scores[2]
     assert lpips.score(truth, truth + 0.05 * noise) == pytest.approx(scores[1], rel=1e-4)
@@ -89,6 +84,7 @@ def test_a_wrong_file_is_named(tmp_path):
     cases = [
         (torch.zeros(3), "holds no table of tensors"),
         ({"layer": torch.zeros(3)}, "features.0.weight is missing"),
+        (LPIPS("alex").state_dict() | {"features.0.weight": torch.full((64, 3, 11, 11), torch.nan)}, "holds NaN"),
         (wrong, r"features.3.weight has shape \(1,\), not \(192, 64, 5, 5\)"),
     ]
     for content, words in cases:
@@ -99,17 +95,3 @@ def test_a_wrong_file_is_named(tmp_path):
         path.write_bytes(junk)
         with pytest.raises(InputError, match="not a file of weights"):
             load_lpips(str(path))
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda tensor: tensor * float("nan"), "features.0.weight holds NaN or infinity"),
-        (lambda tensor: tensor.to(torch.int8), "features.0.weight is of the type int8"),
-    ],
-)
-def test_weights_that_are_no_weights(tmp_path, change, words):
-    state = LPIPS("alex").state_dict()
-    torch.save({**state, "features.0.weight": change(state["features.0.weight"])}, tmp_path / "alexnet.pth")
-    with pytest.raises(InputError, match=words):
-        load_lpips(str(tmp_path / "alexnet.pth"))

@@ -94,13 +94,6 @@ def test_only_what_is_seen_is_kept():
     assert 0.5 < distance.min() < distance.max() < 0.82
 
 
-def test_nobody_looking_from_the_other_side_nothing_of_it_is_kept():
-    scene = all_around()
-    one = replace(scene, splits={"train": (0,), "test": (0,)})  # it stands at x = 4
-    baked = baked_ball(48, 1, shiny_model(ball(RADIUS), inside=400.0), record_of(one))
-    assert coloured_places(baked)[:, 0].min() > -0.5 * RADIUS
-
-
 def test_bytes_of_density_are_exponents():
     optical = 2.0 ** np.linspace(-6, 3.5, 50)
     found = 2.0 ** (LEAST_EXPONENT + EXPONENT_STEP * to_bytes_of_density(optical)) - 2.0**LEAST_EXPONENT

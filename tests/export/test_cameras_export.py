@@ -69,15 +69,6 @@ def test_round_trip_through_both_formats(tmp_path, camera, moved):
     assert len([line for line in text.splitlines() if not line.startswith("#")]) == 1  # one camera for all
 
 
-def test_what_nerfstudio_applied_is_undone(tmp_path):
-    known = Known()
-    applied = {"applied_transform": [[0, 0, 1, 2.0], [1, 0, 0, 0], [0, 1, 0, -1.0]], "applied_scale": 0.25}
-    scene = read("transforms", write_transforms(tmp_path / "made", known, **applied))
-    CamerasExport().export(solid(ball()), scene_record(scene), tmp_path / "out", 4096)
-    write_pictures(tmp_path / "out" / "images", known.names, known.size)
-    same_rays(scene, read("transforms", tmp_path / "out"), {name: name for name in scene.view_names})
-
-
 def test_a_forward_facing_capture_has_its_cameras_in_the_world(tmp_path):
     known = Known(c2w=wall())
     scene = read("llff", write_llff(tmp_path / "made", known), space="ndc")

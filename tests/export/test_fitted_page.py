@@ -21,9 +21,13 @@ WHITE, BLACK = (replace(all_around(), background=behind) for behind in ("white",
 
 def error_of(baked, scene, view):
     """The squared error of a view, through what the page shows."""
-    rays = view_rays(RayGenerator(scene.cameras, scene.near, scene.far), all_pixels(scene.cameras, view))[0]
     wanted = scene.pixels.view(view).float() / 255.0
-    return float((over(Marcher(baked).render(rays), scene.background) - wanted[..., :3]).double().square().sum())
+    return float((shown(baked, scene, view) - wanted[..., :3]).double().square().sum())
+
+
+def shown(baked, scene, view):
+    rays = view_rays(RayGenerator(scene.cameras, scene.near, scene.far), all_pixels(scene.cameras, view))[0]
+    return over(Marcher(baked).render(rays), scene.background)
 
 
 def opaque(scene):
@@ -84,15 +88,9 @@ def moved(baked, column, by):
 
 def test_pictures_come_nearer_to_the_photographs(ball):
     spoilt = replace(ball, colors=np.where(np.arange(27)[:, None] < 3, ball.colors // 2, ball.colors))
-    scene = WHITE
-    shown = {
-        view: over(Marcher(ball).render(view_rays(_rays(scene), all_pixels(scene.cameras, view))[0]), "white")
-        for view in range(6)
-    }
-    rgba = torch.cat(
-        [torch.cat([each, torch.ones(*each.shape[:2], 1)], dim=-1).flatten(0, 1) for each in shown.values()]
-    )
-    scene = replace(scene, pixels=replace(scene.pixels, rgba=(rgba * 255).round().to(torch.uint8)))
+    pictures = torch.cat([shown(ball, WHITE, view).flatten(0, 1) for view in range(6)])
+    rgba = torch.cat([pictures, torch.ones(len(pictures), 1)], dim=-1)
+    scene = replace(WHITE, pixels=replace(WHITE.pixels, rgba=(rgba * 255).round().to(torch.uint8)))
     scene = replace(scene, splits={"train": (0, 1, 2, 4, 5), "test": (3,)})
     found = fitted(spoilt, scene, record_of(scene), 20, quiet)
     assert error_of(found, scene, 0) < 0.2 * error_of(spoilt, scene, 0)
@@ -114,10 +112,6 @@ def test_bits_do_not_depend_on_threads(ball):
         torch.set_num_threads(threads)
     assert found[0][0] == found[1][0]
     assert torch.equal(found[0][1], found[1][1])
-
-
-def _rays(scene):
-    return RayGenerator(scene.cameras, scene.near, scene.far)
 
 
 def test_only_photographs_that_the_model_learnt_from_are_fitted_to(ball):

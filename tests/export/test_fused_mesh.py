@@ -10,7 +10,6 @@ from support.known_fields import INSIDE, SOFT, ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export import fused_mesh
 from nerf_lightning.export.fused_mesh import depth_rays
 from nerf_lightning.export.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
@@ -82,9 +81,3 @@ def test_what_no_view_sees_is_refused_with_the_cure(tmp_path):
     with pytest.raises(InputError, match=r"no training view of ball sees anything opaque in its box"):
         exported(tmp_path, solid(ball()), elsewhere)
     assert not list(tmp_path.iterdir())
-
-
-def test_what_is_seen_too_badly_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(fused_mesh, "LEAST_WEIGHT", 1e3)
-    with pytest.raises(InputError, match="No surface of ball is seen well enough"):
-        exported(tmp_path, solid(ball()), record())

@@ -67,8 +67,3 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_rendered(t
     with pytest.raises(InputError, match=r"The view \w+ has 1099511627776 x 1 pixels .* Views of up to [\d,]+ pixels"):
         ImagesExport().export(solid(ball()), scene, tmp_path / "out", TILE)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_split_without_views_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"ball has no val views"):
-        ImagesExport(split="val").export(solid(ball()), record(splits={"train": (0,), "val": ()}), tmp_path, TILE)

@@ -15,7 +15,6 @@ from support.posed_captures import Known, read, write_colmap
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export.density_grid import Lattice
 from nerf_lightning.export.density_mesh import marching_cubes, without_floaters
 from nerf_lightning.export.mesh import MeshExport
 from nerf_lightning.messages.errors import InputError
@@ -56,16 +55,6 @@ def test_blocks_make_the_surface_of_the_whole_and_close_it():
     assert len(vertices) == len(whole)
     assert len(faces) == len(whole_faces)
     assert cKDTree(whole).query(vertices)[0].max() < 1e-5
-
-
-def test_a_lattice_covers_the_box():
-    lattice = Lattice.over(torch.tensor([[0.0, 0, 0], [1, 0.5, 0.26]]), 10)
-    assert lattice.shape == (11, 6, 4)
-    points = lattice.points(slice(0, lattice.num_points))
-    assert bool((points.amin(dim=0) <= 1e-6).all())
-    assert bool((points.amax(dim=0) >= torch.tensor([1, 0.5, 0.26]) - 1e-6).all())
-    places = np.stack(np.meshgrid(*map(np.arange, lattice.shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    np.testing.assert_allclose(lattice.to_scene(places.astype(float)), points, atol=1e-6)
 
 
 @pytest.mark.parametrize("format", ["ply", "obj", "glb"])
@@ -240,12 +229,3 @@ def test_a_grid_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypat
     with pytest.raises(InputError, match="4194304 x 4194304 x 4194304 points"):  # 64 bits count none
         exported(tmp_path, solid(ball()), record(), resolution=2**22 - 1)
     exported(tmp_path, solid(ball()), record(), resolution=20)
-
-
-def test_an_arbitrary_similarity_keeps_faces_outward(tmp_path):
-    turn = upright_rotation(torch.tensor([1.0, 0.0, 0.0]))
-    mesh = exported(tmp_path, solid(ball()), record(to_user=similarity(turn, torch.tensor([5.0, 6.0, 7.0]), 100.0)))
-    assert mesh.volume == pytest.approx(1e6 * 4 / 3 * np.pi * RADIUS**3, rel=0.2)
-    np.testing.assert_allclose(mesh.bounds.mean(axis=0), [5, 6, 7], atol=1.0)
-    outward = ((mesh.vertices - [5, 6, 7]) / 80 * mesh.vertex_normals).sum(axis=1)
-    assert outward.min() > 0.9

@@ -123,15 +123,3 @@ def test_a_file_that_is_no_page_or_not_whole_is_refused(page, tmp_path):
     refused(read_baked, cut, parts=("cut off",))
     cut.write_text(page.read_text().replace('id="field">H4sI', 'id="field">H4xx'))
     refused(read_baked, cut, parts=("damaged",))
-
-
-def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
-    from nerf_lightning.export import page_file
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(page_file.Path, "write_text", full)
-    with pytest.raises(OSError, match="No space left"):
-        exported(tmp_path)
-    assert not list(tmp_path.iterdir())

@@ -35,28 +35,13 @@ def exported(folder, what, **changes):
     ("exporter", "settings", "said"),
     [
         (MeshExport, {"threshold": 0.0}, "what.threshold=0.0"),
-        (MeshExport, {"min_share": 2.0}, "what.min_share=2.0"),
-        (MeshExport, {"faces": 2}, "what.faces=2"),
         (MeshExport, {"surface": "tsdf", "threshold": 3.0}, "what.threshold=3.0 belongs to what.surface=density"),
         (MeshExport, {"surface": "tsdf", "seen_only": False}, "what.seen_only=false asks for a closed mesh"),
-        (
-            MeshExport,
-            {"surface": "tsdf", "truncation": 0.5},
-            "what.truncation=0.5: give a number of cells from 1 to 64",
-        ),
         (MeshExport, {"texture": True, "format": "ply"}, "what.format=ply has no texture"),
-        (MeshExport, {"texture": True, "texture_size": 4}, "what.texture_size=4: give a number of texels from 16 to"),
-        (PointsExport, {"num_points": 0}, "what.num_points=0"),
-        (PointsExport, {"longest": 1}, "what.longest=1"),
         (PointsExport, {"agreement": 9}, "what.agreement=9"),
-        (PointsExport, {"min_opacity": 1.0}, "what.min_opacity=1.0"),
-        (PointsExport, {"tolerance": 0.0}, "what.tolerance=0.0"),
-        (PointsExport, {"max_views": 0}, "what.max_views=0"),
         (ImagesExport, {"max_views": 0}, "what.max_views=0"),
         (CamerasExport, {"fps": 0}, "what.fps=0"),
         (PageExport, {"resolution": 4}, "what.resolution=4: give 8 voxels or more"),
-        (PageExport, {"photographs": -1}, "what.photographs=-1"),
-        (PageExport, {"fit_steps": -1}, "what.fit_steps=-1"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(exporter, settings, said):

@@ -110,18 +110,22 @@ def test_a_checkpoint_of_the_gpu_is_read_on_the_cpu_and_scores_the_same(trained,
     assert scores[0] == pytest.approx(scores[1], abs=0.01)
 
 
-@pytest.mark.parametrize("outputs", ["[rgb,depth]", "[rgb,depth,opacity,normals]"])
-def test_render(outputs, trained, trainer, tmp_path):
-    path = ["path=orbit", "path.num_frames=2", "path.width=32", f"outputs={outputs}", "format=frames"]
-    finished(start("render", f"ckpt={trained(trainer)}", *path, trainer, f"paths.output_dir={tmp_path}"))
-    assert len(list((tmp_path / "video").glob("*.png"))) == 2
+PATH = ("path=orbit", "path.num_frames=2", "path.width=32", "format=frames")
 
 
-@pytest.mark.parametrize("what", ["cameras", "images", "points", "volume"])
-def test_export(what, trained, trainer, tmp_path):
-    few = {"points": ["what.num_points=1000"], "volume": ["what.resolution=16"]}.get(what, [])
-    command = ("export", f"ckpt={trained(trainer)}", f"what={what}", *few, trainer, f"paths.output_dir={tmp_path}")
-    finished(start(*command))
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("render", *PATH, "outputs=[rgb,depth,opacity,normals]"),
+        ("export", "what=cameras"),
+        ("export", "what=images"),
+        ("export", "what=points", "what.num_points=1000"),
+        ("export", "what=volume", "what.resolution=16"),
+    ],
+)
+def test_what_is_made_of_a_checkpoint(command, trained, trainer, tmp_path):
+    name, *settings = command
+    finished(start(name, f"ckpt={trained(trainer)}", *settings, trainer, f"paths.output_dir={tmp_path}"))
     assert any(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file())
 
 

@@ -135,21 +135,6 @@ def test_a_packed_sampler_without_a_grid_renders_as_it_trains():
     assert "train/occupied" not in step.model.statistics()
 
 
-def test_codes_learn_from_their_own_photographs_and_pictures_know_none():
-    step = a_step(ADDED["a code for each photograph"])
-    loader, optimizer = RayBatches(ball_scene(num_views=8, size=16), step.progress, 0, 96), step.new_optimizer()
-    for _ in range(20):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-    codes = step.model.last.field.codes.detach()
-    trained = list(ball_scene(num_views=8, size=16).splits["train"])
-    assert codes.shape[0] == 8
-    assert float(codes[trained].abs().sum(dim=1).min()) > 0
-    assert float(codes[[view for view in range(8) if view not in trained]].abs().max()) == 0.0
-    before = render_picture(step.model.eval(), step.rays, 0, "white", 4096).rgb
-    torch.nn.init.normal_(codes)
-    assert torch.equal(render_picture(step.model, step.rays, 0, "white", 4096).rgb, before)
-
-
 def test_a_table_of_cameras_is_a_capture(tmp_path):
     cameras = ball_scene(num_views=8, size=16).cameras
     rows = []

@@ -45,21 +45,13 @@ def test_without_a_rate_of_its_own_it_learns_as_the_model_does():
 
 
 @pytest.mark.parametrize("tile_points", [None, 16, 200])
-def test_a_penalty_counts_once_however_the_step_is_cut(tile_points):
-    model, scene = tiny_model(density_bias=0.5), ball_scene()
-    model.requires_grad_(False)
+@pytest.mark.parametrize("parts", [[slice(0, 64)], [slice(0, 16), slice(16, 64)]])
+def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(tile_points, parts):
+    model = tiny_model(density_bias=0.5).requires_grad_(False)
     light, heavy = (a_step(tile_points, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
     for step in (light, heavy):
-        step.gradients(RayBatches(scene, step.progress, 0, 64).at(0, 0))
-    torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
-
-
-def test_the_shares_of_several_processes_add_up_to_one_penalty():
-    model = tiny_model(density_bias=0.5)
-    light, heavy = (a_step(None, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
-    for step in (light, heavy):
         batch = batch_of(step)
-        for part in (slice(0, 16), slice(16, 64)):
+        for part in parts:
             step.gradients(batch[part], share=Share(part.start, 64, batch.weight.sum()))
     torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
 

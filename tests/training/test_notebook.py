@@ -14,18 +14,16 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from support.captures import write_npz
-from support.configs import options
+from support.configs import composed, options
 from support.learnt_cameras import LearntShifts
-from support.running import refused
+from support.running import FAST, FAST_PATH, refused
 
 import nerf_lightning
 from nerf_lightning import RadianceFieldSystem, RayDataModule, build_run
 from nerf_lightning.checkpoints.reading import read_checkpoint
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.load_model import load_model
 from nerf_lightning.files.folders import conf_folder
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.training.callbacks.checkpoints import Checkpoints
 from nerf_lightning.training.callbacks.nan_guard import NanGuard
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
@@ -64,6 +62,14 @@ def trainer(tmp_path):
         return Trainer(**({"accelerator": "cpu", "default_root_dir": tmp_path / "root"} | quiet | settings))
 
     return make
+
+
+@pytest.fixture
+def saved(run, trainer):
+    """Two steps of a run have been taken; return it, and the checkpoint that Lightning wrote of it."""
+    one, first = run(), trainer(max_steps=2)
+    first.fit(one.system, one.data)
+    return one, kept(first)
 
 
 def kept(trainer):
@@ -119,16 +125,6 @@ def test_a_run_has_the_settings_of_nerf_train(run, capture):
     assert made.data.scene.view_names == made.scene.view_names
     assert made.system.record["choices"]["model"] == "nerf_tiny"
     assert "batch_rays: 32" in made.system.record["config"]
-
-
-def test_weights_follow_from_the_seed_alone(run):
-    def weights(*overrides):
-        torch.rand(7)  # whatever else has drawn numbers
-        return run(*overrides).system.state_dict()
-
-    first, again, other = weights("seed=1"), weights("seed=1"), weights("seed=2")
-    assert all(torch.equal(again[name], value) for name, value in first.items())
-    assert not all(torch.equal(other[name], value) for name, value in first.items())
 
 
 def test_whoever_uses_hydra_keeps_it(run):
@@ -218,19 +214,11 @@ def test_several_devices_need_a_strategy_that_adds_gradients_once(run, trainer, 
     refused(fit.fit, one.system, one.data, parts=parts)
 
 
-def test_lightnings_defaults_are_enough(run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    one = run()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Lightning's advice
-        Trainer(max_steps=3).fit(one.system, one.data)
-    assert one.system.step.progress.step == 3
-
-
-def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer):
-    whole, rest, found = whole_and_resumed(lambda: run("scheduler=constant"), trainer, stop=5, steps=12)
-    assert found.endswith("step=5.ckpt")
-    assert rest.system.step.progress.step == 12
+@pytest.mark.parametrize("settings", [(), FAST_PATH])
+def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, settings):
+    whole, rest, found = whole_and_resumed(lambda: run(*settings, "scheduler=constant"), trainer, stop=20, steps=40)
+    assert found.endswith("step=20.ckpt")
+    assert rest.system.step.progress.step == 40
     assert_equal(rest, whole)
 
 
@@ -249,8 +237,6 @@ def test_a_run_of_epochs_goes_on_in_the_midst_of_one(run, trainer):
 
 
 def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
-    from support.running import FAST_PATH
-
     learning = (*FAST_PATH, "refinement=se3_lens", "encoder.blend_in=0.8")
     whole, rest = run(*learning), run(*learning)
     saves = ModelCheckpoint(every_n_train_steps=5, save_top_k=-1)
@@ -264,13 +250,6 @@ def test_cameras_and_levels_that_are_on_their_way_go_on_too(run, trainer):
     refined = read_checkpoint(found).scene.cameras
     assert not torch.equal(refined.c2w, rest.scene.cameras.c2w)
     assert not torch.equal(refined.focal, rest.scene.cameras.focal)
-
-
-def test_the_fast_path_goes_on_too(run, trainer):
-    from support.running import FAST_PATH
-
-    whole, rest, _ = whole_and_resumed(lambda: run(*FAST_PATH, "scheduler=constant"), trainer, stop=20, steps=40)
-    assert_equal(rest, whole)
 
 
 @pytest.mark.parametrize("option", [each for each in options("correction") if each != "auto"])
@@ -302,19 +281,12 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
         goes_on.fit(other.system, other.data, ckpt_path=found)
 
 
-def test_a_checkpoint_of_another_run_is_refused(run, trainer):
-    one, other = run(), run("field=nerf_mlp_small")
-    first = trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    goes_on = trainer(max_steps=4)
+def test_checkpoints_of_other_runs_and_programs_are_refused(run, trainer, saved, tmp_path):
+    _, found = saved
+    other = run("field=nerf_mlp_small")
     with pytest.raises(InputError, match=r"state_dict\..*Training cannot go on"):
-        goes_on.fit(other.system, other.data, ckpt_path=kept(first))
-
-
-def test_what_is_no_checkpoint_of_ours_is_refused(run, trainer, tmp_path):
-    one, first = run(), trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    content = torch.load(kept(first), weights_only=True)
+        trainer(max_steps=4).fit(other.system, other.data, ckpt_path=found)
+    content = torch.load(found, weights_only=True)
     del content["nerf_lightning"]
     torch.save(content, tmp_path / "other.ckpt")
     again = run()
@@ -322,55 +294,19 @@ def test_what_is_no_checkpoint_of_ours_is_refused(run, trainer, tmp_path):
         trainer(max_steps=4).fit(again.system, again.data, ckpt_path=tmp_path / "other.ckpt")
 
 
-def test_a_second_fit_does_not_begin_in_the_midst(run, trainer):
-    one = run()
-    trainer(max_steps=2).fit(one.system, one.data)
-    parts = ("2 steps", "ckpt_path", "build_run")
-    refused(trainer(max_steps=4).fit, one.system, one.data, parts=parts)
+def test_what_was_fitted_loaded_or_belongs_to_another_run_is_not_fitted(run, trainer, saved):
+    one, found = saved
+    loaded = RadianceFieldSystem.load_from_checkpoint(found)
+    for system, data, parts in (
+        (one.system, one.data, ("2 steps", "ckpt_path", "build_run")),
+        (loaded, run().data, ("loaded from a checkpoint", "build_run", "ckpt_path")),
+        (run().system, run().data, ("same run",)),
+    ):
+        refused(trainer(max_steps=4).fit, system, data, parts=parts)
 
 
-def test_the_parts_of_two_runs_are_not_mixed(run, trainer):
-    refused(trainer(max_steps=2).fit, run().system, run().data, parts=("same run",))
-
-
-def test_a_checkpoint_of_lightnings_is_one_of_ours(run, trainer):
-    """What eval, render and the others read."""
-    one, first = run(), trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    checkpoint = read_checkpoint(kept(first))
-    assert checkpoint.step == 2
-    assert checkpoint.precision == "32-true"
-    model = load_model(checkpoint).state_dict()
-    assert all(torch.equal(model[name], value) for name, value in one.system.model.state_dict().items())
-
-
-def test_a_system_is_loaded_from_a_checkpoint_alone(run, trainer):
-    one, first = run(), trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
-    for system in (one.system, loaded):
-        system.eval()
-
-    def picture(system):
-        return render_picture(system.model, system.rays, 0, "white", tile_points=8192).rgb
-
-    assert torch.equal(picture(loaded), picture(one.system))
-    trainer(max_steps=2).validate(loaded, one.data)
-
-
-def test_a_loaded_system_cannot_train_and_says_what_can(run, trainer):
-    one, first = run(), trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    loaded = RadianceFieldSystem.load_from_checkpoint(kept(first))
-    other = run()
-    parts = ("loaded from a checkpoint", "build_run", "ckpt_path")
-    refused(trainer(max_steps=2).fit, loaded, other.data, parts=parts)
-
-
-def test_a_stranger_names_no_class(run, trainer, tmp_path):
-    one, first = run(), trainer(max_steps=2)
-    first.fit(one.system, one.data)
-    content = torch.load(kept(first), weights_only=True)
+def test_a_stranger_names_no_class(saved, tmp_path):
+    content = torch.load(saved[1], weights_only=True)
     content["nerf_lightning"]["config"] = "model: {_target_: os.system, command: touch here}"
     torch.save(content, tmp_path / "stranger.ckpt")
     refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "stranger.ckpt", parts=("os.system",))
@@ -378,13 +314,8 @@ def test_a_stranger_names_no_class(run, trainer, tmp_path):
 
 
 def test_the_callbacks_of_nerf_train_work_there_too(run, trainer, capture, tmp_path):
-    from support.configs import composed
-    from support.running import FAST
-
     chosen = composed("train", "scene=npz", f"scene.path={capture}", *FAST).callbacks
-    watching = [
-        callback for callback in build(chosen).values() if not isinstance(callback, (Checkpoints, NanGuard))
-    ]  # fmt: skip
+    watching = [each for each in build(chosen).values() if not isinstance(each, (Checkpoints, NanGuard))]
     one = run()
     fit = trainer(max_epochs=2, callbacks=[*watching, TimeBudget(60.0)], enable_progress_bar=True)
     fit.fit(one.system, one.data)

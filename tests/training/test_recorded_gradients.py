@@ -89,20 +89,10 @@ def test_what_the_host_decides_is_refused_by_name():
         run.training.record_gradients(record=tape)
 
 
-def test_cameras_that_learn_are_refused():
-    run = step_by_step("fast_small", CPU)
-    run.training.rays.moved = torch.nn.Parameter(torch.zeros(3))
-    with pytest.raises(InputError, match="here are: refinement"):
-        run.training.record_gradients(record=tape)
-
-
 @pytest.mark.parametrize("model", ["fast_proposal", "nerf_tiny"])
-def test_models_without_an_occupancy_grid_are_refused(model):
+def test_models_without_an_occupancy_grid_and_other_devices_are_refused(model):
     with pytest.raises(InputError, match=rf"{SETTING}.*this model has others"):
         step_by_step(model, CPU).training.record_gradients(record=tape)
-
-
-def test_other_devices_are_refused():
     with pytest.raises(InputError, match=rf"{SETTING} is for NVIDIA GPUs, and this run computes on cpu"):
         TrainerSettings(accelerator="cpu", cuda_graph=True)
 

@@ -67,13 +67,7 @@ def test_frames_that_are_the_result_are_replaced_by_another_films_and_else_kept(
     assert {file.name for file in (tmp_path / "video").iterdir()} == {"note.txt", MARK}
 
 
-def test_an_empty_file_is_no_frame(tmp_path):
-    stop_after(tmp_path, 0, 1)
-    (tmp_path / ".frames" / "depth" / "frame_0001.png").write_bytes(b"")
-    assert opened(frames(tmp_path))[0] == [1, 2, 3]
-
-
-@pytest.mark.parametrize("note", ["", "[]", "{}", '{"fingerprint": "a"}', '{"fingerprint": "a", "depth_range": [1]}'])
+@pytest.mark.parametrize("note", ["", "[]", '{"fingerprint": "a", "depth_range": [1]}'])
 def test_a_note_that_says_nothing_is_not_believed(tmp_path, note):
     stop_after(tmp_path, 0, 1)
     (tmp_path / ".frames" / "film.json").write_text(note)
@@ -153,38 +147,16 @@ def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch
     assert opened(frames(tmp_path, films=("video",)), fingerprint="b")[0] == [1, 2, 3]
 
 
-def test_nothing_hidden_stays_beside_a_finished_film(tmp_path):
-    stop_after(tmp_path, 0, 1, 2, 3)
-    (tmp_path / ".frames" / ".film.json.77.part").write_text("of a process that was killed")
-    each = frames(tmp_path)
-    opened(each)
-    each.finish(fps=4)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
-
-
-def test_a_folder_that_is_not_ours_is_neither_emptied_nor_filled(tmp_path):
-    for theirs in ("film.json", "chapters/1.tex"):
-        (tmp_path / ".frames" / theirs).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / ".frames" / theirs).write_text("{}")
+def test_what_is_not_ours_is_neither_emptied_nor_filled(tmp_path):
+    for theirs in (".frames/film.json", ".frames/chapters/1.tex", "other/video/frame_0000.png"):
+        (tmp_path / theirs).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / theirs).write_text("{}")
     for form in ("video", "frames"):
         refused(opened, frames(tmp_path, form), parts=(f"{tmp_path}/.frames", "not made by this program", "chapters"))
     assert (tmp_path / ".frames" / "chapters" / "1.tex").is_file()
-
-
-def test_frames_that_are_not_ours_are_neither_removed_nor_written_over(tmp_path):
-    (tmp_path / "video").mkdir()
-    (tmp_path / "video" / "frame_0000.png").write_text("mine")
-    refused(opened, frames(tmp_path, "frames"), parts=(f"{tmp_path}/video", "not made by this program", "frame_0000"))
-    assert (tmp_path / "video" / "frame_0000.png").read_text() == "mine"
-
-
-def test_frames_are_ours_whatever_was_filmed_since(tmp_path):
-    stop_after(tmp_path, 0, 1, 2, 3, form="frames")
-    stop_after(tmp_path, 0, 1, 2, 3)
-    each = frames(tmp_path)
-    opened(each)
-    each.finish(fps=4)
-    assert opened(frames(tmp_path, "frames"), fingerprint="b")[0] == [0, 1, 2, 3]
+    other = tmp_path / "other"
+    refused(opened, frames(other, "frames"), parts=(f"{other}/video", "not made by this program", "frame_0000"))
+    assert (other / "video" / "frame_0000.png").read_text() == "{}"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")

@@ -14,12 +14,6 @@ def test_it_is_the_articles_encoding_written_as_a_loop():
     torch.testing.assert_close(FrequencyEncoder(5).double()(points), torch.cat(expected, dim=-1))
 
 
-def test_the_paper_widths():
-    assert FrequencyEncoder(10).out_dim == 63
-    assert FrequencyEncoder(4).out_dim == 27
-    assert FrequencyEncoder(4, include_input=False).out_dim == 24
-
-
 def test_with_pi_the_lowest_frequency_has_period_two():
     encoder = FrequencyEncoder(3, include_input=False, with_pi=True).double()
     points = torch.rand(5, 3, dtype=torch.float64)

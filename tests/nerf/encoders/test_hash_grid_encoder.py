@@ -12,11 +12,6 @@ def test_tables_that_cannot_fit_are_refused_before_they_are_allocated():
         HashGridEncoder(num_levels=16, log2_table_size=29, max_resolution=100_000)
 
 
-def test_it_starts_near_zero():
-    table = HashGridEncoder(num_levels=2, log2_table_size=8).table
-    assert 0 < float(table.detach().abs().max()) <= 1e-4
-
-
 @pytest.mark.parametrize(("blend_in", "levels_on"), [(0.0, 3), (0.5, 2)])
 def test_known_features_have_the_gradients_of_computed_ones(blend_in, levels_on):
     encoder = HashGridEncoder(num_levels=3, log2_table_size=9, max_resolution=40, blend_in=blend_in)
@@ -50,17 +45,3 @@ def test_levels_are_blended_in_from_coarse_to_fine():
         encoder.on_step(StepContext(share, 0, 0))
         torch.testing.assert_close(encoder(points), whole * torch.tensor(weights).repeat_interleave(2))
         assert encoder.level_weights.tolist() == list(weights)
-
-
-def test_a_grid_whose_levels_are_all_on_holds_nothing_else():
-    plain, blended = (HashGridEncoder(num_levels=2, log2_table_size=8, blend_in=share) for share in (0.0, 0.3))
-    assert list(plain.state_dict()) == ["table"]
-    plain.on_step(StepContext(0.1, 0, 0))
-    blended.load_state_dict(plain.state_dict() | {"level_weights": torch.ones(2)})
-    points = torch.rand(9, 3)
-    assert torch.equal(plain(points), blended(points))
-
-
-def test_a_share_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"blend_in=1\.5: give 0\.0 to 1\.0"):
-        HashGridEncoder(num_levels=1, log2_table_size=6, blend_in=1.5)

@@ -29,10 +29,6 @@ def a_step(model):
     return step
 
 
-def test_without_codes_nothing_is_there():
-    assert not [name for name in a_model(appearance=0).state_dict() if "codes" in name or "trained" in name]
-
-
 @pytest.mark.parametrize("model", ["fast_small", "fast_proposal"])
 def test_codes_learn_from_their_own_photographs_and_pictures_have_their_mean(model):
     scene, step = ball_scene(num_views=8), a_step(a_model(model))

@@ -93,12 +93,3 @@ def test_contracted_space_brings_far_points_within_reach_of_the_encoding():
     torch.testing.assert_close(field.density(Points(inside))[0], plain.density(Points(inside))[0])
     contracted = torch.tensor([[1.75, 0.0, 0.0], [0.0, 0.0, -1.9]])
     torch.testing.assert_close(field.density(Points(outside))[0], plain.density(Points(contracted))[0])
-
-
-@pytest.mark.parametrize("space", ["bounded", "ndc"])
-def test_elsewhere_positions_enter_as_they_are(space):
-    torch.manual_seed(0)
-    field, points = tiny_field(density_activation="softplus"), 5 * torch.rand(20, 3)
-    before = field.density(Points(points))[0]
-    field.fit_to(replace(ball_scene(), space=space, aabb=torch.tensor([[-9.0] * 3, [3.0] * 3])))
-    assert torch.equal(field.density(Points(points))[0], before)

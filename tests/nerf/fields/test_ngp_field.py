@@ -104,21 +104,3 @@ def test_space_starts_thick_where_alpha_tells_what_is_empty_and_thin_where_nothi
         densities.append(float(field.density(Points(torch.zeros(1, 3)))[0].detach()))
     assert densities[0] == pytest.approx(2.718281828**3, rel=1e-4)
     assert densities[1] == pytest.approx(2.718281828**-1, rel=1e-4)
-
-
-@pytest.mark.parametrize(("space", "everywhere"), [("bounded", False), ("ndc", False), ("contracted", True)])
-def test_the_scene_says_whether_there_is_something_outside_of_its_box(space, everywhere):
-    field = a_field()
-    field.fit_to(replace(ball_scene(), space=space))
-    assert bool((field.density(Points(torch.tensor([[1.2, 0.0, 0.0], [0.0, -40.0, 3.0]])))[0] > 0).all()) is everywhere
-    stubborn = a_field(contraction=False)
-    stubborn.fit_to(replace(ball_scene(), space=space))
-    assert bool((stubborn.density(Points(torch.tensor([[1.2, 0.0, 0.0]])))[0] == 0).all())
-
-
-def test_the_space_travels_in_the_state_dict():
-    field, other = a_field(), a_field()
-    field.fit_to(replace(ball_scene(), space="contracted"))
-    other.load_state_dict(field.state_dict())
-    points = 5 * torch.rand(20, 3)
-    assert torch.equal(other.density(Points(points))[0], field.density(Points(points))[0])

@@ -2,7 +2,6 @@ import torch
 from support.scenes import some_rays
 
 from nerf_lightning.nerf.geometry.boxes import distances_in_box, to_unit_cube
-from nerf_lightning.nerf.geometry.contraction import contract
 
 AABB = torch.tensor([[-1.0, -0.5, -2.0], [1.0, 0.5, 0.3]])
 
@@ -25,14 +24,6 @@ def test_rays_along_the_axes_are_not_lost():
     rays.directions.copy_(torch.tensor([[0.0, 0.0, -1.0]]))
     enter, leave = distances_in_box(rays, AABB)
     torch.testing.assert_close(torch.cat([enter, leave]), torch.tensor([3.7, 6.0]))
-
-
-def test_contraction_keeps_the_unit_ball_and_brings_infinity_to_two():
-    points = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
-    torch.testing.assert_close(contract(0.7 * points), 0.7 * points)
-    torch.testing.assert_close(contract(1e9 * points).norm(dim=-1), torch.full((50,), 2.0))
-    radius = torch.logspace(-2, 4, 200)[:, None] * torch.tensor([[0.6, 0.8, 0.0]])
-    assert bool((contract(radius).norm(dim=-1).diff() >= 0).all())
 
 
 def test_the_unit_cube_has_the_boxes_corners():

@@ -16,7 +16,8 @@ def cameras_with(*lenses, model="radial_tangential", focal=60.0):
     return replace(pinhole_cameras(c2w, focal, 100, 80), lens=torch.tensor(lenses), lens_model=model)
 
 
-def refused(cameras, *parts, names=("a.jpg", "b.jpg", "c.jpg", "d.jpg")):
+def refused(cameras, *parts):
+    names = ("a.jpg", "b.jpg", "c.jpg", "d.jpg")
     with pytest.raises(InputError) as error:
         require_invertible(cameras, names[: len(cameras.lens)])
     message = str(error.value)
@@ -64,17 +65,14 @@ def test_a_fisheye_that_would_see_more_than_everything():
     refused(cameras_with(NONE, model="fisheye", focal=19.0), "a.jpg", "pixel (", "model fisheye")
 
 
-def test_a_fisheye_knows_no_tangential_coefficients():
-    refused(
-        cameras_with([0.0, 0.0, 0.0, 0.0, 0.01, 0.0], model="fisheye"), "p1, p2, which the model fisheye", "p1=0.01"
-    )
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_coefficients_must_be_finite(value):
-    refused(cameras_with([value, 0.0, 0.0, 0.0, 0.0, 0.0]), "has coefficients that are not finite")
-
-
-def test_coefficients_in_pixels_are_refused():
-    """The usual mistake with units: divided by nothing."""
-    refused(cameras_with([-40.0, 12.0, 0.0, 0.0, 0.0, 0.0]), "for lengths in focal lengths, not in pixels")
+@pytest.mark.parametrize(
+    ("lens", "model", "parts"),
+    [
+        ([0.0, 0.0, 0.0, 0.0, 0.01, 0.0], "fisheye", ("p1, p2, which the model fisheye", "p1=0.01")),
+        ([math.nan, 0.0, 0.0, 0.0, 0.0, 0.0], "radial_tangential", ("has coefficients that are not finite",)),
+        # The usual mistake with units: divided by nothing.
+        ([-40.0, 12.0, 0.0, 0.0, 0.0, 0.0], "radial_tangential", ("for lengths in focal lengths, not in pixels",)),
+    ],
+)
+def test_coefficients_that_no_lens_has_are_refused(lens, model, parts):
+    refused(cameras_with(lens, model=model), *parts)

@@ -7,7 +7,7 @@ import torch
 from support.panoramas import Panorama, near_the_bricks, traced
 
 from nerf_lightning.data.bricks.tracer import Pinhole
-from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels, resized
+from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, project, rays_through_pixels
 from nerf_lightning.nerf.geometry.footprints import footprint
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.geometry.lenses import project_plane, stretches, unproject
@@ -46,13 +46,6 @@ def test_the_middle_looks_ahead_a_quarter_to_the_right_and_the_top_up():
     assert right == pytest.approx([3.0, 1.0])
     assert up[1] == pytest.approx(0.0)
     assert behind == pytest.approx([0.0, 1.0], abs=1e-6)
-
-
-def test_other_sizes_show_the_same_directions():
-    cameras = panorama_cameras(near_the_bricks(1), 64, 32)
-    double = resized(cameras, 2 * cameras.width, 2 * cameras.height)
-    point = torch.tensor([[0.3, -0.2, 0.7]], dtype=torch.float64)
-    torch.testing.assert_close(project(double, 0, point), 2 * project(cameras, 0, point))
 
 
 def test_stretches_are_those_of_finite_differences():

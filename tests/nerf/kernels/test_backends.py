@@ -74,14 +74,8 @@ def test_a_gpu_whose_kernels_triton_cannot_compile_has_none(anew, monkeypatch, c
     assert backends.cuda_backend("hash_grid.cuda", torch.device("cpu")) is None
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "Failed to find C compiler. Please specify via CC environment variable",
-        "CalledProcessError: Command '['/usr/bin/gcc', 'cuda_utils.c']' returned non-zero exit status 1",
-    ],
-)
-def test_without_a_c_compiler_or_its_headers_the_message_names_them(words, anew, monkeypatch, caplog):
+def test_without_a_c_compiler_or_its_headers_the_message_names_them(anew, monkeypatch, caplog):
+    words = "CalledProcessError: Command '['/usr/bin/gcc', 'cuda_utils.c']' returned non-zero exit status 1"
     monkeypatch.setattr(backends.importlib, "import_module", lambda name: module_whose_trial(words))
     assert backends.cuda_backend("hash_grid.cuda", torch.device("cuda")) is None
     assert "apt install gcc python3-dev" in caplog.text
@@ -107,19 +101,6 @@ def test_without_a_folder_for_its_cache_numba_keeps_kernels_for_this_process(ane
     assert [record.getMessage().partition(" (")[0] for record in caplog.records] == [
         "Until then every start compiles the kernels anew, which takes about a minute: numba cannot write its cache"
     ]
-
-
-@pytest.mark.slow
-def test_a_cache_that_cannot_be_written_is_noticed_by_numba_itself(tmp_path):
-    (tmp_path / "file").touch()
-    places = {"NUMBA_CACHE_DIR": f"{tmp_path}/file/below", "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
-    program = (
-        "from nerf_lightning.nerf.kernels.backends import backend; "
-        "print(backend('nerf_lightning.nerf.kernels.adam.cpu'))"
-    )
-    result = subprocess.run([sys.executable, "-c", program], env=os.environ | places, capture_output=True, text=True)
-    assert "adam/cpu.py" in result.stdout, result.stderr
-    assert "Set NUMBA_CACHE_DIR" in result.stderr
 
 
 KEPT = """

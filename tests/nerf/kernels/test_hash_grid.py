@@ -93,30 +93,6 @@ def test_the_result_does_not_depend_on_the_threads(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_without_numba_the_torch_twin_runs_after_one_warning(monkeypatch, caplog):
-    def broken(name):
-        raise OSError("libLLVM is missing")
-
-    monkeypatch.setattr(backends.importlib, "import_module", broken)
-    backends.backend.cache_clear()
-    backends._warn_once.cache_clear()
-    try:
-        layout = LAYOUTS[0]
-        given = inputs(layout, 2)
-        found = values_and_gradients(interpolate, *given, layout)
-        backends.backend.cache_clear()
-        values_and_gradients(interpolate, *given, layout)
-    finally:
-        backends.backend.cache_clear()
-        backends._warn_once.cache_clear()
-    expected = values_and_gradients(interpolate_torch, *given, layout)
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
-    assert [record.getMessage()[:60] for record in caplog.records] == [
-        "numba cannot be used here (OSError: libLLVM is missing): the"
-    ]
-
-
 @pytest.mark.parametrize("features", [2, 4])
 def test_a_point_does_not_depend_on_where_it_stands(features):
     layout = hash_grid_layout(4, 8, 2, 40)

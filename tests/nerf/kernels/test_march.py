@@ -115,11 +115,3 @@ def test_a_fixed_capacity_drops_the_last_rays_and_pads_with_nothing():
         assert int(samples.bounds[-1]) == kept
         torch.testing.assert_close(samples.starts[:kept], whole.starts[:kept])
         assert bool((samples.deltas[kept:] == 0).all())
-
-
-def test_rays_that_miss_the_box_have_no_samples():
-    rays, state, lattice, grid = a_march(count=20, share=1.0)
-    rays.directions.mul_(-1.0)
-    enter, leave = distances_in_box(rays, AABB)
-    samples, _ = march(rays, MarchState(enter, leave, state.jitter, state.next), lattice, grid)
-    assert samples.starts.numel() == 0

@@ -41,24 +41,3 @@ def test_it_multiplies_bfloat16_where_it_is_told_to_and_adds_up_gradients_in_flo
     # Beside the rounding itself, units near zero are on in one precision and off in the other.
     for found, expected in zip(used, leaves, strict=True):
         assert float((found.grad - expected.grad).norm()) < 6e-2 * float(expected.grad.norm())
-
-
-def test_the_result_does_not_depend_on_the_threads():
-    points, used = torch.randn(3 * TILE, 32), weights(32, 64, 3)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            leaves = [weight.clone().requires_grad_() for weight in used]
-            mlp(points, leaves).square().sum().backward()
-            results.append(torch.cat([leaf.grad.flatten() for leaf in leaves]))
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(*results)
-
-
-def test_gradients_of_the_points_are_left_out_where_nobody_asks():
-    points, used = torch.randn(50, 8), [weight.requires_grad_() for weight in weights(8, 4, 2)]
-    mlp(points, used).sum().backward()
-    assert points.grad is None
-    assert all(weight.grad is not None for weight in used)

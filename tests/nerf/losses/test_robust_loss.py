@@ -23,32 +23,19 @@ def square(top: int, left: int, side: int) -> torch.Tensor:
     return bad
 
 
-def test_single_pixels_and_thin_lines_are_kept_for_their_neighbours():
-    """Fine detail: large residuals among small ones."""
-    single, line = square(1, 1, 1), torch.zeros(PATCH, PATCH, dtype=torch.bool)
+def test_fine_detail_and_small_blobs_are_kept_and_what_is_bad_at_a_border_is_not():
+    """Fine detail: large residuals among small ones. The inner half of a square is vouched for by the whole."""
+    line = torch.zeros(PATCH, PATCH, dtype=torch.bool)
     line[0::4, :] = True
-    assert bool(kept(single).all())
-    assert bool(kept(line).all())
-
-
-def test_a_small_blob_in_the_middle_of_a_good_square_is_kept():
-    assert bool(kept(square(5, 5, 6)).all())
-
-
-def test_a_blob_at_the_border_is_left_out_up_to_its_corners():
-    """The inner half of a square is vouched for by the whole, its rim is not."""
-    found = kept(square(0, 0, 4))
+    for bad in (square(1, 1, 1), line, square(5, 5, 6)):
+        assert bool(kept(bad).all())
     expected = torch.ones(PATCH, PATCH, dtype=torch.bool)
     expected[:4, :4] = False
     expected[3, 3] = True  # 5 of its 9 neighbours are good
-    assert torch.equal(found, expected)
-
-
-def test_a_square_that_is_mostly_bad_is_left_out_but_for_what_is_good():
-    bad = square(0, 0, 13)
-    found = kept(bad)
-    assert not bool(found[:12, :12].any())
-    assert bool(found[~bad].all())
+    assert torch.equal(kept(square(0, 0, 4)), expected)
+    mostly = square(0, 0, 13)
+    assert not bool(kept(mostly)[:12, :12].any())
+    assert bool(kept(mostly)[~mostly].all())
 
 
 def test_squares_do_not_speak_for_each_other_and_what_is_no_whole_square_is_kept():

@@ -1,11 +1,9 @@
 import pytest
 import torch
-from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
-from support.steps import rays_of
+from support.scenes import some_rays, tiny_field, tiny_model
 
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
-from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
@@ -36,14 +34,6 @@ def test_tiles_cover_the_batch_evenly():
         assert max(sizes) - min(sizes) <= 1
     assert tile_rays_for(tiny_model(), 8192) == 512
     assert tile_rays_for(tiny_model(), 1) == 1
-
-
-def test_a_picture_is_the_same_whatever_its_tiles():
-    model, scene = tiny_model(density_bias=1.0), ball_scene()
-    pictures = [render_picture(model, rays_of(scene), 1, "white", points) for points in (64, 10**6)]
-    assert pictures[0].rgb.shape == (12, 12, 3)
-    torch.testing.assert_close(pictures[0].rgb, pictures[1].rgb)
-    torch.testing.assert_close(pictures[0].depth, pictures[1].depth)
 
 
 @pytest.mark.parametrize(("step", "learns"), [(0, True), (9, True), (10, False), (11, False), (12, True), (13, False)])

@@ -97,16 +97,6 @@ def rays_at(model, share):
     return model.subpixels.per_pixel
 
 
-def test_a_step_of_the_last_part_says_so_in_the_state_and_steps_before_do_not():
-    step = make_step(None, model_with(2, start=0.02))
-    scene, seen = ball_scene(), []
-    loader, optimizer = RayBatches(scene, step.progress, 0, 64), step.new_optimizer()
-    for _ in range(4):
-        step(loader.at(0, step.progress.rays_seen), optimizer)
-        seen.append(int(step.model.state_dict()["subpixels.now"]))
-    assert seen == [1, 1, 2, 2]
-
-
 def test_a_checkpoint_renders_as_its_last_step_was():
     model, other = model_with(2), model_with(2)
     model.subpixels.on_step(StepContext(1.0, 0, 0))

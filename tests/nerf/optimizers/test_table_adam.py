@@ -3,7 +3,6 @@ import copy
 import pytest
 import torch
 
-from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.adam.step import adam_step_torch
 from nerf_lightning.nerf.optimizers.table_adam import TableAdam
 
@@ -77,8 +76,3 @@ def test_its_state_can_be_saved_and_taken_up():
         weight.square().sum().backward()
         optimizer.step()
     assert torch.equal(one, two)
-
-
-def test_settings_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match=r"lr=-1.0.*give a positive lr"):
-        TableAdam([torch.nn.Parameter(torch.ones(1))], lr=-1.0)

@@ -118,22 +118,3 @@ def test_a_closed_ray_takes_all_light():
     assert abs(float(rendering.opacity) - 1.0) < 1e-6
     torch.testing.assert_close(rendering.rgb.sum(), torch.tensor(1.0))
     assert float(closed_weights(torch.zeros(4))[-1]) == 1.0
-
-
-def test_interval_lengths_are_distances_so_opacity_does_not_depend_on_how_a_direction_was_written():
-    """The fault: lengths in units of an unnormalised direction. Here directions are unit, so length is distance."""
-    import nerf_lightning.nerf.geometry.cameras as cameras
-    from nerf_lightning.nerf.types.rays import PixelIndex
-
-    c2w = torch.eye(4)[None, :3].double()
-    wide = cameras.pinhole_cameras(c2w, focal=5.0, width=20, height=20)  # corners 60 degrees off axis
-    corner = PixelIndex(*(torch.tensor([0]) for _ in range(3)))
-    rays = cameras.rays_through_pixels(wide, corner, torch.tensor([0.0]), torch.tensor([2.0]))
-    edges = torch.linspace(0, 2, 65, dtype=torch.float64)[None]
-    output = FieldOutput(torch.full((1, 64), 0.5, dtype=torch.float64), torch.zeros(1, 64, 3, dtype=torch.float64))
-    rendering = composite(output, RaySamples(edges), rays, None)
-    opaque = weights_from_density(output.density, RaySamples(edges).deltas).sum()
-    travelled = (edges[:, -1] * rays.directions.norm(dim=-1)).item()
-    assert abs(float(opaque) - (1 - math.exp(-0.5 * travelled))) < 1e-12
-    assert abs(travelled - 2.0) < 1e-12
-    assert rendering.weights.shape == (1, 64)

@@ -86,12 +86,6 @@ def test_many_rays_do_not_blur_the_median():
     assert bool((median_distances(*dense(weights)) - 0.7).abs().max() < 1e-6)
 
 
-def test_all_parts_together_are_the_mean_opacity():
-    weights = torch.rand(7, 33) / 33
-    rendering, rays = dense(weights, near=0.5, far=3.0)
-    assert float(weight_along(rendering, rays, bins=50).sum()) == pytest.approx(float(weights.sum(1).mean()))
-
-
 def test_without_bounds_the_parts_are_those_of_the_spacing():
     """Far is at 1 - 1 / 2000 of the spacing: 500 lies at 0.9995 of the way, though at half of the distance."""
     weights = torch.zeros(1, 2)

@@ -87,28 +87,10 @@ def test_jitter_is_fresh_for_every_ray_and_step_and_absent_at_evaluation():
     assert bool((sampler.start(rays, None).jitter == 0).all())
 
 
-def test_intervals_grow_with_the_distance_where_a_cone_is_asked_for():
-    lattice = a_sampler(num_cascades=2, cone_angle=0.02).lattice
-    step = lattice.diff()
-    assert float(step[0]) == pytest.approx(max(12**0.5 / 64, 0.02 * 2.0), rel=1e-4)
-    assert bool((step.diff() >= -1e-5).all())
-    assert float(step[-1]) > 1.5 * float(step[0])
-
-
 def test_a_box_that_no_camera_sees_is_said_by_name():
     scene = opaque_ball()
     with pytest.raises(InputError, match=r"box of the scene ball.*no camera sees it.*scene\.aabb_half"):
         a_sampler(replace(scene, aabb=scene.aabb + 500.0))
-
-
-def test_state_travels_in_the_state_dict():
-    sampler = learn(a_sampler(), ball_density())
-    other = OccupancySampler(resolution=16, num_steps=64)
-    other.load_state_dict(sampler.state_dict())
-    rays = some_rays(20)
-    one = sampler(rays, batch_random(1, 20))
-    two = other(rays, batch_random(1, 20))
-    assert torch.equal(one.starts, two.starts)
 
 
 def test_cameras_inside_the_box_are_said_by_name(caplog):
@@ -148,21 +130,6 @@ def test_contracted_space_wants_more_and_coarser_boxes_unless_told(settings, cas
     assert sampler.cone_angle == cone_angle
     steps = sampler.lattice.diff()
     assert (float(steps[-1]) > 1.5 * float(steps[0])) == (cone_angle > 0)
-
-
-@pytest.mark.parametrize("space", ["bounded", "ndc"])
-def test_other_spaces_have_one_box(space):
-    sampler = a_sampler(replace(opaque_ball(), space=space))
-    assert sizes(sampler)["cells"] == (1, 16, 16, 16)
-    assert sampler.cone_angle == 0.0
-
-
-def test_a_second_scene_makes_the_grid_anew():
-    sampler = a_sampler(contracted_ball())
-    sampler.fit_to(opaque_ball())
-    assert sizes(sampler)["cells"] == (1, 16, 16, 16)
-    learn(sampler, ball_density())
-    assert 0 < int(sampler.grid.cells.sum()) < 16**3
 
 
 def test_in_normalised_device_coordinates_every_cell_is_possible():

@@ -9,7 +9,6 @@ from nerf_lightning.nerf.randomness import batch_random, fold
 from nerf_lightning.nerf.rendering.quadrature import composite
 from nerf_lightning.nerf.samplers.importance import ImportanceSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
-from nerf_lightning.nerf.types.rays import RaySamples
 from nerf_lightning.nerf.types.renderings import FieldOutput
 
 
@@ -85,12 +84,6 @@ def test_importance_ignores_light_that_a_closed_ray_gives_to_its_last_interval()
     empty = composite(FieldOutput(torch.zeros(3, 64), torch.zeros(3, 64, 3)), samples, rays, None)
     fine = ImportanceSampler(62)(rays, [empty], None).edges
     assert bool((torch.histc(fine, 62, 2.0625, 5.9375) >= 3).all())  # evenly spread, not heaped at far
-
-
-def test_counts():
-    assert StratifiedSampler(64).num_samples_after(0) == 64
-    assert ImportanceSampler(128).num_samples_after(64) == 192
-    assert RaySamples(torch.arange(5.0)).deltas.shape == (4,)
 
 
 def endless_rays(count):

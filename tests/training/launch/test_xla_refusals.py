@@ -20,13 +20,10 @@ def tpu(monkeypatch):
     monkeypatch.setattr(xla_device, "require_device", lambda: "TPU")
 
 
-def test_a_missing_torch_xla_is_named_with_the_way_to_install_it(monkeypatch):
+def test_a_missing_torch_xla_is_named_with_the_way_to_install_it_and_a_missing_tpu(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"torch_xla, which is not installed.*torch 2\.9.*make xla.*trainer=auto"):
         TrainerSettings(accelerator=composed("train", "trainer=tpu").trainer.accelerator)
-
-
-def test_a_machine_without_tpu_is_refused(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
     monkeypatch.setattr(xla_device, "ACCELERATOR", type("None", (), {"is_available": staticmethod(lambda: False)}))
     with pytest.raises(InputError, match="finds no TPU on this machine"):

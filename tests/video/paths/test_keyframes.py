@@ -2,12 +2,11 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 import torch
 from support.scenes import ball_scene
-from test_chosen_paths import MIDDLE, UP, frame, keyframe_file, keys
+from test_chosen_paths import MIDDLE, UP, frame, keyframe_file
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import project
@@ -36,6 +35,7 @@ def test_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
     assert (first.position, first.ahead, second.ahead) == ((1, 0, 0), (-1, 0, 0), (0, -1, 0))
 
 
+PLACES = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
 GOOD = "{position: [1, 0, 0], look_at: [0, 0, 0]}"
 # Each line has twice the keys of the one before, and all of them are walked through while the file is read.
 MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n}, *a{n}]}}\n" for n in range(35))
@@ -44,35 +44,20 @@ MERGE_BOMB = "- &a0 {position: [1, 0, 0]}\n" + "".join(f"- &a{n + 1} {{<<: [*a{n
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "has no list of keyframes"),
         ("keyframes: 3", "has no list of keyframes"),
         ("keyframes: [", "is not readable yaml"),
         (f"- {GOOD}", r"has 1 keyframe\(s\), and a path needs two"),
         (f"- {GOOD}\n- 7", "keyframe 2 is 7, but must name a position"),
-        (f"- {GOOD}\n- {{position: [1, 0]}}", "keyframe 2: position is .1, 0., but must be three finite numbers"),
-        (f"- {GOOD}\n- {{position: [1, 0, .nan]}}", "keyframe 2: position is"),
+        (f"- {GOOD}\n- {{position: [1, 0, .nan]}}", "keyframe 2: position is .1, 0, nan., but must be three finite"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], target: [0, 0, 0]}}", "keyframe 2 has the unknown key 'target'"),
         (f"- {GOOD}\n- {{position: [1, 0, 0]}}", "keyframe 2 must have a position, and one of look_at and direction"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [1, 0, 0]}}", "keyframe 2 looks nowhere"),
-        (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: wide}}", "keyframe 2: fov is 'wide'"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 180}}", "between 0 and 180"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], fov: 18, focal: 9}}", "both fov and focal"),
         (f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 1}}", "1 of 2 keyframes have a time"),
         ("\n".join(2 * ["- {position: [1, 0, 0], look_at: [0, 0, 0], time: 1}"]), "its time 1 does not follow 1"),
         (f"- {GOOD}\n- {{position: [1, 0, 0x{'f' * 500}], look_at: [0, 0, 0]}}", "holds a value that cannot be read"),
-        (
-            f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 0x{'f' * 9000}}}",
-            "holds a value that cannot be read",
-        ),
-        (
-            f"- {GOOD}\n- {{position: [1, 0, 0], look_at: [0, 0, 0], time: 2020-99-99}}",
-            "holds a value that cannot be read",
-        ),
         ("[" * 5000, "it nests more than 50 deep"),
-        (
-            "- &a [x, x]\n" + "".join(f"- &{n} [{', '.join(9 * [f'*{m}'])}]\n" for m, n in pairwise("abcdefghijk")),
-            "holds",
-        ),
         (MERGE_BOMB, r"it holds references \(\*name\)"),
         ("- !!python/object/apply:os.system [ls]", "is not readable yaml"),
     ],
@@ -86,27 +71,24 @@ def test_a_bad_file_is_named(tmp_path, text, words):
     assert len(str(caught.value)) < 1500
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_what_cannot_be_filmed_is_named(tmp_path):
     with pytest.raises(InputError, match=r"none.yaml cannot be read: No such file.*path.file"):
         KeyframePath(str(tmp_path / "none.yaml"))
-
-
-def test_a_keyframe_that_looks_along_its_up(tmp_path):
     file = keyframe_file(tmp_path, *(Keyframe((x, 0.0, 5.0), direction=(0.0, 0.0, -1.0)) for x in (0.0, 1.0)))
     with pytest.raises(InputError, match="keyframe 1 looks straight along its up"):
         KeyframePath(file).cameras(frame())
 
 
 def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
-    times, places = (0.0, 1.0, 1.5), ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
+    times = (0.0, 1.0, 1.5)
     file = keyframe_file(
         tmp_path,
-        *(Keyframe(p, direction=(1 - p[0], 2 - p[1], 0.0), time=t) for p, t in zip(places, times, strict=True)),
+        *(Keyframe(p, direction=(1 - p[0], 2 - p[1], 0.0), time=t) for p, t in zip(PLACES, times, strict=True)),
     )
     cameras = KeyframePath(file, fps=10).cameras(frame())
     assert len(cameras.c2w) == 16
     assert is_rigid(cameras.c2w, tolerance=1e-9).all()
-    torch.testing.assert_close(cameras.c2w[[0, 10, 15], :, 3], torch.tensor(places, dtype=torch.float64))
+    torch.testing.assert_close(cameras.c2w[[0, 10, 15], :, 3], torch.tensor(PLACES, dtype=torch.float64))
     ahead = -cameras.c2w[10, :, 2]
     torch.testing.assert_close(ahead, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     assert len(KeyframePath(file, num_frames=7).cameras(frame()).c2w) == 7
@@ -115,13 +97,12 @@ def test_the_curve_passes_the_keyframes_at_their_times(tmp_path):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("closed", [False, True])
 def test_seconds_count_from_any_beginning(tmp_path, dtype, closed):
-    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
     around = replace(frame(), center=MIDDLE.to(dtype), up=UP.to(dtype), poses=frame().poses.to(dtype))
 
     def cameras(beginning):
         keyframes = (
             Keyframe(place, look_at=(1.0, 2.0, 3.0), fov=40.0, time=beginning + second)
-            for place, second in zip(places, (0.0, 2.0, 2.25), strict=True)
+            for place, second in zip(PLACES, (0.0, 2.0, 2.25), strict=True)
         )
         return KeyframePath(keyframe_file(tmp_path, *keyframes), closed=closed, fps=8).cameras(around)
 
@@ -133,14 +114,13 @@ def test_seconds_count_from_any_beginning(tmp_path, dtype, closed):
 
 
 def test_keys_close_together_on_a_long_path_are_passed(tmp_path):
-    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
     file = keyframe_file(
         tmp_path,
-        *(Keyframe(p, look_at=(1.0, 2.0, 3.0), time=t) for p, t in zip(places, (0.0, 1e9, 1e9 + 1), strict=True)),
+        *(Keyframe(p, look_at=(1.0, 2.0, 3.0), time=t) for p, t in zip(PLACES, (0.0, 1e9, 1e9 + 1), strict=True)),
     )
     around = replace(frame(), center=MIDDLE.float(), up=UP.float(), poses=frame().poses.float())
     cameras = KeyframePath(file, num_frames=3).cameras(around)
-    torch.testing.assert_close(cameras.c2w[[0, 2], :, 3], torch.tensor(places)[[0, 2]])
+    torch.testing.assert_close(cameras.c2w[[0, 2], :, 3], torch.tensor(PLACES)[[0, 2]])
 
 
 def test_times_that_are_no_seconds_make_no_endless_film(tmp_path):
@@ -153,8 +133,7 @@ def test_times_that_are_no_seconds_make_no_endless_film(tmp_path):
 
 def test_what_all_keyframes_look_at_stays_in_the_middle(tmp_path):
     target = tuple(MIDDLE.tolist())
-    places = ((5.0, 2.0, 4.0), (1.0, 7.0, 5.0), (-4.0, 2.0, 3.0))
-    file = keyframe_file(tmp_path, *(Keyframe(place, look_at=target) for place in places))
+    file = keyframe_file(tmp_path, *(Keyframe(place, look_at=target) for place in PLACES))
     cameras = KeyframePath(file, num_frames=20, closed=True).cameras(frame())
     for view in range(20):
         torch.testing.assert_close(project(cameras, view, MIDDLE), cameras.center[view])
@@ -171,10 +150,6 @@ def test_focal_lengths_go_from_keyframe_to_keyframe(tmp_path):
     focal = path.cameras(frame()).focal
     assert focal[:, 0].tolist() == pytest.approx([25.0, 100.0, 70.0], rel=0.02)  # of a picture half as wide
     assert KeyframePath(file, num_frames=3, fov=90.0).cameras(frame()).focal[1].tolist() == pytest.approx([50.0, 50.0])
-
-
-def test_without_times_there_are_120_frames(tmp_path):
-    assert len(KeyframePath(keys(tmp_path)).cameras(frame()).c2w) == 120
 
 
 def test_hermite_is_exact_for_parabolas_inside_and_passes_all_knots():

@@ -84,24 +84,13 @@ def test_another_size_keeps_the_field_of_view(asked, size, focal):
     assert math.isclose(float(cameras.width[0] / cameras.focal[0, 0]), 100 / 140, rel_tol=1e-6)
 
 
-def test_a_radius_of_ones_own():
-    cameras = Orbit(num_frames=3, radius=1.5).cameras(frame(dtype=torch.float32))
-    distance = (cameras.c2w[:, :, 3] - frame(dtype=torch.float32).center).norm(dim=-1)
-    torch.testing.assert_close(distance, torch.full((3,), 1.5))
-
-
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
         ({"num_frames": 0}, "path.num_frames is 0, but must be at least 1"),
         ({"elevation": 90.0}, "path.elevation is 90.0, but must be between -90 and 90"),
-        ({"elevation": math.nan}, "path.elevation is nan"),
         ({"radius": 0.0}, "path.radius is 0.0, but must be a positive distance"),
-        ({"radius": math.inf}, "path.radius is inf"),
         ({"turns": 0.0}, "path.turns is 0.0"),
-        ({"start": math.nan}, "path.start is nan"),
-        ({"width": 0}, "path.width is 0"),
-        ({"height": -3}, "path.height is -3"),
         ({"fps": 0}, "path.fps is 0"),
         ({"fov": 180.0}, "path.fov is 180.0"),
         ({"center": [0.0, 1.0]}, "path.center is .0.0, 1.0., but must be three finite numbers"),
