@@ -17,8 +17,7 @@ from nerf_lightning.config.overrides import quoted
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.types.scene import Scene
 
 log = logging.getLogger(__name__)

@@ -80,7 +80,7 @@ def _add_gradients(
 def _frozen(model: Model) -> Iterator[None]:
     """Let a model learn nothing and count nothing meanwhile."""
     learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    counts = [count.clone() for count in model.counts()]
+    counts = [count.clone() for count in model.sample_counts()]
     try:
         for parameter in learning:
             parameter.requires_grad_(False)
@@ -88,5 +88,5 @@ def _frozen(model: Model) -> Iterator[None]:
     finally:
         for parameter in learning:
             parameter.requires_grad_(True)
-        for count, before in zip(model.counts(), counts, strict=True):
+        for count, before in zip(model.sample_counts(), counts, strict=True):
             count.copy_(before)

@@ -24,8 +24,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.rendering.blending import background_colors, photograph

@@ -59,7 +59,7 @@ class RayRandom(TensorStruct):
     key: Int[Tensor, "*rays"]
     """fold(seed, attempt, step), the same for all rays."""
     slots: Int[Tensor, "*rays"]
-    """The ray's place in the global batch."""
+    """The ray's index in the global batch."""
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
@@ -82,7 +82,7 @@ class PointRandom(TensorStruct):
     key: Int[Tensor, "*#points"]
     """fold(seed, attempt, step)."""
     slots: Int[Tensor, "*#points"]
-    """The ray's place in the global batch."""
+    """The ray's index in the global batch."""
     number: Int[Tensor, "*points"]
     """Of the sample on its ray."""
 
@@ -118,10 +118,10 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     """
     rows = max(1, int(size**0.5))
     columns = -(-size // rows)
-    place = _feistel(index, rows, columns, key)
-    while (outside := (place >= size).nonzero(as_tuple=True))[0].numel():
-        place[outside] = _feistel(place[outside], rows, columns, key.expand(place.shape)[outside])
-    return place
+    position = _feistel(index, rows, columns, key)
+    while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
+        position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
+    return position
 
 
 def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:

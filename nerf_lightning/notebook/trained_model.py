@@ -17,8 +17,7 @@ from nerf_lightning.data.captures.checks import known_background
 from nerf_lightning.data.captures.joined import shown_capture
 from nerf_lightning.files.budgets import Budgets, set_limits
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, Scene, SceneRecord

@@ -10,8 +10,7 @@ from nerf_lightning.config.load_model import hold_to_budgets, load_weights
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.refinements.base import Refinement
 from nerf_lightning.nerf.types.progress import Progress

@@ -179,7 +179,7 @@ class TrainStep:
         def compute(batch: Batch, weight: Tensor, key: Tensor) -> StepOutput:
             return self._in_tiles(batch, _backward, self._share(weight), key, batch.num_rays)
 
-        self._recorded = RecordedGradients(compute, self._parameters(), self.model.counts, record)
+        self._recorded = RecordedGradients(compute, self._parameters(), self.model.sample_counts, record)
 
     @property
     def rays_together(self) -> int:
@@ -273,10 +273,10 @@ class TrainStep:
             norms = self.model.gradient_norms() if measure_gradients else {}
             self._update(optimizer)
             self.loss.learn(seen.rgb, seen.target, seen.weight)
-            ranks.average(self.loss.measurements())
+            ranks.average(self.loss.buffers_to_average())
         progress.advance(num_rays)
         if progress.step == 1 or progress.step % BATCH_STEPS == 0:
-            ranks.average(self.model.measurements())
+            ranks.average(self.model.buffers_to_average())
             if self.sample_budget is not None:
                 points = self.model.points_per_ray(training=True)
                 progress.batch_rays = batch_size(
@@ -296,7 +296,7 @@ class TrainStep:
             What this share saw; its losses and errors add up over all shares to the batch's.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
-        counts = [count.clone() for count in self.model.counts()]
+        counts = [count.clone() for count in self.model.sample_counts()]
         while True:
             try:
                 tile_rays = self._tile_rays(batch.num_rays, training=True)
@@ -308,7 +308,7 @@ class TrainStep:
                 self._take_smaller_tiles(batch, error)
             for part in self.parts.values():
                 part.zero_grad(set_to_none=False)
-            for count, before in zip(self.model.counts(), counts, strict=True):
+            for count, before in zip(self.model.sample_counts(), counts, strict=True):
                 count.copy_(before)
         for part in self._parts():
             if (penalty := part.penalty()) is not None:

@@ -17,7 +17,7 @@ class StepGuard:
 
     def __init__(self) -> None:
         self.counts: Tensor | None = None
-        self.place: Tensor | None = None
+        self.first_bad: Tensor | None = None
         self.watched: list[str] = []
 
     def allows(self, losses: Tensor, parameters: Iterable[tuple[str, Tensor]]) -> bool:
@@ -27,11 +27,11 @@ class StepGuard:
         watched = {name: gradient for name, gradient in gradients.items() if gradient.numel() < LARGE}
         sums = [gradient.sum() for gradient in watched.values()]
         broken = ~torch.isfinite(torch.stack([*sums, losses.sum()]))
-        bad, place = broken.any(), broken.int().argmax()
+        bad, first_bad = broken.any(), broken.int().argmax()
         if self.counts is None or self.counts.device != bad.device:
             self.counts = torch.zeros(2, dtype=torch.long, device=bad.device)
         begins = (self.counts[1] == 0) & bad
-        self.place = place if self.place is None else torch.where(begins, place, self.place)
+        self.first_bad = first_bad if self.first_bad is None else torch.where(begins, first_bad, self.first_bad)
         self.watched = [*watched, "loss.itself"]
         self.counts = torch.stack([self.counts[0] + bad, (self.counts[1] + 1) * bad])
         if bad.device.type == "cpu":
@@ -53,7 +53,7 @@ class StepGuard:
     @property
     def first_module(self) -> str:
         """The first module, in the model's order, whose gradients were not finite when the row of bad steps began."""
-        return "none" if self.place is None else self.watched[int(self.place)].rpartition(".")[0]
+        return "none" if self.first_bad is None else self.watched[int(self.first_bad)].rpartition(".")[0]
 
     def state(self) -> list[int]:
         """What a checkpoint keeps."""

@@ -14,7 +14,7 @@ GROUPS = (
     ("validation/picture", "Pictures/validation"),
     ("scene/cameras", "Pictures/cameras"),
 )
-"""Beginnings of names and their places. Between PSNR and losses stand the pictures, and histograms come last."""
+"""Beginnings of names and their groups. Between PSNR and losses stand the pictures, and histograms come last."""
 ALONG_RAYS, PER_RAY = "weights_along_rays/weight", "weights_per_ray/effective_samples"
 WHOLE = ("val/psnr", "test/psnr", "train/loss", "validation/picture", "scene/cameras")
 """Names that are no beginnings of others."""
@@ -46,7 +46,7 @@ def shown_name(name: str) -> str:
     >>> [shown_name(name) for name in ("val/psnr", "val/psnr_standard_error", "train/loss_fine", "speed/rays_per_step")]
     ['PSNR/validation', 'val/psnr_standard_error', 'Training loss/fine', 'speed/rays_per_step']
     """
-    for beginning, place in GROUPS:
+    for beginning, group in GROUPS:
         if name == beginning if beginning in WHOLE else name.startswith(beginning):
-            return place + name.removeprefix(beginning)
+            return group + name.removeprefix(beginning)
     return name

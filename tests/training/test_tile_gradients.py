@@ -41,7 +41,7 @@ def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_poi
     optimizer = step.new_optimizer()
     optimizer.zero_grad()
     seen = step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), backward)
-    counts = torch.cat([count.float() for count in step.model.counts()] or [torch.zeros(1)])
+    counts = torch.cat([count.float() for count in step.model.sample_counts()] or [torch.zeros(1)])
     return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen, counts
 
 

@@ -18,8 +18,7 @@ from nerf_lightning.evaluation.protocol import COLORS, measured_of
 from nerf_lightning.export.page import QUALITIES, PageExport
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import Model
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import Model, show_photographs
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.training.callbacks.hparams import FINAL_METRICS

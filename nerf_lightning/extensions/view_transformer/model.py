@@ -177,8 +177,8 @@ class ViewTransformer(Model):
         photographs = tables.photographs
         sources = choose_sources(photographs, rays, self.num_sources, random)
         samples = self._samples(rays, random)
-        places = sources.places[sources.target]
-        projected = project_samples(photographs.cameras, tables.least_cosine, places, rays, samples.midpoints)
+        of_ray = sources.views[sources.target]
+        projected = project_samples(photographs.cameras, tables.least_cosine, of_ray, rays, samples.midpoints)
         visible = projected.visible & sources.given[sources.target][:, None]
         projected = replace(projected, visible=visible)
         views = self._looked_up(tables, sources, projected)
@@ -237,7 +237,7 @@ class ViewTransformer(Model):
         return RaySamples(torch.where(deep, 1.0 / inverse, even))
 
     def _looked_up(self, tables: ViewTables, sources: SourceViews, projected: Projected) -> Views:
-        views, numbered = torch.unique(sources.places, return_inverse=True)
+        views, numbered = torch.unique(sources.views, return_inverse=True)
         numbers = views.tolist()
         view = numbered[sources.target][:, None].expand(projected.visible.shape)
         features = tables.features(views, numbers, self.image_network).look_up(view, projected.at)

@@ -53,15 +53,15 @@ class NearestViews:
         capture = torch.zeros_like(rays.near, dtype=torch.int64) if rays.capture is None else rays.capture
         # The nearest is the first of one; more come from nearest to farthest.
         sources = choose_sources(photographs, rays, self.count, None)
-        places = sources.places[sources.target]
+        views = sources.views[sources.target]
         at = torch.stack([pixels.x, pixels.y], dim=-1).flatten(0, 1) + 0.5
-        as_is = self._colors(places, at[:, None].expand(-1, places.shape[1], -1))
+        as_is = self._colors(views, at[:, None].expand(-1, views.shape[1], -1))
         axis = -self.cameras.c2w[view, :, 2]
         ahead = ((photographs.middle[capture] - rays.origins) * axis).sum(dim=-1)
         t = (ahead / (rays.directions * axis).sum(dim=-1).clamp(min=1e-6)).clamp(min=1e-6)
-        seen = project_samples(photographs.cameras, self.tables.least_cosine, places, rays, t[:, None])
-        on_plane, there = self._colors(places, seen.at[:, 0]), seen.visible[:, 0]
-        apart = squared_distances(photographs, capture, rays.origins, places)
+        seen = project_samples(photographs.cameras, self.tables.least_cosine, views, rays, t[:, None])
+        on_plane, there = self._colors(views, seen.at[:, 0]), seen.visible[:, 0]
+        apart = squared_distances(photographs, capture, rays.origins, views)
         weights = 1.0 / (apart / apart.amin(dim=1, keepdim=True).clamp(min=1e-12) + SHARPNESS)
         weights, everywhere = weights * sources.given[sources.target], torch.ones_like(there)
         found = [
@@ -71,8 +71,8 @@ class NearestViews:
         ]
         return {kind: picture.view(*shape, 3) for kind, picture in zip(KINDS, found, strict=True)}
 
-    def _colors(self, places: Tensor, at: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
-        used, numbered = torch.unique(places, return_inverse=True)
+    def _colors(self, views: Tensor, at: Float[Tensor, "rays sources 2"]) -> Float[Tensor, "rays sources 3"]:
+        used, numbered = torch.unique(views, return_inverse=True)
         return self.tables.colors(used, used.tolist()).look_up(numbered, at)
 
 

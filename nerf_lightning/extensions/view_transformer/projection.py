@@ -40,7 +40,7 @@ class Projected(TensorStruct):
 def project_samples(
     cameras: Cameras,
     least_cosine: Float[Tensor, "views"],
-    places: Int[Tensor, "rays sources"],
+    views: Int[Tensor, "rays sources"],
     rays: RayBundle,
     t: Float[Tensor, "rays samples"],
 ) -> Projected:
@@ -49,11 +49,11 @@ def project_samples(
     Args:
         cameras: of the photographs.
         least_cosine: what `seen_cosines` returns of them.
-        places: which of them each ray's sources are.
+        views: which of them each ray's sources are.
         rays: in the world.
         t: distances.
     """
-    c2w, t = cameras.c2w[places], t[:, :, None, None]
+    c2w, t = cameras.c2w[views], t[:, :, None, None]
     apart = rays.origins[:, None] - c2w[..., 3]
     # From a camera's axes (right, up, back) to those of its lens (right, down, forward).
     axes = torch.cat([c2w[..., :1], -c2w[..., 1:3]], dim=-1)
@@ -61,11 +61,11 @@ def project_samples(
     along = (rays.directions[:, None, None, :] @ axes)[..., 0, :]
     local = start[:, None] + t * along[:, None]
     distance = local.square().sum(dim=-1).clamp(min=1e-12).sqrt()
-    ahead = local[..., 2] > least_cosine[places][:, None] * distance
+    ahead = local[..., 2] > least_cosine[views][:, None] * distance
     in_front = torch.where(ahead[..., None], local, torch.eye(3, device=local.device, dtype=local.dtype)[2])
-    plane = project_plane(in_front, cameras.lens[places][:, None], cameras.lens_model)
-    at = plane * cameras.focal[places][:, None] + cameras.center[places][:, None]
-    size = torch.stack([cameras.width[places], cameras.height[places]], dim=-1)[:, None]
+    plane = project_plane(in_front, cameras.lens[views][:, None], cameras.lens_model)
+    at = plane * cameras.focal[views][:, None] + cameras.center[views][:, None]
+    size = torch.stack([cameras.width[views], cameras.height[views]], dim=-1)[:, None]
     visible = ahead & ((at >= 0.0) & (at <= size)).all(dim=-1)
     looks = rays.directions[:, None, None, :]
     source_looks = (apart[:, None] + t * looks) / distance[..., None]

@@ -29,7 +29,7 @@ NO_PHOTOGRAPH = -1
 class SourceViews(TensorStruct):
     """The photographs that some rays are rendered from; the rays of one target share theirs."""
 
-    places: Int[Tensor, "targets sources"]
+    views: Int[Tensor, "targets sources"]
     """Which of `Photographs` they are."""
     given: Bool[Tensor, "targets sources"]
     """False where there are no more photographs; the place is then that of any."""
@@ -71,19 +71,19 @@ def choose_sources(photographs: Photographs, rays: RayBundle, count: int, random
         count = max(1, count - MORE_OR_FEWER + int(more * (2 * MORE_OR_FEWER + 1)))
     pool, count = min(max(pool, count), num_views), min(count, num_views)
     nearest = distance.sort(dim=1, stable=True)
-    places, known = nearest.indices[:, :pool], nearest.values[:, :pool].isfinite()
+    views, known = nearest.indices[:, :pool], nearest.values[:, :pool].isfinite()
     if random is not None:
-        of_target = PointRandom(random.key[:1, None], photograph[:, None], photographs.numbers[places])
+        of_target = PointRandom(random.key[:1, None], photograph[:, None], photographs.numbers[views])
         order = torch.where(known, of_target.uniform("sources.order"), torch.inf).argsort(dim=1, stable=True)
-        places, known = places.gather(1, order), known.gather(1, order)
-    return SourceViews(places[:, :count], known[:, :count], of_ray)
+        views, known = views.gather(1, order), known.gather(1, order)
+    return SourceViews(views[:, :count], known[:, :count], of_ray)
 
 
 def squared_distances(
     photographs: Photographs,
     capture: Int[Tensor, "targets"],
     eye: Float[Tensor, "targets 3"],
-    places: Int[Tensor, "#targets views"],
+    views: Int[Tensor, "#targets views"],
 ) -> Float[Tensor, "targets views"]:
     """Return how far photographs are from targets, as the nearest are chosen: of directions where cameras stand around.
 
@@ -91,9 +91,9 @@ def squared_distances(
         photographs: of all captures.
         capture: that each target belongs to.
         eye: where it is seen from.
-        places: which photographs are asked about; of its own capture.
+        views: which photographs are asked about; of its own capture.
     """
-    eyes, middle = photographs.cameras.c2w[places, :, 3], photographs.middle[capture][:, None]
+    eyes, middle = photographs.cameras.c2w[views, :, 3], photographs.middle[capture][:, None]
     # Not by the cosine, which hardly changes where directions all but agree.
     turned = functional.normalize(eye[:, None] - middle, dim=-1) - functional.normalize(eyes - middle, dim=-1)
     apart = torch.where(photographs.around[capture][:, None, None], turned, eye[:, None] - eyes)
@@ -101,7 +101,7 @@ def squared_distances(
 
 
 def _targets(rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the places from which rays are seen, each once (capture, photograph, eye), and which is each ray's."""
+    """Return the origins that rays start from, each once (capture, photograph, eye), and which is each ray's."""
     # Origins are told apart by their bits, as the whole numbers beside them.
     none = torch.zeros_like(rays.near, dtype=torch.int64)
     capture = none if rays.capture is None else rays.capture

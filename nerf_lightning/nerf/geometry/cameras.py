@@ -73,7 +73,7 @@ def rays_through_pixels(
     pixels: PixelIndex,
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
-    place: Float[Tensor, "*#rays 2"] | None = None,
+    subpixel_offset: Float[Tensor, "*#rays 2"] | None = None,
     per_side: int = 1,
 ) -> RayBundle:
     """Return the rays through pixels; near and far are given per view (scene units).
@@ -87,13 +87,13 @@ def rays_through_pixels(
         pixels: which.
         near: where the rays of each view begin.
         far: where they end.
-        place: where in its pixel each ray goes through, in pixels from the centre (x, y); None: there.
+        subpixel_offset: from the centre of its pixel to where each ray passes, in pixels (x, y); None: none.
         per_side: so many rays share each side of a pixel.
     """
     view = pixels.view
     at = torch.stack([pixels.x, pixels.y], dim=-1).to(cameras.focal) + 0.5
-    if place is not None:
-        at = at + place
+    if subpixel_offset is not None:
+        at = at + subpixel_offset
     plane = (at - cameras.center[view]) / cameras.focal[view]
     if cameras.lens_model == "pinhole":
         local = torch.stack([plane[..., 0], -plane[..., 1], -torch.ones_like(plane[..., 0])], dim=-1)
@@ -159,10 +159,10 @@ def seen_at(
 
     Whether something hides them is not asked.
     """
-    place = project(cameras, view, points)
+    pixel = project(cameras, view, points)
     inside = (camera_coordinates(cameras, view, points)[:, 2] < 0) | (cameras.lens_model == "equirectangular")
-    inside &= (place >= 0).all(dim=-1) & (place[:, 0] < cameras.width[view]) & (place[:, 1] < cameras.height[view])
-    x, y = torch.where(inside[:, None], place, 0.0).long().unbind(dim=-1)
+    inside &= (pixel >= 0).all(dim=-1) & (pixel[:, 0] < cameras.width[view]) & (pixel[:, 1] < cameras.height[view])
+    x, y = torch.where(inside[:, None], pixel, 0.0).long().unbind(dim=-1)
     return inside, x, y
 
 

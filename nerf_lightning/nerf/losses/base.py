@@ -42,7 +42,7 @@ class Loss(nn.Module, ABC):
             weight: 0 for masked pixels.
         """
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the buffers that `learn` has changed, whose means the processes of a run must agree on."""
         return []
 

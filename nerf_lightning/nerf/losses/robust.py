@@ -73,7 +73,7 @@ class RobustLoss(Loss):
         moved = MEMORY * self.threshold + (1.0 - MEMORY) * wanted
         self.threshold.copy_(torch.where(torch.isfinite(moved), moved, self.threshold))
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the threshold, on which the processes of a run must agree."""
         return [self.threshold]
 

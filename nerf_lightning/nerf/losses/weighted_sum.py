@@ -47,9 +47,9 @@ class WeightedSum(Loss):
         for loss in self._losses():
             loss.learn(rgb, target, weight)
 
-    def measurements(self) -> list[Tensor]:
-        """Return the measurements of all losses."""
-        return [each for loss in self._losses() for each in loss.measurements()]
+    def buffers_to_average(self) -> list[Tensor]:
+        """Return those of all losses."""
+        return [each for loss in self._losses() for each in loss.buffers_to_average()]
 
     def forget(self) -> None:
         """Let each loss forget."""

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.photographs import photographs_of
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.models.subpixels import Subpixels
 from nerf_lightning.nerf.randomness import RayRandom
@@ -35,7 +36,7 @@ class Model(nn.Module, ABC):
 
     replays: bool = False
     """True where a training step's kernels are the same in each step, so that a recording of them may be replayed: what
-    the host decides between two steps would stay as it was. Then `counts` are all that a step changes."""
+    the host decides between two steps would stay as it was. Then `sample_counts` are all that a step changes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,11 +96,11 @@ class Model(nn.Module, ABC):
     def update(self, step: int, key: int) -> None:
         """Do what is done between steps of training: `step` steps have been taken, `key` is the next one's."""
 
-    def counts(self) -> list[Tensor]:
+    def sample_counts(self) -> list[Tensor]:
         """Return the buffers in which a training step counts, to put them back where a step is repeated."""
         return []
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the buffers that hold means over rays, which the processes of a run must agree on."""
         return []
 
@@ -161,3 +162,13 @@ def _look_at_what_was_loaded(model: Model, _: Any) -> None:
         look = getattr(part, "validate_state", None)
         if look is not None:
             look()
+
+
+def show_photographs(model: Model, scene: Scene) -> None:
+    """Show a model the photographs that it renders a scene from, if it needs any.
+
+    Raises:
+        InputError: they are too few, or of a kind that the model cannot use.
+    """
+    if model.needs_photographs:
+        model.set_source_images(photographs_of(scene, scene.sources))

@@ -77,11 +77,11 @@ class Level(nn.Module):
         """Return the density per unit length, as the field has it."""
         return self.field.density(Points(positions))[0]
 
-    def counts(self) -> list[Tensor]:
+    def sample_counts(self) -> list[Tensor]:
         """Return the buffers in which a training step counts, to put them back where a step is repeated."""
         return []
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the buffers that hold means over rays, which the processes of a run must agree on."""
         return []
 

@@ -104,13 +104,13 @@ class RadianceModel(PointField):
         for level in self._in_order():
             level.fit_to(scene)
 
-    def counts(self) -> list[Tensor]:
+    def sample_counts(self) -> list[Tensor]:
         """Return the buffers of all levels in which a training step counts."""
-        return [count for level in self._in_order() for count in level.counts()]
+        return [count for level in self._in_order() for count in level.sample_counts()]
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the buffers of all levels that hold means over rays."""
-        return [measured for level in self._in_order() for measured in level.measurements()]
+        return [measured for level in self._in_order() for measured in level.buffers_to_average()]
 
     def set_precision(self, matmul_precision: MatmulPrecision) -> None:
         """Set the precision of the products with the fields' weights; everything else is float32 always."""

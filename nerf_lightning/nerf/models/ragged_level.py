@@ -96,11 +96,11 @@ class RaggedLevel(Level):
         super().update(step, key)
         self.counter.average()
 
-    def counts(self) -> list[Tensor]:
+    def sample_counts(self) -> list[Tensor]:
         """Return samples and rays since the sampler's last update."""
         return [self.counter.counts]
 
-    def measurements(self) -> list[Tensor]:
+    def buffers_to_average(self) -> list[Tensor]:
         """Return the samples per ray; `points_per_ray` reads them again after this."""
         self.counter.reread()
         return [self.counter.mean]

@@ -82,16 +82,16 @@ class RayGenerator(Part):
         return Cameras(lens_model=self.lens_model, **{name: getattr(self, name) for name in MOVED})
 
     def forward(
-        self, pixels: PixelIndex, place: Float[Tensor, "*#rays 2"] | None = None, per_side: int = 1
+        self, pixels: PixelIndex, subpixel_offset: Float[Tensor, "*#rays 2"] | None = None, per_side: int = 1
     ) -> RayBundle:
         """Return the rays through pixels, in the world or in normalised device coordinates.
 
         Args:
             pixels: which.
-            place: where in its pixel each ray goes through, in pixels from the centre; None: there.
+            subpixel_offset: from the centre of its pixel to where each ray passes, in pixels (x, y); None: none.
             per_side: so many rays share each side of a pixel.
         """
-        rays = rays_through_pixels(self.cameras, pixels, self.near, self.far, place, per_side)
+        rays = rays_through_pixels(self.cameras, pixels, self.near, self.far, subpixel_offset, per_side)
         if self.capture_of is not None:
             rays = replace(rays, capture=self.capture_of[pixels.view])
         return replace(rays, photograph=pixels.view) if self.names_photographs else rays
@@ -100,9 +100,9 @@ class RayGenerator(Part):
         """Return the rays of pixels in a row, as many for each as a model wants, those of one pixel after the other."""
         if subpixels.per_pixel == 1:
             return self(pixels)
-        place = subpixels.places(pixels.x.device).repeat(pixels.x.numel(), 1)
+        subpixel_offset = subpixels.offsets(pixels.x.device).repeat(pixels.x.numel(), 1)
         each = pixels.map(lambda of_pixel: for_each_ray(of_pixel, subpixels.per_pixel))
-        return self(each, place, subpixels.per_side)
+        return self(each, subpixel_offset, subpixels.per_side)
 
     def reset_parameters(self) -> None:
         """Put the cameras back to where they were given."""
@@ -119,6 +119,6 @@ class RayGenerator(Part):
         with torch.no_grad():
             return align_untrained_cameras(self.given.to("cpu"), self.cameras.to("cpu"), trained)
 
-    def through_world(self, pixels: PixelIndex, place: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
+    def through_world(self, pixels: PixelIndex, subpixel_offset: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
         """Return the rays through the world, wherever those of `forward` run."""
-        return rays_through_pixels(replace(self.cameras, ndc=None), pixels, self.near, self.far, place)
+        return rays_through_pixels(replace(self.cameras, ndc=None), pixels, self.near, self.far, subpixel_offset)

@@ -63,8 +63,8 @@ def render_picture(
     """
     cameras, subpixels, device = rays_of.cameras, model.subpixels, next(model.parameters()).device
 
-    def through(place: Float[Tensor, "2"], pixels: PixelIndex) -> Picture:
-        at = (place, subpixels.per_side)
+    def through(offset: Float[Tensor, "2"], pixels: PixelIndex) -> Picture:
+        at = (offset, subpixels.per_side)
         rays, straight = view_rays(rays_of, pixels, clip, *at)
         if seen_from is not None:
             rays = replace(rays, view_directions=view_rays(seen_from, pixels, None, *at)[1].view_directions)
@@ -77,10 +77,10 @@ def render_picture(
 
     def render(part: slice) -> Picture:
         pixels = pixels_between(cameras, view, part)
-        first, *others = subpixels.places()
+        first, *others = subpixels.offsets()
         total = through(first, pixels)
-        for place in others:
-            total = _sum(total, through(place, pixels))
+        for offset in others:
+            total = _sum(total, through(offset, pixels))
         return total.map(lambda each: each / subpixels.per_pixel) if others else total
 
     height, width = int(cameras.height[view]), int(cameras.width[view])
@@ -93,7 +93,7 @@ def view_rays(
     rays_of: RayGenerator,
     pixels: PixelIndex,
     clip: Clip | None = None,
-    place: Float[Tensor, "2"] | None = None,
+    subpixel_offset: Float[Tensor, "2"] | None = None,
     per_side: int = 1,
 ) -> tuple[RayBundle, RayBundle]:
     """Return the rays of pixels as the model takes them, and the same rays through the world; both on the CPU.
@@ -104,13 +104,13 @@ def view_rays(
         rays_of: the cameras.
         pixels: which.
         clip: what of the scene is shown; None: all.
-        place: where in each pixel its ray goes through, in pixels from the centre; None: there.
+        subpixel_offset: from the centre of each pixel to where its ray passes, in pixels (x, y); None: none.
         per_side: so many rays share each side of a pixel.
     """
-    place = None if place is None else place.to(pixels.x.device)
-    rays = rays_of(pixels, place, per_side).to("cpu")
+    subpixel_offset = None if subpixel_offset is None else subpixel_offset.to(pixels.x.device)
+    rays = rays_of(pixels, subpixel_offset, per_side).to("cpu")
     bent = rays_of.ndc is not None
-    straight = rays_of.through_world(pixels, place).to("cpu") if bent else rays
+    straight = rays_of.through_world(pixels, subpixel_offset).to("cpu") if bent else rays
     return rays if clip is None else clip(rays, straight, ndc=bent), straight
 
 

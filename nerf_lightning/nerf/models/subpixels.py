@@ -49,12 +49,12 @@ class Subpixels(Part):
         """Rays through each pixel."""
         return self._now**2
 
-    def places(self, device: torch.device | str = "cpu") -> Float[Tensor, "per_pixel 2"]:
+    def offsets(self, device: torch.device | str = "cpu") -> Float[Tensor, "per_pixel 2"]:
         """Return where in a pixel its rays go through, in pixels from its centre (x, y), row by row.
 
         >>> halves = Subpixels(2)
         >>> halves.on_step(StepContext(progress=0.9, step=9, key=0))
-        >>> halves.places().tolist()
+        >>> halves.offsets().tolist()
         [[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]
         """
         along = (torch.arange(self._now, device=device) + 0.5) / self._now - 0.5

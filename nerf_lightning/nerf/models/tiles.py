@@ -65,8 +65,8 @@ def weighted_renderings(
     count = rays.near.numel()
     random = batch_random(key, count, rays.near.device)
     behind = background_colors(background, count, rays.near.device, random)
-    counts = [number.clone() for number in model.counts()]
+    counts = [number.clone() for number in model.sample_counts()]
     for part in tiles(count, tile_rays_for(model, tile_points, training=True)):
         yield rays[part], model(rays[part], None if behind is None else behind[part], random[part])
-    for number, before in zip(model.counts(), counts, strict=True):
+    for number, before in zip(model.sample_counts(), counts, strict=True):
         number.copy_(before)

@@ -44,5 +44,5 @@ def sum_over_rays(values: Float[Tensor, "capacity n"], samples: RaggedSamples) -
 
 def first_of_each_ray(samples: RaggedSamples, counts: Int[Tensor, "rays"]) -> tuple[Tensor, Tensor]:
     """Return which samples are the first `counts` ones of each ray, and the bounds of what is left."""
-    kept = (samples.place < counts.index_select(0, samples.ray_index)).nonzero()[:, 0]
+    kept = (samples.sample_index < counts.index_select(0, samples.ray_index)).nonzero()[:, 0]
     return kept, torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -37,8 +37,8 @@ def weight_along(
     if contracted_spacing:
         near, far, distance = normalized_distance(near), normalized_distance(far), normalized_distance(distance)
     share = (distance - near[ray]) / (far - near).clamp(min=torch.finfo(torch.float32).tiny)[ray]
-    place = (bins * share).long().clamp(0, bins - 1)
-    total = torch.zeros(bins, device=weights.device).index_add_(0, place, weights)
+    bin_index = (bins * share).long().clamp(0, bins - 1)
+    total = torch.zeros(bins, device=weights.device).index_add_(0, bin_index, weights)
     return total / rays.near.numel()
 
 

@@ -42,12 +42,15 @@ def ragged_points(
     def of_ray(each: Tensor) -> Tensor:
         return each.index_select(0, ray)
 
+    of_points = None
+    if random is not None:
+        of_points = PointRandom(of_ray(random.key), of_ray(random.slots), first + samples.sample_index)
     along = samples.midpoints[:, None] * of_ray(rays.directions)
     return Points(
         positions=of_ray(rays.origins) + along,
         directions=of_ray(rays.view_directions),
         photograph=None if rays.photograph is None else of_ray(rays.photograph),
-        random=None if random is None else PointRandom(of_ray(random.key), of_ray(random.slots), first + samples.place),
+        random=of_points,
         covariance=_covariance(rays, samples, ray) if cones else None,
     )
 

@@ -64,17 +64,17 @@ def _until_opaque(
 ) -> tuple[Tensor, Tensor | None]:
     """Return how many samples of each ray are visible, and the features of all that were computed."""
     density, features = torch.zeros_like(samples.starts), None
-    place, counts, asked = samples.place, samples.bounds.diff(), 0
+    sample_index, counts, asked = samples.sample_index, samples.bounds.diff(), 0
     while rays_left := int((counts > asked).sum()):
         until = asked + _samples_per_chunk(counts.shape[0], rays_left)
         in_chunk = (counts.clamp(max=until) - asked).clamp(min=0)
         until_there = counts.clamp(max=until).index_select(0, samples.ray_index)
-        number = ((place >= asked) & (place < until_there)).nonzero()[:, 0]
+        number = ((sample_index >= asked) & (sample_index < until_there)).nonzero()[:, 0]
         part = samples.at(number, torch.cat([counts.new_zeros(1), in_chunk.cumsum(0)]))
         found, computed = field.density(ragged_points(rays, part, random, field.sees_cones, first=asked))
         density[number] = found.float()
         if computed is not None:
-            features = computed.new_empty(*place.shape, computed.shape[1]) if features is None else features
+            features = computed.new_empty(*sample_index.shape, computed.shape[1]) if features is None else features
             features[number] = computed
         counts = num_visible(density, samples, sampler.opaque_below)
         asked = until

@@ -82,7 +82,7 @@ class RaggedSamples(TensorStruct):
     """No ray has more samples; None: the bounds say so, read on the host."""
 
     @property
-    def place(self) -> Int[Tensor, "capacity"]:
+    def sample_index(self) -> Int[Tensor, "capacity"]:
         """Number of each sample in its ray, from 0."""
         first = self.bounds.index_select(0, self.ray_index)
         return torch.arange(self.ray_index.shape[0], device=self.bounds.device) - first

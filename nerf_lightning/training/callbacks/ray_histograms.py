@@ -76,14 +76,14 @@ def look_along(
 def write_shares(writer: SummaryWriter, tag: str, shares: Float[Tensor, "parts"], step: int) -> None:
     """Write a histogram over [0, 1] whose bars are given."""
     shares = shares.double()
-    places = (torch.arange(len(shares), dtype=torch.double) + 0.5) / len(shares)
+    middles = (torch.arange(len(shares), dtype=torch.double) + 0.5) / len(shares)
     writer.add_histogram_raw(
         tag,
         min=0.0,
         max=1.0,
         num=float(shares.sum()),
-        sum=float((shares * places).sum()),
-        sum_squares=float((shares * places.square()).sum()),
+        sum=float((shares * middles).sum()),
+        sum_squares=float((shares * middles.square()).sum()),
         bucket_limits=((torch.arange(len(shares)) + 1) / len(shares)).tolist(),
         bucket_counts=shares.tolist(),
         global_step=step,

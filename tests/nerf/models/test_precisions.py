@@ -9,7 +9,7 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics, mean_over_images
 from nerf_lightning.nerf.losses.base import Loss
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import show_photographs
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.rendering.blending import photograph
 from nerf_lightning.nerf.types.progress import Progress

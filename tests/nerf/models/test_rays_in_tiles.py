@@ -36,10 +36,10 @@ CAMERAS = {
 }
 
 
-def through_all_at_once(place, model, generator, view):
+def through_all_at_once(offset, model, generator, view):
     """A picture as it was rendered before: all rays, then tile by tile."""
     pixels = all_pixels(generator.cameras, view)
-    rays = generator(pixels, place, model.subpixels.per_side)
+    rays = generator(pixels, offset, model.subpixels.per_side)
     flat, seen = rays.map(lambda each: each.flatten(0, 1)), []
     for part in tiles(flat.near.numel(), tile_rays_for(model, TILE)):
         behind = background_colors("white", part.stop - part.start, torch.device("cpu"), None)
@@ -48,7 +48,7 @@ def through_all_at_once(place, model, generator, view):
     columns = (torch.cat(column) for column in zip(*seen, strict=True))
     rgb, depth, opacity, first = (column.view(*rays.near.shape, *column.shape[1:]) for column in columns)
     if generator.ndc is not None:
-        depth = world_distance(generator.through_world(pixels, place), depth / rays.far)
+        depth = world_distance(generator.through_world(pixels, offset), depth / rays.far)
     return rgb, depth, opacity, first
 
 
@@ -64,7 +64,7 @@ def test_a_picture_has_the_bits_that_all_its_rays_at_once_gave_it(name, per_side
     model, generator = tiny_model(density_bias=0.5).eval(), RayGenerator(CAMERAS[name], SCENE.near, SCENE.far)
     model.fit_to(replace(SCENE, space=space))
     model.subpixels._now = per_side
-    parts = [through_all_at_once(place, model, generator, 1) for place in model.subpixels.places()]
+    parts = [through_all_at_once(offset, model, generator, 1) for offset in model.subpixels.offsets()]
     picture = render_picture(model, generator, 1, "white", TILE)
     for found, columns in zip(picture.tensors(), zip(*parts, strict=True), strict=True):
         assert torch.equal(found, sum(columns[1:], columns[0]) / len(columns))

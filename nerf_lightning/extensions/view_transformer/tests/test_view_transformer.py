@@ -11,8 +11,7 @@ from nerf_lightning.data.captures.joined import joined
 from nerf_lightning.evaluation.evaluator import Scoring
 from nerf_lightning.extensions.view_transformer.nearest_view import NearestViews
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.nerf.models.base import point_field
-from nerf_lightning.nerf.models.looking import show_photographs
+from nerf_lightning.nerf.models.base import point_field, show_photographs
 from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.rendering.blending import photograph
 

@@ -212,11 +212,11 @@ def _find(p, resolution, hashed, mask, e, w):
 
 
 # Four features are kept in registers as one vector: written one by one, the compiler must fear that what it stores is
-# what it loads next, and takes a third longer. A place without sign is not looked at for being negative.
+# what it loads next, and takes a third longer. An unsigned index needs no test for a negative one.
 @njit(fastmath=True)
 @no_type_check
-def _take(table, place, weight, a, b, c, d):
-    entry = np.uintp(place)
+def _take(table, index, weight, a, b, c, d):
+    entry = np.uintp(index)
     return (
         a + weight * table[entry, 0],
         b + weight * table[entry, 1],
@@ -227,8 +227,8 @@ def _take(table, place, weight, a, b, c, d):
 
 @njit(fastmath=True)
 @no_type_check
-def _give(into, place, weight, a, b, c, d):
-    entry = np.uintp(place)
+def _give(into, index, weight, a, b, c, d):
+    entry = np.uintp(index)
     p, q, r, s = into[entry, 0], into[entry, 1], into[entry, 2], into[entry, 3]
     into[entry, 0], into[entry, 1] = p + weight * a, q + weight * b
     into[entry, 2], into[entry, 3] = r + weight * c, s + weight * d

@@ -184,8 +184,8 @@ def _find(first_ray, last_ray, o, d, enter, leave, jitters, lattice, cells, leap
 @no_type_check
 def _pack(first_ray, last_ray, jitters, lattice, numbers, bounds, index, starts, ends):
     for r in range(first_ray, last_ray):
-        for place in range(bounds[r], bounds[r + 1]):
-            k = numbers[r, place - bounds[r]]
-            index[place] = r
-            starts[place] = edge(lattice, jitters[r], k)
-            ends[place] = edge(lattice, jitters[r], k + 1)
+        for sample in range(bounds[r], bounds[r + 1]):
+            k = numbers[r, sample - bounds[r]]
+            index[sample] = r
+            starts[sample] = edge(lattice, jitters[r], k)
+            ends[sample] = edge(lattice, jitters[r], k + 1)

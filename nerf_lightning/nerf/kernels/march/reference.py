@@ -54,8 +54,8 @@ def in_occupied(positions: Float[Tensor, "*points 3"], grid: OccupancyCells) -> 
         cascade += (reach > 2.0**number).long()
     unit = 0.5 * scaled / (2.0**cascade)[..., None] + 0.5
     cell = (unit * resolution).long().clamp(0, resolution - 1)
-    place = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
-    return (reach <= 2.0 ** (cascades - 1)) & grid.cells[place].bool()
+    cell_index = (cascade, cell[..., 0], cell[..., 1], cell[..., 2])
+    return (reach <= 2.0 ** (cascades - 1)) & grid.cells[cell_index].bool()
 
 
 def _packed(

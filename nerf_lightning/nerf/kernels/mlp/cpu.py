@@ -94,10 +94,10 @@ def backward(
 
 def unpadded(total: Tensor, weights: Sequence[Tensor], widths: Sequence[int]) -> list[Tensor]:
     """Return the gradients of all layers' weights, which lie one after the other, without what was padded."""
-    grads, place = [], 0
+    grads, offset = [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
-        grads.append(total[place : place + inner * outer].view(outer, inner)[: weight.shape[0]])
-        place += inner * outer
+        grads.append(total[offset : offset + inner * outer].view(outer, inner)[: weight.shape[0]])
+        offset += inner * outer
     return grads
 
 
@@ -123,17 +123,17 @@ def words_of(numbers: int, dtype: torch.dtype) -> int:
 
 def packed_words(weights: Sequence[Tensor], widths: Sequence[int], transposed: bool) -> np.ndarray:
     """Return the words of all layers: rows of W^T, or of W, one layer after the other; in bfloat16 pairs of rows."""
-    out, place = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights[0].dtype), np.int32), 0
+    out, offset = np.empty(words_of(sum(a * b for a, b in pairwise(widths)), weights[0].dtype), np.int32), 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
         padded = np.zeros((outer, inner), np.float32)
         padded[: weight.shape[0], : weight.shape[1]] = weight.detach().float().numpy()
         rows = np.ascontiguousarray(padded if transposed else padded.T)
-        end = place + words_of(rows.size, weight.dtype)
+        end = offset + words_of(rows.size, weight.dtype)
         if weight.dtype == torch.bfloat16:
-            _pack(rows, out[place:end])
+            _pack(rows, out[offset:end])
         else:
-            out[place:end] = rows.reshape(-1).view(np.int32)
-        place = end
+            out[offset:end] = rows.reshape(-1).view(np.int32)
+        offset = end
     return out
 
 

@@ -84,11 +84,11 @@ def backward(
         sizes = inputs, grad.shape[1], *widths, widths[-1]
         flags = len(weights), wants_points, BACKWARD_BLOCK, _interpreted(sums)
         _backward[(programs,)](*arrays, rows, *sizes[:6], *flags, **BACKWARD)
-    total, grads, place = sums.sum(dim=0), [], 0
+    total, grads, offset = sums.sum(dim=0), [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
-        of_weight = total[place : place + inner * outer].view(outer, inner)
+        of_weight = total[offset : offset + inner * outer].view(outer, inner)
         grads.append(of_weight[: weight.shape[0], : weight.shape[1]])
-        place += inner * outer
+        offset += inner * outer
     return of_points if wants_points else None, grads
 
 

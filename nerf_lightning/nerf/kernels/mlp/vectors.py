@@ -85,7 +85,7 @@ def multiply_block(
         else:
             three = ir.FunctionType(FLOATS, [FLOATS, FLOATS, FLOATS])
             fused = cgutils.get_or_insert_function(builder.module, three, "llvm.fmuladd.v16f32")
-        places = [
+        addresses = [
             [_at(builder, y, FLOATS, builder.add(_times(builder, row, r), row.type(64 * b))) for b in range(width)]
             for r in range(count)
         ]
@@ -93,7 +93,7 @@ def multiply_block(
         goes_on, zeros = builder.icmp_signed("!=", adds, adds.type(0)), ir.Constant(FLOATS, [0.0] * LANES)
         for r in range(count):
             for b in range(width):
-                builder.store(builder.select(goes_on, builder.load(places[r][b], align=4), zeros), sums[r][b])
+                builder.store(builder.select(goes_on, builder.load(addresses[r][b], align=4), zeros), sums[r][b])
         undefined, lanes = ir.Constant(numbers, ir.Undefined), ir.Constant(WORDS, [0] * LANES)
         with cgutils.for_range(builder, words) as loop:
             from_w = builder.add(w, builder.mul(loop.index, row))
@@ -112,7 +112,7 @@ def multiply_block(
                     builder.store(after, sums[r][b])
         for r in range(count):
             for b in range(width):
-                builder.store(builder.load(sums[r][b]), places[r][b], align=4)
+                builder.store(builder.load(sums[r][b]), addresses[r][b], align=4)
         return context.get_dummy_value()
 
     return types.void(kind, rows, blocks, *[ADDRESS] * 8), code

@@ -16,7 +16,7 @@ def transmittance_torch(density: Float[Tensor, "capacity"], samples: RaggedSampl
     longest = int(samples.bounds.diff().amax()) if samples.longest is None and rays else samples.longest
     columns = max(1, longest or 0)
     slot = torch.arange(capacity, device=density.device)
-    in_ray = samples.ray_index * columns + samples.place
+    in_ray = samples.ray_index * columns + samples.sample_index
     cell = torch.where(slot < samples.bounds[-1], in_ray, rays * columns + slot)
     optical = density * samples.deltas
     table = optical.new_zeros((rays + -(-capacity // columns)) * columns).scatter(0, cell, optical).view(-1, columns)

@@ -136,23 +136,23 @@ def interval(march, r, k):
 
 @njit
 @no_type_check
-def _go_on(march, live, ray, place, light, opaque_below):
+def _go_on(march, live, ray, sample_index, light, opaque_below):
     # Ends the rays that are opaque or have no samples left, and takes the others to their next; returns how many go on.
     end, s = march[5].shape[0] - 2, 0
     while s < live:
-        k = next_sample(march, ray[s], place[s] + 1) if light[s] > opaque_below else end
+        k = next_sample(march, ray[s], sample_index[s] + 1) if light[s] > opaque_below else end
         if k < end:
-            place[s] = k
+            sample_index[s] = k
             s += 1
         else:
             live -= 1
-            ray[s], place[s], light[s] = ray[live], place[live], light[live]
+            ray[s], sample_index[s], light[s] = ray[live], sample_index[live], light[live]
     return live
 
 
 @njit
 @no_type_check
-def start(march, most, live, waiting, last, ray, place, light):
+def start(march, most, live, waiting, last, ray, sample_index, light):
     """Fill free places, up to `most`, with rays that meet something; return how many are taken, and the next ray."""
     enter, leave, jitters, lattice = march[2:6]
     while live < most and waiting < last:
@@ -161,7 +161,7 @@ def start(march, most, live, waiting, last, ray, place, light):
         if enter[r] < leave[r]:
             k = next_sample(march, r, first_from(lattice, jitters[r], 0, enter[r]))
             if k < lattice.shape[0] - 2:
-                ray[live], place[live], light[live] = r, k, ONE
+                ray[live], sample_index[live], light[live] = r, k, ONE
                 live += 1
     return live, waiting
 
@@ -204,7 +204,7 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
     bias, least_alpha, opaque_below = limits
     foreground, opacity, depth = out
     # Of the rays under way: which, how much light comes through to where they stand, and at which interval that is.
-    ray, place, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
+    ray, sample_index, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
     begin, stop = light.copy(), light.copy()
     points, features = np.zeros((ROWS, 3), np.float32), np.zeros((ROWS, dims[0]), np.float32)
     size, sums = bytes_of(kind), np.zeros((ROWS, dims.max()), np.float32)
@@ -216,12 +216,12 @@ def _render(kind, first, last, march, world, directions, table, levels, networks
     colors, hidden = np.zeros((ROWS, color_dims.max()), np.float32), color_dims[0] - directions.shape[1]
     live, waiting, asked = 0, first, 0
     while True:
-        live = _go_on(march, live, ray, place, light, opaque_below)
-        live, waiting = start(march, ROWS, live, waiting, last, ray, place, light)
+        live = _go_on(march, live, ray, sample_index, light, opaque_below)
+        live, waiting = start(march, ROWS, live, waiting, last, ray, sample_index, light)
         if live == 0:
             break
         for s in range(live):
-            begin[s], stop[s] = interval(march, ray[s], place[s])
+            begin[s], stop[s] = interval(march, ray[s], sample_index[s])
             locate(world, ray[s], HALF * (begin[s] + stop[s]), points, s)
         encode(0, live, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, stride, y = address(words), 4 * words.shape[1], address(sums)

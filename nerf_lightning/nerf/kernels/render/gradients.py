@@ -258,11 +258,11 @@ class _WholeRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _take(march, world, live, ray, place, slots, owners, numbers, points):
+def _take(march, world, live, ray, sample_index, slots, owners, numbers, points):
     # Gives each ray under way its next samples, as many as there is room for; returns how many samples there are.
     each, end, count = ROWS // live, march[5].shape[0] - 2, 0
     for s in range(live):
-        r, k = ray[s], place[s]
+        r, k = ray[s], sample_index[s]
         for _ in range(each):
             if k >= end:
                 break
@@ -273,7 +273,7 @@ def _take(march, world, live, ray, place, slots, owners, numbers, points):
             numbers[count, 0], numbers[count, 1] = stop - begin, t
             count += 1
             k = next_sample(march, r, k + 1)
-        place[s] = k
+        sample_index[s] = k
     return count
 
 
@@ -316,15 +316,15 @@ def _color(count, raw, outer, owners, numbers, foreground):
 
 @njit
 @no_type_check
-def _end(live, end, opaque_below, ray, place, light):
+def _end(live, end, opaque_below, ray, sample_index, light):
     # Leaves the rays out that are opaque or have no samples left; returns how many go on.
     s = 0
     while s < live:
-        if light[s] > opaque_below and place[s] < end:
+        if light[s] > opaque_below and sample_index[s] < end:
             s += 1
         else:
             live -= 1
-            ray[s], place[s], light[s] = ray[live], place[live], light[live]
+            ray[s], sample_index[s], light[s] = ray[live], sample_index[live], light[live]
     return live
 
 
@@ -336,7 +336,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     bias, opaque_below = limits
     foreground, opacity, depth = out
     all_owners, all_numbers, all_points, density_kept, color_kept = room
-    ray, place, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
+    ray, sample_index, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
     slots, features = np.zeros(ROWS, np.int64), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0]), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
@@ -344,14 +344,14 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
     live, waiting, block, asked, end = 0, first, 0, 0, march[5].shape[0] - 2
     while True:
-        live, waiting = start(march, SLOTS, live, waiting, last, ray, place, light)
+        live, waiting = start(march, SLOTS, live, waiting, last, ray, sample_index, light)
         if live == 0:
             return block, asked
         if (block + 1) * ROWS > all_owners.shape[0]:
             return block + 1, asked
         rows = slice(block * ROWS, (block + 1) * ROWS)
         owners, numbers, points = all_owners[rows], all_numbers[rows], all_points[rows]
-        count = _take(march, world, live, ray, place, slots, owners, numbers, points)
+        count = _take(march, world, live, ray, sample_index, slots, owners, numbers, points)
         owners[count:], points[count:] = -1, HALF
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + block * ROWS * stride, address(sums)
@@ -367,7 +367,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
         round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
         through(kind, x, color_stride, address(color_words), color_dims, y, y)
         _color(count, flat, color_dims[-1], owners, numbers, foreground)
-        live = _end(live, end, opaque_below, ray, place, light)
+        live = _end(live, end, opaque_below, ray, sample_index, light)
         block += 1
 
 
