@@ -13,7 +13,7 @@ from nerf_lightning.doctor.matches import Matches, Proof
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
-PAIRS_AT_ONCE = 1 << 24
+PAIRS_AT_ONCE = 1 << 24  # a capture may have 200,000 views
 Verdict = Literal["ok", "look", "wrong"]
 """`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be."""
 
@@ -68,5 +68,5 @@ ok, look, wrong = partial(Check, "", "ok"), partial(Check, "", "look"), partial(
 
 
 def rows_at_once(columns: int) -> int:
-    """Return how many of many things are compared at once with each of others: a capture may have 200,000 views."""
+    """Return how many rows of a table of pairs, with so many columns, are computed at once."""
     return max(1, PAIRS_AT_ONCE // columns)

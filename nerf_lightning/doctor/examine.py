@@ -1,13 +1,11 @@
 """All checks of a capture, and what they look at. A new check is a function, named in CHECKS of its file."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
 
 from nerf_lightning.data.pixels.store import in_threads
-from nerf_lightning.doctor import cameras, extent, image_quality, memory, poses
+from nerf_lightning.doctor import cameras, extent, image_quality, poses
 from nerf_lightning.doctor.check import Check, CheckFn, Evidence
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.features import Corners, Looks, find_corners, look_at_view, shrunk_cameras, small_picture
@@ -21,7 +19,6 @@ CHECKS: dict[str, CheckFn] = {
     **extent.CHECKS,
     **cameras.OF_VIEWS,
     **image_quality.CHECKS,
-    **memory.CHECKS,
 }
 
 
@@ -36,18 +33,12 @@ def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
             f"{scene.name} joins {len(scene.captures)} captures, and the doctor examines one at a time: give "
             "scene=auto scene.root=DIR; or doctor=off to train all the same."
         )
-    with _one_thread_each():
-        evidence = gather_evidence(scene)
-        return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
     # Pictures are spread over our own threads; torch's would only stand in their way.
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        evidence = gather_evidence(scene)
+        return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
     finally:
         torch.set_num_threads(before)
 

@@ -19,7 +19,7 @@ FEWEST = 50
 FEW, MANY = 0.03, 0.15
 # Of each view, a grid of GRID x GRID pixels is looked at.
 GRID = 12
-INCHES, FEET, CENTIMETRES = 39.37, 3.281, 100.0
+UNITS = {"inches": 39.37, "feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 
 
 def near_and_far(evidence: Evidence) -> Check:
@@ -140,9 +140,11 @@ def _share_in_box(scene: Scene, view: int) -> Float[Tensor, ""]:
 
 def _units(low: float, high: float, near: float, far: float) -> str:
     # near and far in another unit than the poses.
+    if min(far, high) <= 0 or (near > 0 and low <= 0):
+        return ""  # a ratio needs distances
     factor = ((near * far) / (low * high)) ** 0.5 if near > 0 else far / high
     off = f"they are {max(factor, 1 / factor):.3g} times too {'large' if factor > 1 else 'small'}."
-    for name, size in (("inches", INCHES), ("feet", FEET), ("centimetres", CENTIMETRES), ("millimetres", 1000.0)):
+    for name, size in UNITS.items():
         if abs(factor / size - 1) < 0.35:
             return f" Near and far may be in {name} and the poses in metres: {off}"
         if abs(factor * size - 1) < 0.35:

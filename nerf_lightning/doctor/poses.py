@@ -1,12 +1,13 @@
 """Checks of the poses against the pixels: places that photographs share must lie where the cameras say."""
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence, look, ok, wrong
+from nerf_lightning.doctor.check import Check, CheckFn, Evidence, look, ok, wrong
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.matches import Matches, Proof, strongest_proof
@@ -42,25 +43,9 @@ DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; mo
 NOT_JUDGED = "not judged: too few details could be found again from one photograph to another"
 
 
-def axes_convention(evidence: Evidence) -> Check:
-    """Judge whether another convention of axes, or the inverse, explains the pixels better."""
-    return _best_reading(evidence, AXES, "the cameras' axes are right, up, back, camera to world")
-
-
-def mirrored(evidence: Evidence) -> Check:
-    """Judge whether the photographs are mirrored."""
-    return _best_reading(evidence, PHOTOGRAPHS, "the photographs are not mirrored")
-
-
-def order_of_photographs(evidence: Evidence) -> Check:
-    """Judge whether photographs and poses were paired in another order."""
-    return _best_reading(evidence, ORDERS, "each photograph has its own pose")
-
-
 def poses_and_pixels(evidence: Evidence) -> Check:
     """Judge whether the poses explain what photographs have in common."""
-    matches = evidence.matches
-    share, count = evidence.agreement, len(matches.view)
+    share, count = evidence.agreement, len(evidence.matches.view)
     if count < FEWEST:
         return look(NOT_JUDGED, "Look at the poses in doctor.png; larger or sharper photographs help.")
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
@@ -72,7 +57,7 @@ def poses_and_pixels(evidence: Evidence) -> Check:
 def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     """Judge all poses by pairs of photographs whose details are no mistakes, since most matches do not agree."""
     pairs = clear_pairs(evidence.matches, evidence.scene.cameras)
-    against = [pair for pair in pairs if pair.contradicts]
+    against = [proof for contradicts, proof in pairs if contradicts]
     if len(pairs) < FEWEST_CLEAR:
         return look(f"{message}; too few photographs share enough details to tell", DOUBTFUL)
     share = len(against) / len(pairs)
@@ -82,7 +67,7 @@ def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     cure = "See the other verdicts for the cause; if they name none, estimate the poses anew (nerf poses)."
     if share < MOST_AGAINST or evidence.agreement >= HOPELESS:
         return look(message, cure)
-    return wrong(message, cure, (against[0].proof,))
+    return wrong(message, cure, (against[0],))
 
 
 def focal_length(evidence: Evidence) -> Check:
@@ -232,7 +217,8 @@ def _share(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0)
     return float(agreeing(matches, c2w, zoom).float().mean()) if len(matches.view) else 0.0
 
 
-def _best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
+def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -> Check:
+    """Judge whether one of other readings of the capture explains the pixels better; `fine`: what holds if not."""
     scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
     if len(matches.view) < FEWEST:
         return ok(NOT_JUDGED)
@@ -253,10 +239,10 @@ def _best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) 
     )
 
 
-CHECKS = {
-    "axes": axes_convention,
-    "mirrored photographs": mirrored,
-    "order of photographs": order_of_photographs,
+CHECKS: dict[str, CheckFn] = {
+    "axes": partial(best_reading, readings=AXES, fine="the cameras' axes are right, up, back, camera to world"),
+    "mirrored photographs": partial(best_reading, readings=PHOTOGRAPHS, fine="the photographs are not mirrored"),
+    "order of photographs": partial(best_reading, readings=ORDERS, fine="each photograph has its own pose"),
     "poses and pixels": poses_and_pixels,
     "single poses": single_poses,
     "focal length": focal_length,

@@ -110,18 +110,11 @@ def _starts(own: Matches, c2w: Float[Tensor, "views 3 4"], suspects: list[int]) 
     return torch.cat([c2w[mixed], beside])
 
 
-@dataclass(frozen=True)
-class ClearPair:
-    """Two photographs whose details fit each other."""
+def clear_pairs(matches: Matches, cameras: Cameras) -> list[tuple[bool, Proof]]:
+    """Return the clear ones among the largest pairs, the largest first; `cameras` are those that are judged.
 
-    contradicts: bool
-    """The poses do not explain most of what fits."""
-    proof: Proof
-    """What fits, and how the two cameras stand to each other."""
-
-
-def clear_pairs(matches: Matches, cameras: Cameras) -> list[ClearPair]:
-    """Return the clear ones among the largest pairs, the largest first; `cameras` are those that are judged."""
+    For each: whether the poses do not explain most of what fits, and what fits, with how the two cameras stand.
+    """
     _, pair, count = matches.view.unique(dim=0, return_inverse=True, return_counts=True)
     largest = [
         number for number in count.argsort(descending=True)[:MOST_PAIRS].tolist() if count[number] >= FEWEST_IN_PAIR
@@ -130,7 +123,7 @@ def clear_pairs(matches: Matches, cameras: Cameras) -> list[ClearPair]:
     return [each for each in found if each is not None]
 
 
-def _judged(matches: Matches, cameras: Cameras) -> ClearPair | None:
+def _judged(matches: Matches, cameras: Cameras) -> tuple[bool, Proof] | None:
     view, other = matches.view[0].tolist()
     # The other camera where it is; this one turned alike and a step beside it, to any of six sides.
     there = cameras.c2w[other].double()
@@ -151,7 +144,7 @@ def _judged(matches: Matches, cameras: Cameras) -> ClearPair | None:
         return None
     agrees = agreeing(fitting, cameras.c2w)
     against = fitting.where(~agrees) if bool((~agrees).any()) else fitting
-    return ClearPair(float(agrees.float().mean()) < AGREES, Proof(against, tried[best]))
+    return float(agrees.float().mean()) < AGREES, Proof(against, tried[best])
 
 
 def refitted(

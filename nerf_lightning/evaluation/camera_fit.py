@@ -60,9 +60,8 @@ def fitted_camera(model: Model, scene: Scene, view: int, background: Background,
             _add_gradients(model, rays_of, seen, truth.to(device), background, tile_points)
             optimizer.step()
             decay.step()
-    found = rays_of.cameras.c2w.detach().cpu()
     c2w = scene.cameras.c2w.clone()
-    c2w[view] = found[0]
+    c2w[view] = rays_of.cameras.c2w.detach().cpu()[0]
     return replace(scene.cameras, c2w=c2w)
 
 

@@ -3,12 +3,11 @@
 import logging
 import time
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.evaluation.camera_fit import fitted_camera
@@ -33,6 +32,7 @@ from nerf_lightning.nerf.types.scene import Background, Scene
 log = logging.getLogger(__name__)
 
 
+@dataclass
 class Scoring:
     """What is measured and how.
 
@@ -50,30 +50,25 @@ class Scoring:
             view shown as the nearest of them and as their blend; null: no.
     """
 
-    def __init__(
-        self,
-        split: Literal["train", "val", "test"] = "test",
-        max_views: int | None = None,
-        quantize: bool = False,
-        num_pictures: int = 5,
-        num_worst: int = 3,
-        lpips_weights: str | None = None,
-        lpips_net: Literal["alex", "vgg"] = "alex",
-        colors: Colors = "raw",
-        nearest_views: int | None = None,
-    ):
-        if nearest_views is not None and nearest_views < 1:
-            raise InputError(f"evaluation.nearest_views={nearest_views}: give at least one photograph, or null.")
-        if max_views is not None and max_views < 1:
-            raise InputError(f"evaluation.max_views={max_views}: give at least one view, or null for all.")
-        for name, count in (("num_pictures", num_pictures), ("num_worst", num_worst)):
+    split: Literal["train", "val", "test"] = "test"
+    max_views: int | None = None
+    quantize: bool = False
+    num_pictures: int = 5
+    num_worst: int = 3
+    lpips_weights: str | None = None
+    lpips_net: Literal["alex", "vgg"] = "alex"
+    colors: Colors = "raw"
+    nearest_views: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.nearest_views is not None and self.nearest_views < 1:
+            raise InputError(f"evaluation.nearest_views={self.nearest_views}: give at least one photograph, or null.")
+        if self.max_views is not None and self.max_views < 1:
+            raise InputError(f"evaluation.max_views={self.max_views}: give at least one view, or null for all.")
+        for name, count in (("num_pictures", self.num_pictures), ("num_worst", self.num_worst)):
             if count < 0:
                 raise InputError(f"evaluation.{name}={count}: give 0 or more.")
-        self.split, self.max_views, self.quantize = split, max_views, quantize
-        self.colors: Colors = colors
-        self.num_pictures, self.num_worst = num_pictures, num_worst
-        self.nearest_views = nearest_views
-        self.lpips = load_lpips(lpips_weights, lpips_net)
+        self.lpips = load_lpips(self.lpips_weights, self.lpips_net)
 
     def score(
         self,
@@ -154,7 +149,10 @@ class Scoring:
         scored = slice(None)
         if self.colors == "half_fit":
             scored = slice(truth.shape[1] // 2, None)
-            picture = replace(picture, rgb=_fitted_on_the_left(picture, truth, kept, scored.start, background))
+            left = torch.ones(truth.shape[:2], dtype=torch.bool) if kept is None else kept.clone()
+            left[:, scored] = False
+            behind = background_colors(background, 1, torch.device("cpu"), random=None)
+            picture = replace(picture, rgb=exposure_fitted(picture.rgb, truth, picture.opacity, left, behind))
         if self.quantize:
             picture = replace(picture, rgb=(picture.rgb.clamp(0, 1) * 255).round() / 255)
         render, true, counts = picture.rgb[:, scored], truth[:, scored], None if kept is None else kept[:, scored]
@@ -177,15 +175,6 @@ def _warn_of_unseen(rows: list[dict[str, Any]]) -> None:
             100.0 * share,
             name,
         )
-
-
-def _fitted_on_the_left(
-    picture: Picture, truth: Tensor, kept: Tensor | None, middle: int, background: Background
-) -> Tensor:
-    fitted = torch.ones(truth.shape[:2], dtype=torch.bool) if kept is None else kept.clone()
-    fitted[:, middle:] = False
-    behind = background_colors(background, 1, torch.device("cpu"), random=None)
-    return exposure_fitted(picture.rgb, truth, picture.opacity, fitted, behind)
 
 
 def _geometry_errors(picture: Picture, scene: Scene, view: int) -> dict[str, float | None]:

@@ -1,7 +1,7 @@
 """How close the shape is, for scenes that know theirs: error of the depth and of the normals."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.surfaces import surface_depth
@@ -42,18 +42,14 @@ def normal_error(
     A pixel counts if it and its four neighbours are wholly covered by the scene (`alpha` 1): the differences
     that make its normal then touch no background. The border, which lacks a neighbour, does not count.
     """
-    scored = _well_inside(alpha >= 1.0) & (truth_normals.norm(dim=-1) > 0)
+    covered, inside = alpha >= 1.0, torch.zeros_like(alpha, dtype=torch.bool)
+    above_and_below = covered[:-2, 1:-1] & covered[2:, 1:-1]
+    beside = covered[1:-1, :-2] & covered[1:-1, 2:]
+    inside[1:-1, 1:-1] = covered[1:-1, 1:-1] & above_and_below & beside
+    scored = inside & (truth_normals.norm(dim=-1) > 0)
     if not scored.any():
         return None
     ours, true = normals[scored], truth_normals[scored]
     # atan2 keeps its precision at small angles, where acos of a dot product near 1 loses half the digits.
     angle = torch.atan2(torch.linalg.cross(ours, true).norm(dim=-1), (ours * true).sum(dim=-1))
     return float(torch.rad2deg(angle).mean())
-
-
-def _well_inside(covered: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    inside = torch.zeros_like(covered)
-    above_and_below = covered[:-2, 1:-1] & covered[2:, 1:-1]
-    beside = covered[1:-1, :-2] & covered[1:-1, 2:]
-    inside[1:-1, 1:-1] = covered[1:-1, 1:-1] & above_and_below & beside
-    return inside

@@ -34,8 +34,6 @@ MAY_LACK = ("lpips", "cc_psnr")
 Colors = Literal["raw", "half_fit"]
 """Whether a render is compared as it is; or on its right half alone, with exposure and white balance of the left."""
 COLORS = {"raw": "raw", "half_fit": "exposure and white balance fitted on the left half, scored on the right"}
-UNSAID = {"colors": "raw"}
-"""What older results meant without saying it."""
 
 
 def measured_how(
@@ -166,16 +164,12 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any], same_scene: bo
     return [
         f"{key}: {_said(one, key)} and {_said(other, key)}"
         for key in keys
-        if _meant(one, key) != _meant(other, key) and not (key in MAY_LACK and None in (one.get(key), other.get(key)))
+        if one.get(key) != other.get(key) and not (key in MAY_LACK and None in (one.get(key), other.get(key)))
     ]
 
 
-def _meant(protocol: Mapping[str, Any], key: str) -> Any:
-    return protocol.get(key, UNSAID.get(key))
-
-
 def _said(protocol: Mapping[str, Any], key: str) -> str:
-    return str(_meant(protocol, key))[:80] if key in protocol or key in UNSAID else "not said"
+    return str(protocol[key])[:80] if key in protocol else "not said"
 
 
 LIBRARIES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "triton")

@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +36,7 @@ COLMAP_TAKES = {"pinhole": [], "radial_tangential": [0, 1, 4, 5], "fisheye": [0,
 log = logging.getLogger(__name__)
 
 
+@dataclass
 class CamerasExport(Export):
     """Write where the photographs were taken, and through what lens.
 
@@ -51,9 +53,12 @@ class CamerasExport(Export):
 
     needs_density = False
 
-    def __init__(self, images: str | None = None, format: CamerasFormat = "transforms", fps: int = 24):
-        require_setting("fps", fps, fps >= 1, "give 1 or more photographs per second.")
-        self.images, self.format, self.fps = images, format, fps
+    images: str | None = None
+    format: CamerasFormat = "transforms"
+    fps: int = 24
+
+    def __post_init__(self) -> None:
+        require_setting("fps", self.fps, self.fps >= 1, "give 1 or more photographs per second.")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the files."""

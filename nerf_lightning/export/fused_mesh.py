@@ -1,6 +1,6 @@
 """The surface that the views see, as a mesh: their rendered depth, fused to one truncated signed distance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -36,16 +36,6 @@ LEAST_COSINE, NOTHING, LEAST_SHARE = 0.05, 0.3, 0.25
 LEAST_WEIGHT = 0.5
 
 
-@dataclass(frozen=True)
-class DepthView:
-    """What one view says of the surface."""
-
-    depth: Float[Tensor, "height width"]
-    """Distance along the ray at which half of the stopped light was stopped; inf where the ray meets nothing."""
-    trust: Float[Tensor, "height width"]
-    """How much it counts: the cosine of the angle to the surface, less where a pixel covers many cells."""
-
-
 def mesh_of_depth(
     model: Model, record: SceneRecord, lattice: Lattice, truncation: float, tile_points: int, report: Report
 ) -> tuple[Float[ndarray, "vertices 3"], Int[ndarray, "faces 3"]]:
@@ -62,9 +52,9 @@ def mesh_of_depth(
     rays_of = depth_rays(record, max(lattice.shape))
     cameras = rays_of.cameras
     for view in range(len(cameras.width)):
-        seen = depth_view(model, record.background, rays_of, view, lattice.spacing, tile_points)
+        depth, trust = depth_view(model, record.background, rays_of, view, lattice.spacing, tile_points)
         numbers = torch.cat([cameras.c2w[view].reshape(-1), cameras.focal[view], cameras.center[view]]).numpy()
-        fuse.add_view(distance, weight, lower, lattice.spacing, numbers, seen.depth.numpy(), seen.trust.numpy(), reach)
+        fuse.add_view(distance, weight, lower, lattice.spacing, numbers, depth.numpy(), trust.numpy(), reach)
         report("depth", (view + 1) / len(cameras.width))
     if not ((weight > 0) & (distance < 0)).any():
         raise InputError(
@@ -97,8 +87,12 @@ def _known(
 
 def depth_view(
     model: Model, background: Background, rays_of: RayGenerator, view: int, spacing: float, tile_points: int
-) -> DepthView:
-    """Render what one view says of the surface; `spacing` is that of the grid, in scene units."""
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Return what one view says of the surface; `spacing` is that of the grid, in scene units.
+
+    The distance along each ray at which half of the stopped light was stopped (inf: the ray meets nothing), and how
+    much that counts: the cosine of the angle to the surface, less where a pixel covers many cells.
+    """
     rays = rays_of(all_pixels(rays_of.cameras, view))
     flat = rays.map(lambda part: part.flatten(0, 1)).to(next(model.parameters()).device)
     depths, opacities = [], []
@@ -113,7 +107,7 @@ def depth_view(
     cosine = (normals * rays.directions).sum(dim=-1).abs().clamp(min=LEAST_COSINE)
     share = (spacing * rays_of.cameras.focal[view].min() / depth).clamp(LEAST_SHARE, 1.0)
     trust = torch.where(meets, cosine * share, NOTHING)
-    return DepthView(torch.where(meets, depth, torch.inf), trust.float())
+    return torch.where(meets, depth, torch.inf), trust.float()
 
 
 def depth_rays(record: SceneRecord, cells: int) -> RayGenerator:

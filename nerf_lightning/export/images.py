@@ -1,6 +1,7 @@
 """Depth, opacity and normals of the views, as pictures and arrays."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,7 +10,6 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
-from torch import Tensor
 
 from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.export.base import Export, require_free, require_setting
@@ -36,6 +36,7 @@ KINDS = ("depth", "opacity", "normals")
 MILLIMETRE = 1e-3
 
 
+@dataclass
 class ImagesExport(Export):
     """Write folders of pictures: `depth` (16-bit PNG, and float32 .npy), `opacity`, `normals`, and `images.json`.
 
@@ -52,10 +53,13 @@ class ImagesExport(Export):
 
     needs_density = False
 
-    def __init__(self, split: Split = "test", max_views: int | None = None, depth: DepthKind = "distance"):
-        some = max_views is None or max_views >= 1
-        require_setting("max_views", max_views, some, "give at least one view, or null for all.")
-        self.split, self.max_views, self.depth = split, max_views, depth
+    split: Split = "test"
+    max_views: int | None = None
+    depth: DepthKind = "distance"
+
+    def __post_init__(self) -> None:
+        some = self.max_views is None or self.max_views >= 1
+        require_setting("max_views", self.max_views, some, "give at least one view, or null for all.")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the pictures; the scale of the depth is one for all, so the PNG files come last."""
@@ -71,7 +75,7 @@ class ImagesExport(Export):
                 depth = self._depth(seen, record, view)
                 _save_array(depths / f"{names[view]}.npy", depth)
                 farthest = max(farthest, float(np.nanmax(depth, initial=0.0)))
-                _save_opacity(opacities / f"{names[view]}.png", seen.opacity)
+                save_png(opacities / f"{names[view]}.png", to_bytes(seen.opacity))
                 normals = 0.5 + 0.5 * directions_to_user(seen.normals.double(), record.to_user.double())
                 save_png(directions / f"{names[view]}.png", to_bytes(normals))
                 for name, values in seen.channels.items():
@@ -80,7 +84,9 @@ class ImagesExport(Export):
                 report("pictures", (number + 1) / len(views))
             scale = _scale(record, farthest)
             for number, view in enumerate(views):
-                _save_depth(depths, names[view], scale)
+                depth = np.nan_to_num(np.load(depths / f"{names[view]}.npy"), nan=0.0)
+                with whole_file(depths / f"{names[view]}.png") as part:
+                    Image.fromarray(np.rint(depth / scale).astype(np.uint16)).save(part, format="PNG")
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
         write_json(about, self._described(record, names, scale))
@@ -135,15 +141,3 @@ def _save_array(path: Path, array: Float[ndarray, "height width *channels"]) -> 
     np.save(content, array)
     with whole_file(path) as part:
         part.write_bytes(content.getbuffer())
-
-
-def _save_opacity(path: Path, opacity: Float[Tensor, "height width"]) -> None:
-    grey = to_bytes(opacity[..., None].expand(-1, -1, 3))[..., 0]
-    with whole_file(path) as part:
-        Image.fromarray(grey.contiguous().numpy()).save(part, format="PNG")
-
-
-def _save_depth(folder: Path, name: str, scale: float) -> None:
-    depth = np.nan_to_num(np.load(folder / f"{name}.npy"), nan=0.0)
-    with whole_file(folder / f"{name}.png") as part:
-        Image.fromarray(np.rint(depth / scale).astype(np.uint16)).save(part, format="PNG")

@@ -1,6 +1,7 @@
 """A mesh of the surface: of the density or of what the views see, cleaned, coloured, in the user's frame."""
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -49,6 +50,7 @@ TEXTURED_FACES = 60_000
 log = logging.getLogger(__name__)
 
 
+@dataclass
 class MeshExport(Export):
     """Write `mesh.ply` (or .obj, .glb) of what lies in the scene's box, with a colour per vertex or a texture.
 
@@ -74,49 +76,51 @@ class MeshExport(Export):
 
     kernels = (f"{ROOM}.tsdf_fusion", f"{ROOM}.texels")
 
-    def __init__(
-        self,
-        resolution: int = 256,
-        surface: Surface = "density",
-        threshold: float | None = None,
-        truncation: float = 4.0,
-        colors: SeenFrom = "cameras",
-        min_share: float = 0.01,
-        seen_only: bool = True,
-        faces: int | None = None,
-        texture: bool = False,
-        texture_size: int = 2048,
-        format: MeshFormat | None = None,
-    ):
-        positive = threshold is None or threshold > 0
-        require_setting("threshold", threshold, positive, "give a density above 0, or null to take it from the data.")
-        require_setting("truncation", truncation, 1 <= truncation <= 64, "give a number of cells from 1 to 64.")
+    resolution: int = 256
+    surface: Surface = "density"
+    threshold: float | None = None
+    truncation: float = 4.0
+    colors: SeenFrom = "cameras"
+    min_share: float = 0.01
+    seen_only: bool = True
+    faces: int | None = None
+    texture: bool = False
+    texture_size: int = 2048
+    format: MeshFormat | None = None
+
+    def __post_init__(self) -> None:
+        positive = self.threshold is None or self.threshold > 0
+        require_setting(
+            "threshold", self.threshold, positive, "give a density above 0, or null to take it from the data."
+        )
+        require_setting(
+            "truncation", self.truncation, 1 <= self.truncation <= 64, "give a number of cells from 1 to 64."
+        )
         shares = "give a share from 0 (all is kept) to 1 (the largest part)."
-        require_setting("min_share", min_share, 0 <= min_share <= 1, shares)
-        require_setting("faces", faces, faces is None or faces >= 4, "a closed mesh has 4 or more; null keeps all.")
+        require_setting("min_share", self.min_share, 0 <= self.min_share <= 1, shares)
+        enough = self.faces is None or self.faces >= 4
+        require_setting("faces", self.faces, enough, "a closed mesh has 4 or more; null keeps all.")
         sizes = f"give a number of texels from {LEAST_SIZE} to {LARGEST_SIZE}."
-        require_setting("texture_size", texture_size, LEAST_SIZE <= texture_size <= LARGEST_SIZE, sizes)
-        if surface == "tsdf" and threshold is not None:
+        fits = LEAST_SIZE <= self.texture_size <= LARGEST_SIZE
+        require_setting("texture_size", self.texture_size, fits, sizes)
+        if self.surface == "tsdf" and self.threshold is not None:
             raise InputError(
-                f"what.threshold={threshold} belongs to what.surface=density: with what.surface=tsdf the surface is "
-                "where the views' light is stopped. Leave one of the two out."
+                f"what.threshold={self.threshold} belongs to what.surface=density: with what.surface=tsdf the surface "
+                "is where the views' light is stopped. Leave one of the two out."
             )
-        if surface == "tsdf" and not seen_only:
+        if self.surface == "tsdf" and not self.seen_only:
             raise InputError(
                 "what.seen_only=false asks for a closed mesh, and what.surface=tsdf knows only what the views see. "
                 "Take what.surface=density for it."
             )
-        if texture and format == "ply":
+        if self.texture and self.format == "ply":
             raise InputError(
                 "what.format=ply has no texture, and what.texture=true makes one. Give what.format=glb (one file), or "
                 "obj (with an MTL and a PNG beside it)."
             )
-        self.texture, self.texture_size = texture, texture_size
-        self.resolution, self.colors = resolution, colors
-        self.surface, self.threshold, self.truncation = surface, threshold, truncation
-        self.min_share, self.seen_only = min_share, seen_only
-        self.faces = TEXTURED_FACES if texture and faces is None else faces
-        self.format = format or ("glb" if texture else "ply")
+        if self.texture and self.faces is None:
+            self.faces = TEXTURED_FACES
+        self.format = self.format or ("glb" if self.texture else "ply")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the mesh."""

@@ -1,5 +1,6 @@
 """The scene as one page that anyone can open and walk around in: no server, no network, no program."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -8,7 +9,7 @@ from nerf_lightning.export.baking.cost import Cost, measured_cost
 from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export, require_setting
-from nerf_lightning.export.page_file import is_page, page_of, write_page
+from nerf_lightning.export.page_file import is_page, write_page
 from nerf_lightning.export.voxel_kernels.layout import ROOM
 from nerf_lightning.messages.console import StageProgress, say
 from nerf_lightning.messages.errors import InputError
@@ -41,6 +42,7 @@ COSTS = {
 }
 
 
+@dataclass
 class PageExport(Export):
     """Write `page.html`: the field as bytes, with what marches through them, the cameras and small photographs.
 
@@ -58,21 +60,19 @@ class PageExport(Export):
     plays_path = True
     kernels = tuple(f"{ROOM}.{module}" for module in ("bounded", "contracted", "gradients"))
 
-    def __init__(
-        self,
-        quality: Quality = "medium",
-        resolution: int | None = None,
-        photographs: int = 24,
-        max_views: int = 8,
-        fit_steps: int = 60,
-    ):
-        enough = resolution is None or resolution >= 8
-        require_setting("resolution", resolution, enough, "give 8 voxels or more, or null for what.quality's.")
-        for name, value in (("photographs", photographs), ("max_views", max_views), ("fit_steps", fit_steps)):
+    quality: Quality = "medium"
+    resolution: int | None = None
+    photographs: int = 24
+    max_views: int = 8
+    fit_steps: int = 60
+
+    def __post_init__(self) -> None:
+        enough = self.resolution is None or self.resolution >= 8
+        require_setting("resolution", self.resolution, enough, "give 8 voxels or more, or null for what.quality's.")
+        for name in ("photographs", "max_views", "fit_steps"):
+            value = getattr(self, name)
             require_setting(name, value, value >= 0, "give 0 or more.")
-        self.quality, self.photographs, self.max_views = quality, photographs, max_views
-        self.resolution, self.fit_steps = resolution, fit_steps
-        self.needs_photographs = bool(photographs or max_views or fit_steps)
+        self.needs_photographs = bool(self.photographs or self.max_views or self.fit_steps)
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the page, and say what it costs."""
@@ -86,8 +86,7 @@ class PageExport(Export):
                 baked = fitted(baked, photographs, record, self.fit_steps, report)
             marcher = Marcher(baked)
             cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
-        page = page_of(marcher, record, self.beside, self.photographs, cost.facts())
-        write_page(page, target)
+        write_page(target, marcher, record, self.beside, self.photographs, cost.facts())
         say(*self._said(target, cost))
         return [target]
 

@@ -1,10 +1,8 @@
-"""A page as a file: what stands in it, and how it is read again."""
+"""A page as a file: what stands in it."""
 
 import base64
-import binascii
 import io
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +14,13 @@ from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 
-from nerf_lightning.export.baking.baked_field import BakedField, described, deserialized, serialized
+from nerf_lightning.export.baking.baked_field import BakedField, described, serialized
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import STEP, Marcher
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.html import data_address, own_policy, rendered
-from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels, at_most
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
@@ -39,7 +37,6 @@ BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none":
 # Pixels of the longer side: of the still picture, of photographs.
 STILL, PHOTOGRAPH = 640, 320
 JPEG_QUALITY = 80
-MOST_BYTES = 1 << 30
 # How much is seen around a panorama's direction, in radians.
 PART_OF_PANORAMA = 1.5
 
@@ -53,23 +50,15 @@ class ViewOnPage:
     """The photograph, as an address; empty where there is none."""
 
 
-@dataclass(frozen=True)
-class Page:
-    """What a page shows besides its scene."""
-
-    title: str
-    facts: list[tuple[str, str]]
-    views: list[ViewOnPage]
-    still: str
-    background: str
-    about: dict[str, Any]
-    field: bytes
-
-
-def page_of(
-    marcher: Marcher, record: SceneRecord, beside: PageExtras, max_photographs: int, facts: list[tuple[str, str]]
-) -> Page:
-    """Return the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
+def write_page(
+    target: Path,
+    marcher: Marcher,
+    record: SceneRecord,
+    beside: PageExtras,
+    max_photographs: int,
+    facts: list[tuple[str, str]],
+) -> None:
+    """Write the page of a baked field, with what is known of it, and one to `max_photographs` places to jump to."""
     field = serialized(marcher.baked)
     views = evenly_spaced_subset(range(len(record.view_names)), max(1, max_photographs))
     middle, radius = _middle(marcher.baked, record)
@@ -92,47 +81,33 @@ def page_of(
     grid_fact = ("grid", f"{grid}, {about['blocks']:,} blocks of 8 x 8 x 8")
     known = [("scene", record.name), *beside.facts, *facts, grid_fact]
     places = [_view(record, beside, view if max_photographs else None) for view in views]
-    still, behind = _still(marcher, record, views[0]), BEHIND[at_evaluation(record.background)]
-    return Page(record.name, known, places, still, behind, about, field)
-
-
-def write_page(page: Page, target: Path) -> None:
-    """Write one file of HTML."""
+    cameras = at_most(record.cameras, STILL)
+    rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, views[0]))[0]
+    page = {
+        "title": record.name,
+        "facts": known,
+        "views": places,
+        "still": _jpeg(over(marcher.render(rays), record.background), STILL),
+        "background": BEHIND[at_evaluation(record.background)],
+    }
     style, shader, *scripts = (
         (FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", "march.glsl", *SCRIPTS)
     )
     script = "\n".join(scripts)
     # Nothing in a text may end the element that it stands in.
-    about = json.dumps(page.about).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    about_text = json.dumps(about).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     text = rendered(
         FOLDER / "page.html",
         page=page,
         policy=own_policy(script, style),
-        about=Markup(about),
+        about=Markup(about_text),
         script=Markup(script),
         style=Markup(style),
         shader=Markup(shader),
-        field=Markup(base64.b64encode(page.field).decode()),
+        field=Markup(base64.b64encode(field).decode()),
     )
     with whole_file(target) as part:
         part.write_text(text, encoding="utf-8")
-
-
-def read_baked(path: Path) -> tuple[dict[str, Any], BakedField]:
-    """Return what a page says of its scene, and the field in it.
-
-    Raises:
-        InputError: it is no page, or damaged.
-    """
-    text = read_text(path, MOST_BYTES)
-    found = [re.search(rf'<script type="[\w/]+" id="{name}">([^<]*)</script>', text) for name in ("about", "field")]
-    if found[0] is None or found[1] is None:
-        raise InputError(f"{path} is no page of this program, or cut off. Export it again.")
-    try:
-        about = json.loads(found[0][1])
-        return about, deserialized(about, base64.b64decode(found[1][1], validate=True))
-    except (ValueError, binascii.Error) as error:
-        raise InputError(f"The page {path} is damaged: {error}. Export it again.") from error
 
 
 def is_page(path: Path) -> bool:
@@ -172,12 +147,6 @@ def _view(record: SceneRecord, beside: PageExtras, view: int | None) -> ViewOnPa
     if scene is None or name not in scene.view_names or record.cameras.lens_model == "equirectangular":
         return ViewOnPage(name, "")
     return ViewOnPage(name, _jpeg(photograph(scene, scene.view_names.index(name), scene.background), PHOTOGRAPH))
-
-
-def _still(marcher: Marcher, record: SceneRecord, view: int) -> str:
-    cameras = at_most(record.cameras, STILL)
-    rays_of = RayGenerator(cameras, record.near, record.far)
-    return _jpeg(over(marcher.render(view_rays(rays_of, all_pixels(cameras, view))[0]), record.background), STILL)
 
 
 def _jpeg(picture: Float[Tensor, "height width 3"], longest: int) -> str:

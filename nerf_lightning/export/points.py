@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -37,6 +38,7 @@ COSTS = {"depth": 10.0, "agreement": 1.0}
 log = logging.getLogger(__name__)
 
 
+@dataclass
 class PointsExport(Export):
     """Write `points.ply` or `points.las`: a point per pixel of the training views.
 
@@ -53,27 +55,23 @@ class PointsExport(Export):
             needs `pip install 'nerf-lightning[las]'`.
     """
 
-    def __init__(
-        self,
-        num_points: int = 1_000_000,
-        max_views: int = 100,
-        longest: int = 400,
-        min_opacity: float = 0.9,
-        agreement: int = 2,
-        tolerance: float = 0.01,
-        format: PointFormat = "ply",
-    ):
-        counts = {"num_points": num_points, "max_views": max_views, "longest": longest, "agreement": agreement}
-        for (name, value), least in zip(counts.items(), (1, 1, 2, 0), strict=True):
+    num_points: int = 1_000_000
+    max_views: int = 100
+    longest: int = 400
+    min_opacity: float = 0.9
+    agreement: int = 2
+    tolerance: float = 0.01
+    format: PointFormat = "ply"
+
+    def __post_init__(self) -> None:
+        for name, least in {"num_points": 1, "max_views": 1, "longest": 2, "agreement": 0}.items():
+            value = getattr(self, name)
             require_setting(name, value, value >= least, f"give {least} or more.")
         asked = f"{NEIGHBOURS} other views are asked, so give at most that."
-        require_setting("agreement", agreement, agreement <= NEIGHBOURS, asked)
+        require_setting("agreement", self.agreement, self.agreement <= NEIGHBOURS, asked)
         shares = "give a share of the light, from 0 to below 1."
-        require_setting("min_opacity", min_opacity, 0 <= min_opacity < 1, shares)
-        require_setting("tolerance", tolerance, tolerance > 0, "give a share of the distance, above 0.")
-        self.num_points, self.max_views, self.longest = num_points, max_views, longest
-        self.min_opacity, self.agreement, self.tolerance = min_opacity, agreement, tolerance
-        self.format = format
+        require_setting("min_opacity", self.min_opacity, 0 <= self.min_opacity < 1, shares)
+        require_setting("tolerance", self.tolerance, self.tolerance > 0, "give a share of the distance, above 0.")
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the cloud."""

@@ -1,5 +1,6 @@
 """Density and colour on a regular grid over the scene's box."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ LEAST_ALPHA = 1e-3
 COSTS = {"density": 2.0, "colours": 3.0}
 
 
+@dataclass
 class VolumeExport(Export):
     """Write `volume.npz` (density, rgb) and `volume.json`, which says where the grid lies.
 
@@ -35,8 +37,7 @@ class VolumeExport(Export):
         resolution: cells along the longest side of the box.
     """
 
-    def __init__(self, resolution: int = 128):
-        self.resolution = resolution
+    resolution: int = 128
 
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the grids."""

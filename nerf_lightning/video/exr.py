@@ -1,7 +1,6 @@
 """Frames for compositing as EXR, by OpenEXR: colours in linear light, and depth, as floats."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,16 +17,6 @@ from nerf_lightning.nerf.rendering.linear_light import to_linear
 NOTHING = 1e10
 """The depth of a pixel that stops less than half of the light, as Blender writes it."""
 COMMENTS = "R, G, B: linear light. Z: distance from the camera in {unit}, 1e10 where nothing is."
-
-
-@dataclass(frozen=True)
-class Channels:
-    """What a frame holds."""
-
-    values: Mapping[str, Float[Tensor, "height width"]]
-    """By the names that compositors know."""
-    unit: str
-    """Of the depth."""
 
 
 def exr_channels(
@@ -54,8 +43,8 @@ def exr_channels(
     return channels
 
 
-def save_exr(path: Path, channels: Channels) -> None:
-    """Write one frame in 32-bit floats: whole or not at all. Missing folders are made.
+def save_exr(path: Path, channels: Mapping[str, Float[Tensor, "height width"]], unit: str) -> None:
+    """Write one frame, whose depth is in `unit`, in 32-bit floats: whole or not at all. Missing folders are made.
 
     Raises:
         InputError: OpenEXR is not installed.
@@ -65,9 +54,9 @@ def save_exr(path: Path, channels: Channels) -> None:
     header = {
         "compression": openexr.ZIP_COMPRESSION,
         "type": openexr.scanlineimage,
-        "comments": COMMENTS.format(unit=channels.unit),
+        "comments": COMMENTS.format(unit=unit),
     }
-    content = {name: values.float().contiguous().numpy() for name, values in channels.values.items()}
+    content = {name: values.float().contiguous().numpy() for name, values in channels.items()}
     with whole_file(path) as part:
         try:
             openexr.File(header, content).write(str(part))

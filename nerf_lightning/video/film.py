@@ -5,6 +5,7 @@ import json
 import logging
 from collections.abc import Generator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,13 +20,13 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.frames import told_length
 from nerf_lightning.nerf.types.scene import Cameras
 from nerf_lightning.video.encoding import CODECS, require_encoder
-from nerf_lightning.video.exr import Channels, exr_channels, require_openexr
+from nerf_lightning.video.exr import exr_channels, require_openexr, save_exr
 from nerf_lightning.video.frames import FilmFrames, Range
-from nerf_lightning.video.panels import FILMS, channel_picture, film_name, film_pictures, panel
+from nerf_lightning.video.panels import FILMS, channel_picture, film_pictures, panel
 from nerf_lightning.video.paths.base import CameraPath
 from nerf_lightning.video.settings import ENDINGS, FilmSettings
 from nerf_lightning.video.shots import Shot, Subject, depth_range, make_shots
-from nerf_lightning.visualization.pictures import straight_colors
+from nerf_lightning.visualization.pictures import save_png, straight_colors
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +99,7 @@ def film_steps(
     for name in [name for name in settings.outputs if name not in FILMS]:
         channel_picture(name, shots[0].picture(0))  # or says that there is none, before anything is written
     first = shots[0].subject.scene
-    films = ["mosaic"] if settings.mosaic else [film_name(name) for name in settings.outputs]
+    films = ["mosaic"] if settings.mosaic else [FILMS.get(name, name) for name in settings.outputs]
     if settings.form == "exr":
         films = ["exr"]  # all in one file
     frames = FilmFrames(
@@ -113,10 +114,13 @@ def film_steps(
         yield 0, len(mine)
         for done, number in enumerate(mine, start=1):
             if settings.form == "exr":
-                frames.save("exr", number, _channels(shots[0], settings, number))
+                view = shots[0].picture(number)
+                depth = shots[0].z_depth(number, view) if "depth" in settings.outputs else None
+                channels = exr_channels(view, depth, "rgb" in settings.outputs, settings.alpha)
+                frames.save("exr", number, partial(save_exr, channels=channels, unit=told_length(first)[1]))
             else:
                 for name, picture in _frame(shots, settings, number, seen).items():
-                    frames.save(name, number, picture)
+                    frames.save(name, number, partial(save_png, picture=picture))
             yield done, len(mine)
         ranks.gather(None)  # all frames are there
         if ranks.is_first():
@@ -124,13 +128,6 @@ def film_steps(
     finally:
         frames.close()
     return frames.results()
-
-
-def _channels(shot: Shot, settings: FilmSettings, number: int) -> Channels:
-    picture = shot.picture(number)
-    depth = shot.z_depth(number, picture) if "depth" in settings.outputs else None
-    values = exr_channels(picture, depth, "rgb" in settings.outputs, settings.alpha)
-    return Channels(values, told_length(shot.subject.scene)[1])
 
 
 def _frame(shots: list[Shot], settings: FilmSettings, number: int, seen: Range) -> dict[str, UInt8[Tensor, "_ _ _"]]:

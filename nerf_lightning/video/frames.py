@@ -21,9 +21,7 @@ from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_fo
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video.encoding import write_animation, write_video
-from nerf_lightning.video.exr import Channels, save_exr
 from nerf_lightning.video.settings import ENDINGS, Form
-from nerf_lightning.visualization.pictures import save_png
 
 Range = tuple[float, float]
 HIDDEN = ".frames"
@@ -90,8 +88,8 @@ class FilmFrames:
         near, far = note["depth_range"]
         return missing, (near, far)
 
-    def save(self, film: str, number: int, picture: UInt8[Tensor, "height width channels"] | Channels) -> None:
-        """Keep one frame: a picture, or of an EXR its channels.
+    def save(self, film: str, number: int, write: Callable[[Path], None]) -> None:
+        """Keep one frame, which `write` writes to a file.
 
         Raises:
             InputError: the disk is full, or cannot be written.
@@ -100,10 +98,7 @@ class FilmFrames:
             with self._kept():
                 file = self._file(film, number)
                 make_folder(self.folder, *file.parent.relative_to(self.folder).parts)
-                if isinstance(picture, Tensor):
-                    save_png(file, picture)
-                else:
-                    save_exr(file, picture)
+                write(file)
         except InputError as error:
             raise InputError(f"{error} {self._cure()}") from error
 

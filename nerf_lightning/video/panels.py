@@ -52,11 +52,6 @@ def panel(
     return to_bytes(picture.rgb) if output in FILMS else channel_picture(output, picture)
 
 
-def film_name(output: str) -> str:
-    """Return the name of the film of an output."""
-    return FILMS.get(output, output)
-
-
 def channel_picture(name: str, picture: Picture) -> UInt8[Tensor, "height width 3"]:
     """Return a channel as a picture: one number a pixel in grey, three as colours, more in the colour of the largest.
 
@@ -97,9 +92,9 @@ def film_pictures(
         rows = [row((each[name], prefix + name) for name in each) for each, prefix in named]
         return {"mosaic": _framed(_stacked(rows, size), size)}
     if not several:
-        return {film_name(name): picture for name, picture in panels[0].items()}
+        return {FILMS.get(name, name): picture for name, picture in panels[0].items()}
     beside = {name: row(zip((each[name] for each in panels), labels, strict=True)) for name in panels[0]}
-    return {film_name(name): _framed(picture, size) for name, picture in beside.items()}
+    return {FILMS.get(name, name): _framed(picture, size) for name, picture in beside.items()}
 
 
 def _stacked(rows: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int) -> UInt8[Tensor, "height width 3"]:

@@ -199,7 +199,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
 
 
 def _in_frame_of(cameras: Cameras, first: SceneRecord, scene: SceneRecord) -> Cameras:
-    """Return cameras of the first scene's working frame as another's: both know their way to the user's."""
+    """Return cameras of the first scene's working frame as another's."""
     if torch.equal(first.to_user, scene.to_user):
         return cameras
     apart = torch.linalg.inv(first.to_user.double()) @ scene.to_user.double()

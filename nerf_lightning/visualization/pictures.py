@@ -58,8 +58,8 @@ def straight_colors(
     return to_bytes(torch.where(shown, torch.cat([rgb / alpha.clamp(min=0.5 / 255), alpha], dim=-1), 0.0))
 
 
-def save_png(path: Path, picture: UInt8[Tensor, "height width channels"]) -> None:
-    """Write a picture, in RGB or in RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
+def save_png(path: Path, picture: UInt8[Tensor, "height width *channels"]) -> None:
+    """Write a picture, grey, RGB, or RGB and straight alpha, as PNG: whole or not at all. Missing folders are made."""
     with whole_file(path) as part:
         Image.fromarray(picture.numpy()).save(part, format="PNG")
 

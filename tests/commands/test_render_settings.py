@@ -22,8 +22,8 @@ from nerf_lightning.nerf.models.radiance_model import RadianceModel
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.video.film import film
 from nerf_lightning.video.frames import FilmFrames
-from nerf_lightning.video.paths.look_at import LookAt
 from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.pan import LookAt
 from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject, make_shots
 

@@ -9,7 +9,7 @@ from support.scenes import ball_scene
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
 from nerf_lightning.data.readers.transforms import TransformsReader
-from nerf_lightning.doctor import check
+from nerf_lightning.doctor import check, extent
 from nerf_lightning.doctor.examine import examine, gather_evidence
 from nerf_lightning.doctor.features import sharpness_of
 
@@ -84,6 +84,14 @@ def test_near_and_far_in_inches_are_named():
     near, far = torch.full((VIEWS,), 39.37 * low), torch.full((VIEWS,), 39.37 * high)
     judged(with_scene(near=near, far=far), "near and far", "wrong", "inches", "too large")
     assert scene.near[0] < low
+
+
+@pytest.mark.parametrize("near", [0.0, 1.0])
+def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
+    at_cameras = (torch.arange(VIEWS), torch.zeros(VIEWS))
+    monkeypatch.setattr(extent, "content_distances", lambda evidence: at_cameras)
+    evidence = with_scene(near=torch.full((VIEWS,), near), far=torch.full((VIEWS,), near - 0.1))
+    assert extent.near_and_far(evidence).verdict == "wrong"
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from nerf_lightning.doctor.conventions import FLIP_YZ, axes
 from nerf_lightning.doctor.epipolar import agreeing, line_distances
 from nerf_lightning.doctor.features import Corners
 from nerf_lightning.doctor.picture import proof_picture
-from nerf_lightning.doctor.poses import axes_convention, poses_and_pixels, single_poses
+from nerf_lightning.doctor.poses import CHECKS, poses_and_pixels, single_poses
 from nerf_lightning.doctor.second_opinion import better_pose, is_vouched_for
 
 VIEW = 5
@@ -89,7 +89,7 @@ def test_a_proof_holds_details_off_the_given_lines_and_on_those_that_fit():
 
 def test_another_convention_is_proved_with_cameras_that_fit():
     evidence = with_poses(axes(corner_scene().cameras.c2w, FLIP_YZ))
-    (proof,) = axes_convention(evidence).proofs
+    (proof,) = CHECKS["axes"](evidence).proofs
     assert bool((line_distances(proof.matches, proof.fits.c2w) < 1.5).all())
     assert not bool(agreeing(proof.matches, evidence.scene.cameras.c2w).any())
 

@@ -105,10 +105,3 @@ def test_the_protocol_says_which_number_it_is(scored):
     assert half["psnr"] > 40
     assert raw["cc_psnr"] > raw["psnr"] + 5
     assert [word.partition(":")[0] for word in differences(raw["protocol"], half["protocol"])] == ["colors"]
-
-
-def test_older_numbers_are_raw_and_only_raw_ones_are_compared_with_them(scored):
-    raw, half = scored("raw")["protocol"], scored("half_fit")["protocol"]
-    older = {key: value for key, value in raw.items() if key not in ("colors", "cc_psnr")}
-    assert differences(older, raw) == differences(raw, older) == []
-    assert differences(older, half, same_scene=False) == [f"colors: raw and {half['colors']}"]

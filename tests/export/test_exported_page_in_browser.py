@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.baked_ball import all_around, beside, record_of, shiny_model
+from support.baked_ball import all_around, beside, read_baked, record_of, shiny_model
 from support.browser import drag, opened
 from support.contracted_hall import hall_model, hall_scene
 
@@ -18,7 +18,6 @@ from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.baking.cost import over
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.page import PageExport
-from nerf_lightning.export.page_file import read_baked
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.models.ray_generator import RayGenerator

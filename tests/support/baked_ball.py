@@ -1,13 +1,20 @@
 """A ball whose colour depends on where it is seen from, baked, and its page."""
 
+import base64
+import gzip
+import json
+import re
 from dataclasses import replace
 
+import numpy as np
 import torch
 from support.known_fields import SolidField, ball
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
 from nerf_lightning.export.baking.bake import bake
+from nerf_lightning.export.baking.baked_field import BakedField
+from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.export.base import PageExtras
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -53,3 +60,28 @@ def baked_ball(resolution: int = 48, harmonics: int = 4, model=None, record=None
 
 def beside(scene, *facts) -> PageExtras:
     return PageExtras(scene, facts=tuple(facts))
+
+
+def deserialized(about, content: bytes) -> BakedField:
+    """The field of which `described` and `serialized` have made these."""
+    blocks, colored, channels = about["blocks"], about["colored"], 3 * about["harmonics"]
+    raw, ends = np.frombuffer(gzip.decompress(content), np.uint8), np.cumsum([4 * blocks, 512 * blocks, 64 * blocks])
+    numbers, density, bits, colors = np.split(raw, ends)
+    outside = about["contraction"]
+    return BakedField(
+        *(tuple(about[key]) for key in ("lower", "spacing", "shape")),
+        np.frombuffer(numbers.tobytes(), "<i4"),
+        density.reshape(blocks, 8, 8, 8),
+        np.unpackbits(bits, bitorder="little").astype(bool).reshape(blocks, 8, 8, 8),
+        colors.reshape(channels, colored),
+        tuple(about["ranges"]),
+        outside and Contraction(tuple(outside["center"]), outside["half"], outside["near"]),
+        about["closed"],
+    )
+
+
+def read_baked(page):
+    """What a page says of its scene, and the field in it."""
+    text = page.read_text()
+    about, field = (re.search(rf'id="{name}">([^<]*)</script>', text)[1] for name in ("about", "field"))
+    return json.loads(about), deserialized(json.loads(about), base64.b64decode(field))

@@ -4,6 +4,7 @@ import errno
 import json
 import sys
 from contextlib import suppress
+from functools import partial
 
 import pytest
 import torch
@@ -14,8 +15,10 @@ from nerf_lightning.files.made_folders import MARK
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.video import frames as film_frames
 from nerf_lightning.video.frames import FilmFrames
+from nerf_lightning.visualization.pictures import save_png
 
 PICTURE = torch.full((8, 10, 3), 100, dtype=torch.uint8)
+WRITE = partial(save_png, picture=PICTURE)
 
 
 def frames(folder, form="video", films=("video", "depth")):
@@ -31,7 +34,7 @@ def stop_after(folder, *numbers, form="video"):
     opened(each)
     for number in numbers:
         for film in each.films:
-            each.save(film, number, PICTURE)
+            each.save(film, number, WRITE)
     each.close()
 
 
@@ -42,7 +45,7 @@ def test_a_stopped_film_goes_on_with_what_is_missing_and_the_same_colours(tmp_pa
     assert (missing, depths) == ([1, 3], (1.0, 2.0))
     for number in missing:
         for film in again.films:
-            again.save(film, number, PICTURE)
+            again.save(film, number, WRITE)
     again.finish(fps=4)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["depth.mp4", "video.mp4"]
     assert again.results() == [tmp_path / "video.mp4", tmp_path / "depth.mp4"]
@@ -79,18 +82,16 @@ def full(*arguments, **options):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_is_said_in_one_paragraph_and_the_frames_are_kept(tmp_path, monkeypatch):
+def test_a_full_disk_is_said_in_one_paragraph_and_the_frames_are_kept(tmp_path):
     stop_after(tmp_path, 0, 1)
     each = frames(tmp_path)
     opened(each)
-    monkeypatch.setattr(film_frames, "save_png", full)
     with pytest.raises(
         InputError, match=r"No space left.*2 of 4 frames are kept in .*goes on with the missing"
     ) as said:
-        each.save("video", 2, PICTURE)
+        each.save("video", 2, full)
     assert "\n" not in str(said.value)
     each.close()
-    monkeypatch.undo()
     assert opened(frames(tmp_path))[0] == [2, 3]
 
 
@@ -136,7 +137,7 @@ def test_who_takes_the_folder_when_a_film_is_done_keeps_it(tmp_path, monkeypatch
     def released():
         release()
         opened(other, fingerprint="b")  # at the first chance
-        other.save("video", 0, PICTURE)
+        other.save("video", 0, WRITE)
 
     monkeypatch.setattr(each.scratch, "release", released)
     each.finish(fps=4)
@@ -176,7 +177,7 @@ def test_frames_go_through_no_link(tmp_path, link):
         each = frames(tmp_path, form)
         with suppress(InputError):
             opened(each, fingerprint="b")
-            each.save("video", 0, PICTURE)
+            each.save("video", 0, WRITE)
         each.close()
     assert {path.name for path in mine.iterdir()} == {"chapters", "frame_0000.png", "1.tex"}
     assert (mine / "1.tex").read_text() == (mine / "frame_0000.png").read_text() == "mine"

@@ -2,7 +2,6 @@
 
 import gzip
 import math
-import zlib
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,7 +11,6 @@ from numpy import ndarray
 
 from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE
-from nerf_lightning.messages.errors import InputError
 
 LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
 """Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""
@@ -140,40 +138,3 @@ def serialized(baked: BakedField) -> bytes:
     )
     # Without a time: the same field makes the same file.
     return gzip.compress(b"".join(part.tobytes() for part in parts), LEVEL, mtime=0)
-
-
-def deserialized(about: dict[str, Any], content: bytes) -> BakedField:
-    """Return the field that `described` and `serialized` have made these of.
-
-    Raises:
-        InputError: they have not, or not all of it is there.
-    """
-    try:
-        raw = gzip.decompress(content)
-        blocks, colored, channels = int(about["blocks"]), int(about["colored"]), 3 * int(about["harmonics"])
-        sizes = (4 * blocks, SIDE**3 * blocks, SIDE**3 * blocks // 8, channels * colored)
-        if len(raw) != sum(sizes):
-            raise ValueError(f"{len(raw)} bytes, and not {sum(sizes)}")
-        numbers, density, bits, colors = np.split(np.frombuffer(raw, np.uint8), np.cumsum(sizes)[:-1])
-        x, y, z = about["lower"]
-        along_x, along_y, along_z = about["spacing"]
-        nx, ny, nz = about["shape"]
-        low, high = about["ranges"]
-        outside = about["contraction"]
-        if outside is not None:
-            cx, cy, cz = map(float, outside["center"])
-            outside = Contraction((cx, cy, cz), float(outside["half"]), float(outside["near"]))
-        return BakedField(
-            (x, y, z),
-            (along_x, along_y, along_z),
-            (nx, ny, nz),
-            np.frombuffer(numbers.tobytes(), "<i4").astype(np.int32),
-            density.reshape(blocks, SIDE, SIDE, SIDE),
-            np.unpackbits(bits, bitorder="little").astype(bool).reshape(blocks, SIDE, SIDE, SIDE),
-            colors.reshape(channels, colored),
-            (low, high),
-            outside,
-            bool(about["closed"]),
-        )
-    except (OSError, EOFError, zlib.error, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"The field in the page is damaged or cut off: {error}. Export it again.") from error

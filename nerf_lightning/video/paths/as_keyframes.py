@@ -75,11 +75,6 @@ def _keyframes(
     fovs = torch.rad2deg(2 * torch.atan(0.5 * around.width / focal.double()))
     rows = zip(eyes.tolist(), targets, ahead.tolist(), ups.tolist(), fovs.tolist(), times.tolist(), strict=True)
     return [
-        Keyframe(_point(eye), look_at=target or _point(far), up=_point(up), fov=fov, time=time)
+        Keyframe(tuple(eye), look_at=target or tuple(far), up=tuple(up), fov=fov, time=time)
         for eye, target, far, up, fov, time in rows
     ]
-
-
-def _point(values: Sequence[float]) -> Point:
-    x, y, z = values
-    return x, y, z

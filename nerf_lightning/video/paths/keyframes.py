@@ -32,21 +32,15 @@ CURE = "Check path.file; a keyframe file is a plain list of cameras, without ref
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One chosen camera, in the capture's own frame and units. One of `look_at` and `direction` is there."""
+    """One chosen camera, as the file has it (above). One of `look_at` and `direction` is there."""
 
     position: Point
     look_at: Point | None = None
-    """A point that it looks at."""
     direction: Point | None = None
-    """Where it looks, of any length but zero."""
     up: Point | None = None
-    """Where the picture's top points; None: the capture's up."""
     fov: float | None = None
-    """Degrees across the picture's width."""
     focal: float | None = None
-    """Focal length in pixels of a picture as wide as the photographs."""
     time: float | None = None
-    """Seconds from any beginning."""
 
     @property
     def ahead(self) -> Point:

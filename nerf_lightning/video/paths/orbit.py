@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from typing import final
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import look_at
@@ -46,16 +44,12 @@ class Orbit(CameraPath):
         """Return the cameras of the circle."""
         center = around.point("center", self.center)
         radius = around.radius if self.radius is None else self.radius / around.unit
-        eyes = center + radius * self._directions(around.up)
-        return self.pinholes(look_at(eyes, center.expand_as(eyes), around.up), around)
-
-    def _directions(self, up: Float[Tensor, "3"]) -> Float[Tensor, "frames 3"]:
-        """Return unit vectors from the centre to the cameras."""
-        up = normalize(up, dim=0)
+        up = normalize(around.up, dim=0)
         east = horizontal(up)
         north = torch.linalg.cross(up, east)
         steps = torch.arange(self.num_frames, dtype=up.dtype, device=up.device) / self.num_frames
         azimuth = (math.radians(self.start) + 2 * math.pi * self.turns * steps)[:, None]
         level = torch.cos(azimuth) * east + torch.sin(azimuth) * north
         elevation = math.radians(self.elevation)
-        return math.cos(elevation) * level + math.sin(elevation) * up
+        eyes = center + radius * (math.cos(elevation) * level + math.sin(elevation) * up)
+        return self.pinholes(look_at(eyes, center.expand_as(eyes), around.up), around)

@@ -14,9 +14,8 @@ from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.ellipse import Ellipse
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe, write_keyframes
-from nerf_lightning.video.paths.look_at import LookAt
 from nerf_lightning.video.paths.orbit import Orbit
-from nerf_lightning.video.paths.pan import Pan
+from nerf_lightning.video.paths.pan import LookAt, Pan
 from nerf_lightning.video.paths.photograph_path import PhotographPath
 from nerf_lightning.video.paths.spiral import Spiral
 
