@@ -40,6 +40,6 @@ def train(config: DictConfig) -> Trained:
         trainer = fit(job, folder)
         folder.trained(job.clock.seconds)
         psnr = job.post_training(job.settings, job.scene, job.system.model, trainer, folder.path)
-        show(job, folder.path, trainer)
+        show(job, folder.path, trainer, psnr)
         folder.finish(trainer.global_step, psnr)
     return Trained(folder.path, psnr)

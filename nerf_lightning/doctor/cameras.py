@@ -175,7 +175,7 @@ def left_out(evidence: Evidence) -> Check:
     total = len(missing) + len(evidence.scene.view_names)
     message = f"{len(missing)} of {total} photographs have no pose: {listed(missing, cap=5)}"
     cure = "Were they needed, take photographs between them and the others and estimate the poses anew (nerf poses)."
-    return (look if len(missing) < 0.5 * total else wrong)(message, cure)
+    return look(message, cure)
 
 
 def overlap(evidence: Evidence) -> Check:

@@ -1,5 +1,6 @@
 """All checks of a capture, and what they look at. A new check is a function, named in CHECKS of its file."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -22,6 +23,10 @@ CHECKS: dict[str, CheckFn] = {
 }
 
 
+FIRST_ADVICE = ("coverage", "photographs without pose", "number of views", "overlap")
+"""Checks whose cures are worth most: photographs that are missing cannot be made up for."""
+
+
 def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
     """Return the outcome of every check, and what they looked at; takes seconds.
 
@@ -41,6 +46,12 @@ def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
         return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
     finally:
         torch.set_num_threads(before)
+
+
+def advice(checks: Sequence[Check]) -> str | None:
+    """Return the one thing that would improve a result most; None where nothing was found."""
+    doubtful = {check.name: check.cure for check in checks if check.verdict != "ok" and check.cure}
+    return next((doubtful[name] for name in [*FIRST_ADVICE, *doubtful] if name in doubtful), None)
 
 
 # More views than these are thinned out evenly to be compared with each other; that costs the square.

@@ -99,6 +99,7 @@ def test_content_at_the_very_cameras_has_no_unit(monkeypatch, near):
     [
         ({"far": torch.full((VIEWS,), 0.9)}, "near and far", "wrong", ("behind far",)),
         ({"left_out": ("a.jpg", "b.jpg")}, "photographs without pose", "look", ("2 of 14", "a.jpg, b.jpg")),
+        ({"left_out": tuple("abcdefghijklmnop")}, "photographs without pose", "look", ("16 of 28",)),
         ({"splits": {"train": (0, 1, 2), "val": (2, 3), "test": (3,)}}, "split", "wrong", ("view 2.png",)),
         ({"splits": {"train": (1, 2), "val": (0,), "test": (0,)}}, "number of views", "wrong", ("2 to learn",)),
     ],

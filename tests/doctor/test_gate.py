@@ -5,6 +5,7 @@ from support.scenes import ball_scene
 
 from nerf_lightning.doctor import gate
 from nerf_lightning.doctor.check import Check
+from nerf_lightning.doctor.examine import advice
 from nerf_lightning.messages.errors import InputError
 
 
@@ -35,3 +36,11 @@ def test_what_is_doubtful_is_said_and_training_goes_on(verdicts, caplog):
     gate.require_sound(ball_scene())
     assert "doctor: sharpness: 3 of 20 are blurred. Leave them out." in caplog.text
     assert "2 checks find nothing wrong" in caplog.text
+
+
+def test_the_one_advice_is_about_what_no_setting_makes_up_for():
+    sharp = Check("sharpness", "look", "3 of 20 are blurred", "Leave them out.")
+    gap = Check("coverage", "look", "a gap of 90 degrees", "Take some around 142 degrees.")
+    assert advice([Check("lens", "ok", "none"), sharp, gap]) == "Take some around 142 degrees."
+    assert advice([sharp]) == "Leave them out."
+    assert advice([Check("lens", "ok", "none")]) is None

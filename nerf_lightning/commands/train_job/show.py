@@ -9,6 +9,7 @@ from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.commands.train_job.final_page import write_final_page
 from nerf_lightning.commands.train_job.profile_table import profile_lines
 from nerf_lightning.compute import ranks
+from nerf_lightning.doctor.examine import advice
 from nerf_lightning.messages.console import say
 from nerf_lightning.report.page import write_page
 from nerf_lightning.report.read_run import read_run
@@ -21,7 +22,7 @@ MOST_VIDEO_BYTES = 20_000_000
 log = logging.getLogger(__name__)
 
 
-def show(job: TrainJob, folder: Path, trainer: Trainer) -> None:
+def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> None:
     """Close the loggers, and write what the config asks for."""
     for logger in trainer.loggers:
         logger.finalize("success")
@@ -38,4 +39,13 @@ def show(job: TrainJob, folder: Path, trainer: Trainer) -> None:
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
         write_page(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
-        say(f"report       {target}")
+        say(f"report       {target}", *_result(job, psnr))
+
+
+def _result(job: TrainJob, psnr: float | None) -> list[str]:
+    """Return what came out of the photographs, and what would improve it most."""
+    used = len(job.scene.view_names)
+    quality = "" if psnr is None else f"{psnr:.1f} dB on photographs held out, "
+    lines = [f"result       {quality}{used} of {used + len(job.scene.left_out)} photographs used"]
+    cure = advice(job.checks or ())
+    return lines if cure is None else [*lines, f"to improve   {cure}"]

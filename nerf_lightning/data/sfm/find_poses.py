@@ -5,9 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.data.pixels.images import read_rgba
+from nerf_lightning.data.sfm.find_cameras import find_cameras
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
-from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel, reconstruct
-from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching, stage_costs
+from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel
+from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, write_sharp_frames
 from nerf_lightning.files.atomic import full_disk_named
 from nerf_lightning.files.made_folders import ScratchFolder, below, empty_ours, make_folder, remove_empty
@@ -69,14 +70,15 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_ou
             "in the output folder itself. Give another folder with paths.output_dir=DIR."
         )
     costs = {READING: READING_COST * sum(p.width * p.height for p in photographs) / 1e6}
-    with _unfinished(folder) as work, StageProgress(costs | stage_costs(photographs, settings)) as report:
+    with _unfinished(folder) as work:
         images = folder / "images" if in_place else make_folder(work, "images")
-        for number, photograph in enumerate(photographs):
-            report(READING, number / len(photographs))
-            check_pixels(photograph)
-            if not in_place:
-                put_upright(photograph, images)
-        model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+        with StageProgress(costs) as report:
+            for number, photograph in enumerate(photographs):
+                report(READING, number / len(photographs))
+                check_pixels(photograph)
+                if not in_place:
+                    put_upright(photograph, images)
+        model = find_cameras(photographs, images, work, work / "sparse" / "0", settings)
         _publish(work, folder)
     return model, chosen_matching(settings.matching, len(photographs))
 
@@ -101,8 +103,7 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
                 "Give a longer or larger video, or a smaller every=."
             ) from error
         try:
-            with StageProgress(stage_costs(photographs, settings)) as report:
-                model = reconstruct(photographs, images, work, work / "sparse" / "0", settings, report)
+            model = find_cameras(photographs, images, work, work / "sparse" / "0", settings)
         except NothingFoundError as error:
             raise InputError(_nothing_in_video(video, photographs)) from error
         _publish(work, folder)
@@ -120,7 +121,7 @@ def _nothing_in_video(video: Path, frames: list[FoundPhotograph]) -> str:
         cure = "Film again: walk slowly around what matters rather than turning on the spot"
     return (
         f"video={video}: no camera could be placed for the {len(frames)} frames that were chosen; {cause}. {cure}, "
-        "with one zoom. A smaller every= takes more frames of this video, num_features=8192 finds more details in them."
+        "with one zoom. A smaller every= takes more frames of this video."
     )
 
 

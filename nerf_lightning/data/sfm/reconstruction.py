@@ -14,7 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
-from nerf_lightning.data.sfm.settings import FEATURES, MAPPING, MATCHING, CameraMode, SfmSettings, image_pairs, tiles_of
+from nerf_lightning.data.sfm.settings import (
+    FEATURES,
+    MAPPING,
+    MATCHING,
+    Attempt,
+    CameraMode,
+    SfmSettings,
+    image_pairs,
+    tiles_of,
+)
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -28,6 +37,8 @@ class NothingFoundError(InputError):
 
 # A model of fewer than three photographs says nothing; COLMAP would throw away those of fewer than ten.
 FEWEST_REGISTERED = 3
+FEWEST_POINTS = 30
+"""That a photograph must see: with fewer, GLOMAP places it anywhere. COLMAP's own mapper asks for as many."""
 LEAST_ROOM = 1 << 20
 """Bytes; an empty database takes less."""
 
@@ -61,47 +72,40 @@ def reconstruct(
     photographs: list[FoundPhotograph],
     folder: Path,
     work: Path,
-    sparse: Path,
     settings: SfmSettings,
+    attempt: Attempt,
     report: Report = lambda stage, fraction: None,
-) -> SparseModel:
-    """Find the cameras of photographs and write the largest model in COLMAP's binary form.
-
-    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own.
+) -> list[Any]:
+    """Return COLMAP's models of photographs, the largest first: photographs of several places make several.
 
     Args:
         photographs: in the order in which they were taken.
         folder: where the pixels lie, upright, under the photographs' names.
-        work: a folder for the database and lists; what is left there can go.
-        sparse: the folder for cameras.bin, images.bin, points3D.bin; made here.
+        work: a folder for databases and lists; features that an attempt has left there are taken again.
         settings: how.
+        attempt: with which features and which mapper.
         report: called with a stage of `stage_costs` and how much of it is done, 0 to 1.
 
     Raises:
         InputError: no pycolmap, or photographs of several sizes for one camera.
-        NothingFoundError: nothing can be reconstructed.
     """
     colmap = require_pycolmap()
     names = [photograph.path.name for photograph in photographs]
     groups = _camera_groups(photographs, settings.camera_mode)
-    database = work / "database.db"
+    database = work / attempt.database
     with _quiet(colmap), _room_asked_for(work):
         colmap.set_random_seed(settings.seed)
-        _find_features(colmap, database, folder, groups, settings, report)
-        _match(colmap, database, names, work / "pairs.txt", settings, report)
-        models = _models(colmap, database, folder, work / "models", settings, report)
-        if not models:
-            raise NothingFoundError(
-                f"No camera could be placed: the {len(names)} pictures share too few details. Take more photographs "
-                "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
-                "zoom and without mirrors or bare walls filling the picture; then try again. More features may help: "
-                "num_features=8192."
-            )
-        models[0].write_binary(make_folder(sparse))
-    return _in_short(models, names)
+        if not database.exists():
+            _find_features(colmap, database, folder, groups, settings, attempt, report)
+            _match(colmap, database, names, work / "pairs.txt", settings, report)
+        models = work / f"{attempt.database}_{attempt.mapper}"
+        if attempt.mapper == "global":
+            return _mapped_globally(colmap, database, folder, models, settings, report)
+        return _mapped(colmap, database, folder, models, settings, report)
 
 
-def _in_short(models: list[Any], names: list[str]) -> SparseModel:
+def in_short(models: list[Any], names: list[str]) -> SparseModel:
+    """Return what was found of photographs, in short."""
     model = models[0]
     registered, *others = ({each.image(number).name for number in each.reg_image_ids()} for each in models)
     return SparseModel(
@@ -159,6 +163,7 @@ def _find_features(
     folder: Path,
     groups: tuple[list[list[str]], list[str]],
     settings: SfmSettings,
+    attempt: Attempt,
     report: Report,
 ) -> None:
     """Find features a few photographs at a time, so that progress shows and Ctrl-C is heard."""
@@ -166,7 +171,8 @@ def _find_features(
     # Whatever the default: where the wheel has no ONNX, learned features end the process.
     options.type = colmap.FeatureExtractorType.SIFT
     options.use_gpu, options.num_threads = False, settings.threads
-    options.max_image_size, options.sift.max_num_features = settings.max_image_size, settings.num_features
+    options.max_image_size, options.sift.max_num_features = settings.max_image_size, attempt.num_features
+    options.sift.estimate_affine_shape = attempt.affine
     shared, alone = groups
     total, done = sum(map(len, shared)) + len(alone), 0
     report(FEATURES, 0.0)
@@ -230,10 +236,10 @@ def _opened(colmap: Any, database: Path) -> Iterator[Any]:
         content.close()
 
 
-def _models(
+def _mapped(
     colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
 ) -> list[Any]:
-    """Return what was reconstructed, the largest first: photographs of several places make several models."""
+    """Return what is reconstructed photograph after photograph, the largest model first."""
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = settings.threads, settings.seed
     options.min_model_size = FEWEST_REGISTERED
@@ -250,4 +256,23 @@ def _models(
     found = colmap.incremental_mapping(
         database, folder, models, options, initial_image_pair_callback=advance, next_image_callback=advance
     )
-    return sorted(found.values(), key=lambda model: model.num_reg_images(), reverse=True)
+    return _largest_first(found)
+
+
+def _mapped_globally(
+    colmap: Any, database: Path, folder: Path, models: Path, settings: SfmSettings, report: Report
+) -> list[Any]:
+    """Return what is reconstructed of all photographs at once (GLOMAP, arXiv 2407.20219)."""
+    options = colmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = settings.threads, settings.seed
+    report(MAPPING, 0.0)
+    return _largest_first(colmap.global_mapping(database, folder, make_folder(models), options))
+
+
+def _largest_first(found: dict[int, Any]) -> list[Any]:
+    for model in found.values():
+        for image in [model.image(number) for number in model.reg_image_ids()]:
+            if image.num_points3D < FEWEST_POINTS:
+                model.deregister_frame(image.frame_id)
+    models = [model for model in found.values() if model.num_reg_images() >= FEWEST_REGISTERED]
+    return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)

@@ -15,6 +15,8 @@ CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 FEATURES, MATCHING, MAPPING = "finding features", "comparing photographs", "placing cameras"
 MOST_EXHAUSTIVE = 80
 NEIGHBOURS = 10
+FEW, SOME = 24, 80
+MAPPERS: tuple[Literal["incremental", "global"], ...] = ("incremental", "global")
 LANDMARKS = 40
 TILE = 12
 
@@ -27,7 +29,8 @@ class SfmSettings:
         matching: which photographs are compared: all pairs, neighbours in the order of names, or by their number.
         camera_mode: one camera for all, one each, or one per size and EXIF focal length.
         camera_model: COLMAP's name of the lens model.
-        num_features: most features of a photograph.
+        num_features: most features of a photograph; auto: 8192, of more than 24 photographs 3072, of more than 80 2048,
+            and other ways where photographs are left out (`attempts`).
         max_image_size: the longer side in pixels to which photographs are shrunk for finding features.
         num_threads: None uses every core. Two runs are identical only with one thread.
         seed: of the random numbers.
@@ -39,19 +42,57 @@ class SfmSettings:
     matching: Matching = "auto"
     camera_mode: CameraMode = "auto"
     camera_model: CameraModel = "OPENCV"
-    num_features: int = 2048
+    num_features: int | Literal["auto"] = "auto"
     max_image_size: int = 2000
     num_threads: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         threads = 1 if self.num_threads is None else self.num_threads
-        require_positive(num_features=self.num_features, max_image_size=self.max_image_size, num_threads=threads)
+        features = 1 if self.num_features == "auto" else self.num_features
+        require_positive(num_features=features, max_image_size=self.max_image_size, num_threads=threads)
 
     @property
     def threads(self) -> int:
         """Return the number of threads to use."""
         return self.num_threads or num_cores()
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way to find cameras."""
+
+    num_features: int
+    affine: bool = True
+    """Whether features have an affine shape, and so look alike from other viewpoints."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """Photograph after photograph, or all at once."""
+
+    @property
+    def database(self) -> str:
+        """The name of the file that keeps its features and their matches, which both mappers share."""
+        return f"{self.num_features}{'_affine' if self.affine else ''}.db"
+
+    def __str__(self) -> str:
+        shape = "affine" if self.affine else "round"
+        return "all cameras placed at once" if self.mapper == "global" else f"{self.num_features} {shape} features"
+
+
+def attempts(settings: SfmSettings, count: int) -> list[Attempt]:
+    """Return what is tried for `count` photographs, one after the other while photographs are left out.
+
+    >>> [str(attempt) for attempt in attempts(SfmSettings(), 50)][:2]
+    ['3072 round features', 'all cameras placed at once']
+    """
+    if settings.num_features != "auto":
+        return [Attempt(settings.num_features)]
+    if count <= FEW:
+        features = [(8192, True), (8192, False)]
+    elif count <= SOME:
+        features = [(3072, False), (8192, True)]
+    else:  # more would take hours
+        features = [(2048, False)]
+    return [Attempt(number, affine, mapper) for number, affine in features for mapper in MAPPERS]
 
 
 def chosen_matching(matching: Matching, count: int) -> Matching:
@@ -89,13 +130,13 @@ def tiles_of(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     return [list(group) for _, group in groupby(sorted(pairs, key=tile), key=tile)]
 
 
-def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings) -> dict[str, float]:
+def stage_costs(photographs: list[FoundPhotograph], settings: SfmSettings, attempt: Attempt) -> dict[str, float]:
     """Return the seconds that each stage would take on one thread of an ordinary machine, roughly."""
     num_pairs = len(image_pairs(settings.matching, len(photographs)))
     shrunk = [(p, min(1.0, settings.max_image_size / max(p.width, p.height))) for p in photographs]
     megapixels = sum(p.width * p.height * scale**2 / 1e6 for p, scale in shrunk)
     return {
         FEATURES: 1.2 * megapixels,
-        MATCHING: 0.04 * num_pairs * (settings.num_features / 2048) ** 2,
+        MATCHING: 0.02 * num_pairs * (attempt.num_features / 2048) ** 2,
         MAPPING: 0.4 * len(photographs),
     }

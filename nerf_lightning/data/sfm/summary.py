@@ -43,5 +43,5 @@ def remarks(model: SparseModel, matching: str, is_video: bool) -> list[str]:
             "with one zoom and from places some steps apart."
         )
         pairs = " matching=exhaustive compares every photograph with every other." if matching == "sequential" else ""
-        lines.append(f"few were registered: {more}{pairs} num_features=8192 finds more details.")
+        lines.append(f"few were registered: {more}{pairs}")
     return lines

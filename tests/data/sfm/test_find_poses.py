@@ -13,7 +13,7 @@ from support.running import refused
 from nerf_lightning.data.sfm import find_poses, reconstruction
 from nerf_lightning.data.sfm.find_poses import UNFINISHED, from_photographs, require_new_capture
 from nerf_lightning.data.sfm.reconstruction import SparseModel
-from nerf_lightning.data.sfm.settings import SfmSettings
+from nerf_lightning.data.sfm.settings import Attempt, SfmSettings
 
 links = pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need rights there")
 
@@ -27,12 +27,12 @@ def capture(tmp_path, monkeypatch):
         pixels = np.random.default_rng(number).integers(0, 255, (80, 96, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(images / f"{number}.png")
 
-    def reconstruct(photographs, images, work, sparse, settings, report):
+    def find_cameras(photographs, images, work, sparse, settings):
         sparse.mkdir(parents=True)
         (sparse / "cameras.bin").touch()
         return SparseModel(tuple(each.path.name for each in photographs), (), (), 0, 1, 0.0)
 
-    monkeypatch.setattr(find_poses, "reconstruct", reconstruct)
+    monkeypatch.setattr(find_poses, "find_cameras", find_cameras)
     return tmp_path / "cap"
 
 
@@ -51,7 +51,7 @@ def test_nothing_stays_beside_a_capture_and_what_a_killed_process_left_is_remove
     assert found(tmp_path / "other", capture / "images") == CAPTURE
     with monkeypatch.context() as killed:
         killed.setattr(find_poses.ScratchFolder, "remove", lambda scratch: scratch.release())
-        killed.setattr(find_poses, "reconstruct", lambda photographs, images, work, *_: (work / "models").mkdir())
+        killed.setattr(find_poses, "find_cameras", lambda photographs, images, work, *_: (work / "models").mkdir())
         with pytest.raises(FileNotFoundError):
             found(capture)
     assert (capture / UNFINISHED / "models").is_dir()
@@ -133,4 +133,4 @@ def test_a_full_disk_is_found_where_colmap_does_not_tell_of_it(tmp_path, monkeyp
     monkeypatch.setattr(reconstruction, "require_pycolmap", lambda: Colmap)
     monkeypatch.setattr(type(tmp_path), "write_bytes", write)
     with pytest.raises(OSError if is_full else RuntimeError, match="No space" if is_full else "No registered"):
-        reconstruction.reconstruct([], tmp_path, tmp_path, tmp_path / "sparse", SfmSettings())
+        reconstruction.reconstruct([], tmp_path, tmp_path, SfmSettings(), Attempt(600))

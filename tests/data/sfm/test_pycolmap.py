@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nerf_lightning.data.sfm.find_cameras import find_cameras
 from nerf_lightning.data.sfm.photograph_folder import find_photographs
-from nerf_lightning.data.sfm.reconstruction import NothingFoundError, reconstruct
+from nerf_lightning.data.sfm.reconstruction import NothingFoundError
 from nerf_lightning.data.sfm.settings import SfmSettings
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -44,6 +45,7 @@ def test_learned_features_are_never_asked_for_whatever_its_defaults(tmp_path, mo
     for number in range(3):
         pixels = np.random.default_rng(number).integers(0, 255, (80, 96, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
+    settings = SfmSettings(num_features=600, num_threads=1)
     with pytest.raises(NothingFoundError):
-        reconstruct(find_photographs(tmp_path), tmp_path, tmp_path, tmp_path / "sparse", SfmSettings(num_threads=1))
+        find_cameras(find_photographs(tmp_path), tmp_path, tmp_path, tmp_path / "sparse", settings)
     assert [options.type.name for options in made] == ["SIFT", "SIFT_BRUTEFORCE"]

@@ -1,0 +1,61 @@
+"""Attempts at finding cameras, one after the other as long as photographs are left out."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
+from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel, in_short, reconstruct
+from nerf_lightning.data.sfm.settings import SfmSettings, attempts, stage_costs
+from nerf_lightning.files.made_folders import make_folder
+from nerf_lightning.messages.console import StageProgress
+
+WORSE = 1.5
+"""How many times as large the reprojection error may become for the sake of another photograph."""
+
+log = logging.getLogger(__name__)
+
+
+def find_cameras(
+    photographs: list[FoundPhotograph], folder: Path, work: Path, sparse: Path, settings: SfmSettings
+) -> SparseModel:
+    """Find the cameras of photographs and write the largest model in COLMAP's binary form.
+
+    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own. Of several
+    attempts, the one that places most photographs counts.
+
+    Args:
+        photographs: in the order in which they were taken.
+        folder: where the pixels lie, upright, under the photographs' names.
+        work: a folder for databases and lists; what is left there can go.
+        sparse: the folder for cameras.bin, images.bin, points3D.bin; made here.
+        settings: how.
+
+    Raises:
+        InputError: no pycolmap, or photographs of several sizes for one camera.
+        NothingFoundError: nothing can be reconstructed.
+    """
+    best: list[Any] = []
+    for number, attempt in enumerate(tried := attempts(settings, len(photographs))):
+        with StageProgress(stage_costs(photographs, settings, attempt)) as report:
+            models = reconstruct(photographs, folder, work, settings, attempt, report)
+        if models and (not best or _is_better(models[0], best[0])):
+            best = models
+        placed = best[0].num_reg_images() if best else 0
+        if placed == len(photographs):
+            break
+        if placed and number + 1 < len(tried):
+            log.info("cameras: %d of %d placed; next try: %s", placed, len(photographs), tried[number + 1])
+    if not best:
+        raise NothingFoundError(
+            f"No camera could be placed: the {len(photographs)} pictures share too few details. Take more photographs "
+            "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
+            "zoom and without mirrors or bare walls filling the picture; then try again."
+        )
+    best[0].write_binary(make_folder(sparse))
+    return in_short(best, [photograph.path.name for photograph in photographs])
+
+
+def _is_better(model: Any, than: Any) -> bool:
+    errors = (each.compute_mean_reprojection_error() for each in (model, than))
+    return model.num_reg_images() > than.num_reg_images() and next(errors) <= WORSE * next(errors)
