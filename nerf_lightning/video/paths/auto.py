@@ -1,34 +1,31 @@
-"""The path that suits a capture: around it where it was photographed from all sides, else in front of it."""
+"""The path that suits a capture: along its photographs where these look at one thing, else in front of it."""
 
 from dataclasses import dataclass
 from typing import final
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from torch.nn.functional import normalize
 
-from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
-from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, horizontal
-from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spiral import Spiral
+from nerf_lightning.video.paths.sweep import Sweep
 
-# The widest gap between photographs, seen from above, that a circle may cross.
-WIDEST_GAP = 75.0
-LOWEST, HIGHEST = 5.0, 60.0
+FACING = 0.7
+"""Least cosine between where most photographs look and the centre."""
 
 
 @final
 @dataclass
 class AutoPath(CameraPath):
-    """An orbit at the photographs' own height, or a spiral.
+    """A sweep along the photographs, or a spiral in front of what faces them.
 
     Args:
         longest: where neither width nor height is given, the picture is as large as the photographs, but its longer
             side has at most so many pixels: a film of photographs at full size takes hours.
     """
 
+    num_frames: int = 150
     longest: int = 480
 
     def __post_init__(self) -> None:
@@ -41,24 +38,14 @@ class AutoPath(CameraPath):
         width = self.width
         if width is None and self.height is None:
             width = max(1, round(around.width * min(1.0, self.longest / max(around.width, around.height))))
-        from_center = around.poses[:, :, 3] - around.center
-        if widest_gap(from_center, around.up) > WIDEST_GAP:
-            return Spiral(self.num_frames, width=width, height=self.height, fov=self.fov).cameras(around)
-        height = from_center @ around.up / (from_center.norm(dim=-1) * around.up.norm())
-        elevation = float(torch.rad2deg(height.clamp(-1, 1).asin()).median())
-        elevation = min(max(elevation, LOWEST), HIGHEST)
-        return Orbit(self.num_frames, elevation, width=width, height=self.height, fov=self.fov).cameras(around)
+        path = Sweep if looks_at_center(around) else Spiral
+        return path(self.num_frames, width=width, height=self.height, fov=self.fov).cameras(around)
 
 
 @disable_autocast
-def widest_gap(offsets: Float[Tensor, "views 3"], up: Float[Tensor, "3"]) -> float:
-    """Return the widest angle in degrees between neighbouring views, as seen from above.
-
-    >>> east_and_north = torch.tensor([[1.0, 0, 0], [0, 1, 0]])
-    >>> round(widest_gap(east_and_north, torch.tensor([0.0, 0, 1])))
-    270
-    """
-    up = up / up.norm()
-    east = horizontal(up)
-    north = torch.linalg.cross(up, east)
-    return float(gaps_around(torch.atan2(offsets @ north, offsets @ east).rad2deg())[1].max())
+def looks_at_center(around: PathFrame) -> bool:
+    """Tell whether most photographs show the centre, seen from different sides; forward-facing captures have none."""
+    if around.forward_facing:
+        return False
+    offsets = normalize(around.poses[:, :, 3] - around.center, dim=-1)
+    return float((offsets * around.poses[:, :, 2]).sum(dim=-1).median()) > FACING

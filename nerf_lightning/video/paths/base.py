@@ -48,6 +48,8 @@ class PathFrame:
     """Similarity that takes scene coordinates to the capture's own frame."""
     view_names: tuple[str, ...] = ()
     """What the photographs are called, in the order of `poses`."""
+    forward_facing: bool = False
+    """Whether all photographs look the same way, into normalised device coordinates."""
 
     @property
     def unit(self) -> float:
@@ -217,4 +219,5 @@ def frame_of(
         poses=cameras.c2w,
         to_user=torch.eye(4) if to_user is None else to_user,
         view_names=view_names,
+        forward_facing=cameras.ndc is not None,
     )

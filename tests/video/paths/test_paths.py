@@ -12,9 +12,10 @@ from support.configs import loaded, options
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import pinhole_cameras, project
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
-from nerf_lightning.video.paths.auto import AutoPath, widest_gap
+from nerf_lightning.video.paths.auto import AutoPath, looks_at_center
 from nerf_lightning.video.paths.base import PathFrame, frame_of
 from nerf_lightning.video.paths.orbit import Orbit
+from nerf_lightning.video.paths.sweep import Sweep
 
 
 def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64, poses=None):
@@ -160,11 +161,40 @@ def test_what_was_photographed_from_one_side_is_filmed_from_there():
     torch.testing.assert_close(seen, cameras.center)
 
 
-def test_the_widest_gap_does_not_depend_on_the_world():
-    offsets = torch.randn(8, 3, dtype=torch.float64)
-    rotation = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
-    up = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
-    assert widest_gap(offsets, up) == pytest.approx(widest_gap(3 * offsets @ rotation.mT, rotation @ up))
+def test_a_sweep_is_level_and_as_high_and_as_far_as_the_photographs_nearby():
+    near, far = ring(range(0, 180, 15), 20.0, 3.0), ring(range(180, 360, 15), 60.0, 6.0)
+    around = frame(poses=torch.cat([near, far]))
+    cameras = Sweep(num_frames=40).cameras(around)
+    assert cameras.c2w[:, 2, 0].abs().max() < 1e-12
+    offsets = cameras.c2w[:, :, 3] - around.center
+    distance, height = offsets.norm(dim=-1), (offsets[:, 2] / offsets.norm(dim=-1)).asin().rad2deg()
+    assert (distance[9:12] - 3.0).abs().max() < 0.01  # about 90 degrees
+    assert (distance[29:32] - 6.0).abs().max() < 0.01
+    assert (height[9:12] - 20.0).abs().max() < 0.1
+    assert (height[29:32] - 60.0).abs().max() < 0.1
+    step = cameras.c2w[:, :, 3].diff(dim=0, append=cameras.c2w[:1, :, 3]).norm(dim=-1)
+    assert step.max() < 1.2
+
+
+def test_a_sweep_comes_no_nearer_than_a_tenth_of_the_photographs():
+    around = frame(poses=torch.cat([ring(range(0, 60, 3)), ring([30.0], 40.0, 0.5)]))
+    offsets = Sweep(smooth=5.0).cameras(around).c2w[:, :, 3] - around.center
+    assert offsets.norm(dim=-1).min() >= 4.0 - 1e-9
+
+
+def test_a_sweep_stays_where_most_photographs_are():
+    around = frame(poses=ring([170.0, 180.0, 190.0, 200.0, 300.0, 310.0]))
+    offsets = Sweep().cameras(around).c2w[:, :, 3] - around.center
+    azimuth = torch.atan2(offsets[:, 1], offsets[:, 0]).rad2deg() % 360
+    assert 170 < azimuth.min() < 172
+    assert 198 < azimuth.max() < 200
+
+
+def test_what_looks_outwards_is_not_circled():
+    outwards = ring(range(0, 360, 30))
+    outwards[:, :, 0], outwards[:, :, 2] = -outwards[:, :, 0], -outwards[:, :, 2]
+    assert looks_at_center(frame(poses=ring(range(0, 360, 30))))
+    assert not looks_at_center(frame(poses=outwards))
 
 
 def test_a_forward_facing_capture_is_looked_at_from_in_front():

@@ -1,0 +1,86 @@
+"""A loop along the photographs: where they were taken from, the content in the middle, upright."""
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.nerf.geometry.frames import gaps_around
+from nerf_lightning.nerf.geometry.poses import look_at
+from nerf_lightning.nerf.matmul_precision import disable_autocast
+from nerf_lightning.nerf.types.scene import Cameras
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, horizontal
+
+CROSSED_BY_A_CIRCLE, CROSSED_BY_AN_ARC = 75.0, 40.0
+"""Degrees between neighbouring photographs, seen from above, over which a path may lead."""
+OF_AN_ARC = 0.9
+"""That a path to and fro covers: at its ends few photographs see the same."""
+NEAREST = 0.1
+"""Quantile of the photographs' distances; nearer, content leaves the picture."""
+HIGHEST = 80.0
+"""Degrees; straight above the content a picture has no up."""
+
+
+@final
+@dataclass
+class Sweep(CameraPath):
+    """Go along the photographs and back to the start, looking at the middle.
+
+    A circle where photographs were taken from all sides, else to and fro along most of them. Height and distance are
+    those of the photographs nearby, so every frame shows what photographs saw, about as large as they show it.
+
+    Args:
+        smooth: degrees of azimuth over which height and distance are averaged.
+    """
+
+    num_frames: int = 150
+    smooth: float = 20.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_setting("smooth", self.smooth, 0 < self.smooth <= 180, "degrees above 0, at most 180")
+
+    @disable_autocast
+    def cameras(self, around: PathFrame) -> Cameras:
+        """Return the cameras of the loop; the last frame precedes the first."""
+        up = normalize(around.up, dim=0)
+        east = horizontal(up)
+        north = torch.linalg.cross(up, east)
+        offsets = around.poses[:, :, 3] - around.center
+        taken = torch.atan2(offsets @ north, offsets @ east).rad2deg()
+        distances = offsets.norm(dim=-1).clamp(min=1e-6)
+        heights = (offsets @ up / distances).clamp(-1.0, 1.0).asin().rad2deg()
+
+        azimuth = azimuths(taken, self.num_frames)
+        apart = (azimuth[:, None] - taken + 180.0).remainder(360.0) - 180.0
+        weights = torch.softmax(-0.5 * (apart / self.smooth).square(), dim=-1)
+        height = (weights @ heights).clamp(-HIGHEST, HIGHEST).deg2rad()[:, None]
+        distance = (weights @ distances.log()).exp().clamp(min=float(torch.quantile(distances, NEAREST)))
+        level = azimuth.deg2rad().cos()[:, None] * east + azimuth.deg2rad().sin()[:, None] * north
+        eyes = around.center + distance[:, None] * (height.cos() * level + height.sin() * up)
+        return self.pinholes(look_at(eyes, around.center.expand_as(eyes), up), around)
+
+
+def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "frames"]:
+    """Return a loop of azimuths in degrees: once around, or to and fro over the arc with most photographs.
+
+    >>> azimuths(torch.tensor([0.0, 60, 120, 180, 240, 300]), 4).tolist()
+    [0.0, 90.0, 180.0, 270.0]
+    >>> azimuths(torch.tensor([-20.0, 0, 20, 170]), 4).round().tolist()
+    [360.0, 378.0, 360.0, 342.0]
+    """
+    share = torch.arange(num_frames).to(taken) / num_frames
+    in_order, gaps = gaps_around(taken)
+    if float(gaps.max()) <= CROSSED_BY_A_CIRCLE:
+        return 360.0 * share
+    # Begin after the widest gap, and part the photographs where gaps are wide.
+    first = int(gaps.argmax()) + 1
+    along = torch.cat([in_order[first:], in_order[:first] + 360.0])
+    ends = (gaps.roll(-first)[:-1] > CROSSED_BY_AN_ARC).nonzero()[:, 0] + 1
+    arc = max(torch.tensor_split(along, ends.tolist()), key=len)
+    middle, half = 0.5 * (arc[0] + arc[-1]), 0.5 * OF_AN_ARC * (arc[-1] - arc[0])
+    return middle + half * (2.0 * math.pi * share).sin()
