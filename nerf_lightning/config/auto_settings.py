@@ -5,13 +5,14 @@ Each choice is said in one line, with the setting that makes another.
 
 import copy
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from omegaconf import DictConfig
 
 from nerf_lightning.config.compose import chosen, compose_config
-from nerf_lightning.data.captures.extent import model_for
+from nerf_lightning.data.captures.extent import PHOTOGRAPHS, grid_for, model_for
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.exposure import Exposure
@@ -43,7 +44,10 @@ def resolve_auto(
     if choices.get("model") == AUTO:
         name, reason = model_for(scene)
         log.info("model: %s, since %s (model=NAME chooses another)", name, reason)
-        fitted, picked = compose_config("train", [*overrides, f"model={name}"])
+        with_model = [*overrides, f"model={name}"]
+        fitted, picked = compose_config("train", with_model)
+        if name == PHOTOGRAPHS and scene.depths is not None and picked["loss"] == "proposal":
+            fitted, picked = compose_config("train", [*with_model, *_for_depths(scene, overrides)])
         fitted.paths = config.paths
         config, choices = fitted, picked
     of_photos = choices.get("scene") == "photos"
@@ -54,6 +58,22 @@ def resolve_auto(
         if of_photos:
             log.info("budget: %s of training (budget.seconds=N)", spoken(PHOTOS_SECONDS))
     return config, chosen(choices)
+
+
+def _for_depths(scene: Scene, overrides: Sequence[str]) -> list[str]:
+    """Return the loss and the grid that suit known depths; what a person has typed stays."""
+    typed = {re.split("[.=@]", override.lstrip("+~"))[0] for override in overrides}
+    if "loss" in typed or scene.depths is None:
+        return []
+    log.info(
+        "loss: depth, since the distance of %s pixels is known (loss=proposal takes no notice)",
+        f"{len(scene.depths):,}",
+    )
+    if "encoder" in typed:
+        return ["loss=depth"]
+    resolution, table = grid_for(scene)
+    log.info("encoder: %d cells a side, as small as the pixels (encoder.max_resolution=N)", resolution)
+    return ["loss=depth", f"encoder.max_resolution={resolution}", f"encoder.log2_table_size={table}"]
 
 
 def resolve_correction(

@@ -45,6 +45,7 @@ class RayDataModule(LightningDataModule):
         patch: side in pixels of the squares that training rays come in, as the loss wants them.
         overfit_views: train on so many of the photographs, spread over all, without jitter, and validate on the same,
             to see whether a model can learn anything at all; None: as always.
+        depth_every: one of so many rays runs through a pixel whose distance is known, as the loss wants it; 0: none.
         views_per_step: the rays of a step are those of so many photographs, as many of each, for models that look at
             other photographs for each that they explain; None: of all.
     """
@@ -65,6 +66,7 @@ class RayDataModule(LightningDataModule):
         patch: int = 1,
         overfit_views: int | None = None,
         views_per_step: int | None = None,
+        depth_every: int = 0,
     ):
         super().__init__()
         for name, value in (("batch_rays", batch_rays), ("val_rays", val_rays)):
@@ -94,9 +96,9 @@ class RayDataModule(LightningDataModule):
                 raise InputError(f"The scene {scene.name} has no {split} views, and training needs some.")
         if overfit_views is not None:
             scene = _few_views(scene, overfit_views)
-        _check_views_per_step(views_per_step, batch_rays, sample_budget, patch)
+        _check_views_per_step(views_per_step, batch_rays, sample_budget, patch, depth_every)
         self.scene = scene
-        self.batches = RayBatches(scene, progress, seed, batch_rays, patch, views_per_step)
+        self.batches = RayBatches(scene, progress, seed, batch_rays, patch, views_per_step, depth_every)
         self.batches.crop_to(crop_fraction, crop_steps, restart_crop_steps)
         self.val_rays = val_rays
         self.device_budget, self.prefetch = device_budget, prefetch
@@ -148,7 +150,9 @@ def _few_views(scene: Scene, count: int) -> Scene:
     return replace(scene, splits=scene.splits | {"train": few, "val": few})
 
 
-def _check_views_per_step(views: int | None, batch_rays: int, sample_budget: int | None, patch: int) -> None:
+def _check_views_per_step(
+    views: int | None, batch_rays: int, sample_budget: int | None, patch: int, depth_every: int
+) -> None:
     if views is None:
         return
     if not 1 <= views <= batch_rays or batch_rays % views:
@@ -156,11 +160,11 @@ def _check_views_per_step(views: int | None, batch_rays: int, sample_budget: int
             f"data.views_per_step={views} with data.batch_rays={batch_rays}: each photograph of a step gets as many "
             "rays as the others. Give a number of photographs that divides the number of rays, or null."
         )
-    if sample_budget is not None or patch > 1:
+    if sample_budget is not None or patch > 1 or depth_every:
         raise InputError(
             f"data.views_per_step={views} goes neither with data.sample_budget, whose steps have no fixed number of "
-            "rays, nor with losses that look at squares of pixels (loss.patch). Give data.sample_budget=null and "
-            "another loss, or data.views_per_step=null."
+            "rays, nor with losses that look at squares of pixels (loss.patch) or at known distances (loss=depth). "
+            "Give data.sample_budget=null and another loss, or data.views_per_step=null."
         )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerf_lightning.compute import ranks
+from nerf_lightning.data.depth_rays import DepthRays
 from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
@@ -20,6 +21,7 @@ from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex
 from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.tensor_struct import concatenate
 
 BATCH_SIZES = 8
 
@@ -129,12 +131,22 @@ class RayBatches:
         batch_rays: rays per step.
         patch: side in pixels of the squares that rays come in; a batch is made of whole ones.
         views: of how many photographs the rays of a batch are; None: of all.
+        depth_every: one of so many rays (or squares) runs through a pixel whose distance is known, where any is; these
+            come last in a batch. 0: none.
     """
 
     def __init__(
-        self, scene: Scene, progress: Progress, seed: int, batch_rays: int, patch: int = 1, views: int | None = None
+        self,
+        scene: Scene,
+        progress: Progress,
+        seed: int,
+        batch_rays: int,
+        patch: int = 1,
+        views: int | None = None,
+        depth_every: int = 0,
     ):
         self.progress, self.seed, self.batch_rays, self.patch, self.views = progress, seed, batch_rays, patch, views
+        self.depth_every = depth_every
         progress.batch_rays = progress.largest_batch = batch_rays
         self.crop_fraction, self.crop_steps, self.restart_crop_steps = 1.0, 0, 0
         # The device that a background thread makes batches for; None: there is no such thread.
@@ -147,6 +159,8 @@ class RayBatches:
         self.scene = scene
         self.whole = PixelDomain(scene, scene.splits["train"], patch=self.patch)
         self.crop = PixelDomain(scene, scene.splits["train"], self.crop_fraction, self.patch)
+        depths = DepthRays(scene, self.patch) if self.depth_every and scene.depths is not None else None
+        self.depths = depths if depths is not None and len(depths) else None
 
     def crop_to(self, fraction: float, steps: int, restart_steps: int) -> None:
         """See only the pictures' centres at first; without this, runs on white backgrounds may never start learning.
@@ -189,32 +203,62 @@ class RayBatches:
 
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
-        return gather_batch(self.scene, self.pixels_at(attempt, rays_seen, batch_rays))
+        pixels = self.pixels_at(attempt, rays_seen, batch_rays)
+        batch = gather_batch(self.scene, pixels)
+        if self.depths is None:
+            return batch
+        return self.depths.told(batch, self._depths_at(attempt, rays_seen, batch_rays))
 
     def pixels_at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> PixelIndex:
         """Return which pixels this process has of that batch."""
-        crop_rays = self.crop_rays(attempt - self.progress.rollbacks)
-        if rays_seen < crop_rays:
-            domain, purpose, position = self.crop, "crop", rays_seen
+        position, count, slots = self._squares_at(rays_seen, batch_rays)
+        before = self._num_depths(position)
+        num_depths = self._num_depths(position + count) - before
+        position, count = position - before, count - num_depths
+        slots = slots[slots < count]
+        crop_squares = self.crop_rays(attempt - self.progress.rollbacks) // self.patch**2
+        if position < crop_squares:
+            domain, purpose = self.crop, "crop"
         else:
-            domain, purpose, position = self.whole, "rays", rays_seen - crop_rays
-        count = self.progress.batch_rays if batch_rays is None else batch_rays
-        together = self.patch**2
-        count, position = count // together, position // together
-        slots = torch.arange(count)[ranks.share(count)]
+            domain, purpose, position = self.whole, "rays", position - crop_squares
         if self.views is not None:
             key = fold(self.seed, attempt, purpose)
             starts, sizes = domain.ends.cpu() - domain.sizes.cpu(), domain.sizes.cpu()
             numbers = rays_of_few_views(starts, sizes, position // count, slots, count, self.views, key)
             return domain.locate(sent(numbers, domain.ends.device))
-        place = position + slots
-        epochs, epoch = torch.unique_consecutive(place // len(domain), return_inverse=True)
-        keys = torch.tensor([fold(self.seed, attempt, purpose, int(number)) for number in epochs])
-        numbers = permute(place % len(domain), len(domain), keys if len(keys) == 1 else keys[epoch])
+        numbers, keys = self._in_order(position + slots, len(domain), attempt, purpose)
         # Each epoch has its own grid of squares, so that no pixel always lies at a border.
-        shift = (keys % self.patch)[epoch]
-        device = domain.ends.device
-        return domain.locate(sent(numbers, device), sent(shift, device) if together > 1 else 0)
+        shift, device = keys % self.patch, domain.ends.device
+        pixels = domain.locate(sent(numbers, device), sent(shift, device) if self.patch > 1 else 0)
+        if self.depths is None:
+            return pixels
+        return concatenate([pixels, self.depths.locate(self._depths_at(attempt, rays_seen, batch_rays))])
+
+    def _depths_at(self, attempt: int, rays_seen: int, batch_rays: int | None) -> Int[Tensor, "squares"]:
+        """Return which pixels of known distance this process has of that batch."""
+        assert self.depths is not None
+        position, count, slots = self._squares_at(rays_seen, batch_rays)
+        before = self._num_depths(position)
+        first = count - (self._num_depths(position + count) - before)
+        numbers, _ = self._in_order(before + slots[slots >= first] - first, len(self.depths), attempt, "depths")
+        return sent(numbers, self.whole.ends.device)
+
+    def _squares_at(self, rays_seen: int, batch_rays: int | None) -> tuple[int, int, Int[Tensor, "squares"]]:
+        """Return how many squares came before, how many the batch has, and which of them are this process's."""
+        count = (self.progress.batch_rays if batch_rays is None else batch_rays) // self.patch**2
+        return rays_seen // self.patch**2, count, torch.arange(count)[ranks.share(count)]
+
+    def _num_depths(self, squares: int) -> int:
+        """Return how many of the first squares of a run have a pixel of known distance."""
+        return 0 if self.depths is None else squares // self.depth_every
+
+    def _in_order(
+        self, position: Int[Tensor, "squares"], size: int, attempt: int, purpose: str
+    ) -> tuple[Int[Tensor, "squares"], Int[Tensor, "squares"]]:
+        """Return what stands at each position, every number below `size` once an epoch, and the keys of the epochs."""
+        epochs, epoch = torch.unique_consecutive(position // size, return_inverse=True)
+        keys = torch.tensor([fold(self.seed, attempt, purpose, int(each)) for each in epochs], dtype=torch.int64)
+        return permute(position % size, size, keys if len(keys) == 1 else keys[epoch]), keys[epoch]
 
 
 class FixedRays:

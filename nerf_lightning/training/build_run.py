@@ -118,7 +118,9 @@ def assemble(
     if start is not None:
         log.info("init_from: begins with the weights of %s, of step %d", start.path, start.step)
     step.new_optimizer()  # what it refuses is refused before a folder is taken
-    data = build(config.data)(scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch)
+    data = build(config.data)(
+        scene=scene, progress=progress, seed=config.seed, patch=step.loss.patch, depth_every=step.loss.depth_every
+    )
     if ranks.is_first():
         build(config.quick_checks)(scene)
     return Run(settings, scene, data, RadianceFieldSystem(step, record, config.resume_changed_capture))

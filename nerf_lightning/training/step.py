@@ -257,7 +257,7 @@ class TrainStep:
         optimizer.zero_grad()
         if self.num_steps is not None:
             context = StepContext(progress.step / self.num_steps, progress.step, self._key)
-            for part in self._parts():
+            for part in parts_of(*self.parts.values(), self.loss):
                 part.on_step(context)
         self.model.update(progress.step, self._key)
         num_rays = progress.batch_rays
@@ -377,6 +377,9 @@ class TrainStep:
         # A mean of 1 over the batch, not over each tile. Without masks this is 1 exactly and changes no bit.
         weight = batch.weight * (share.num_rays / share.weight.clamp(min=1.0))
         target, several = Target(blend(batch.rgba, behind), weight, batch.pixels), self.model.subpixels
+        if batch.distance is not None:
+            distance, infinity = self.rays.distance_along(batch.pixels, batch.distance)
+            target = replace(target, distance=distance, certainty=batch.certainty, infinity=infinity)
 
         def lose(tile: slice) -> TileLoss:
             # Made tile by tile, since the backward pass of a tile ends where cameras learn: in theirs.

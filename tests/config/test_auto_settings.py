@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 from support.configs import composed
 from support.running import FAST
@@ -14,6 +15,7 @@ from nerf_lightning.config.compose import compose_config
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 from nerf_lightning.runs.folder import former_config
 
 IN_A_BOX = ball_scene()
@@ -37,6 +39,45 @@ def test_the_model_follows_the_scene_and_is_said(caplog, scene, model, batch_ray
     assert (config.data.batch_rays, config.seed) == (batch_rays, 3)
     assert f"model: {model}, since " in caplog.text
     assert "(model=NAME chooses another)" in caplog.text
+
+
+def with_depths(scene, distance=1.0):
+    pixels = PixelIndex(*(torch.tensor([0, 1, 2]) for _ in range(3)))
+    return replace(scene, depths=KnownDepths(pixels, torch.full((3,), distance), torch.ones(3)))
+
+
+def test_known_depths_are_trained_on_with_a_grid_as_fine_as_the_pixels(caplog):
+    caplog.set_level("INFO")
+    far = replace(PHOTOGRAPHS.cameras, focal=PHOTOGRAPHS.cameras.focal * 30.0)  # 576 pixels
+    scene = with_depths(replace(PHOTOGRAPHS, cameras=far), distance=1.5)
+    config, choices = chosen_for(scene, "seed=3")
+    assert choices["loss"] == "depth"
+    # Cells of 4 / 2048 are as small as pixels of 1.5 / 576; those of 4 / 1024 are not.
+    assert (config.encoder.max_resolution, config.encoder.log2_table_size) == (2048, 19)
+    assert "loss: depth, since the distance of 3 pixels is known" in caplog.text
+    assert "encoder: 2048 cells a side" in caplog.text
+
+
+@pytest.mark.parametrize("scene", [IN_A_BOX, PHOTOGRAPHS])
+def test_a_box_and_a_capture_without_depths_are_trained_on_colours_alone(scene):
+    scene = with_depths(scene) if scene is IN_A_BOX else scene
+    config, choices = chosen_for(scene)
+    assert choices["loss"] != "depth"
+    assert config.encoder.max_resolution == 512
+
+
+def test_a_loss_and_a_grid_that_are_typed_stay():
+    config, choices = chosen_for(with_depths(PHOTOGRAPHS), "loss=proposal")
+    assert (choices["loss"], config.encoder.max_resolution) == ("proposal", 512)
+    config, choices = chosen_for(with_depths(PHOTOGRAPHS, 1e-3), "encoder.log2_table_size=12")
+    assert (choices["loss"], config.encoder.max_resolution, config.encoder.log2_table_size) == ("depth", 512, 12)
+    _, choices = chosen_for(with_depths(PHOTOGRAPHS), "model=nerf")
+    assert choices["loss"] == "mse"
+
+
+@pytest.mark.parametrize(("distance", "resolution"), [(1e-4, 4096), (100.0, 512)])
+def test_the_grid_stays_within_reason(distance, resolution):
+    assert chosen_for(with_depths(PHOTOGRAPHS, distance))[0].encoder.max_resolution == resolution
 
 
 @pytest.mark.parametrize("named", ["model=nerf", "experiment=fern"])

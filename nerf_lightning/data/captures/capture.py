@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.data.pixels.decoding import Photograph
@@ -27,6 +27,8 @@ class View:
     """(width, height) for which the intrinsics hold; the picture may be a shrunk copy."""
     lens: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, k3, k4, p1, p2."""
+    depth: Path | None = None
+    """A grey picture of 16 bits whose levels are depths along the camera's axis; 0 is unknown."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,10 @@ class Capture:
     lens_model: LensModel = "pinhole"
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
     """Sparse points of the reconstruction."""
+    point_errors: Float[Tensor, "points"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    """Mean distance in pixels between where a point was seen and where it projects to; empty without `tracks`."""
+    tracks: Int[Tensor, "seen 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.int64))
+    """Which point was seen in which view, where the format says so."""
     bounds: Float[Tensor, "views 2"] | None = None
     """Nearest and farthest depth of content, where the format has them."""
     box: Float[Tensor, "2 3"] | None = None
@@ -49,6 +55,8 @@ class Capture:
     """Takes the poses' frame to the frame that the capture's maker knows."""
     left_out: tuple[str, ...] = ()
     """Photographs that have no pose."""
+    depth_unit: float = 1e-3
+    """How long a level of the views' depth maps is, in units of the capture; sensors count millimetres."""
 
     def some(self, kept: Sequence[int]) -> "Capture":
         """Return some of the views, in order; the splits follow."""
@@ -58,7 +66,16 @@ class Capture:
             for split, numbers in self.splits.items()
         }
         bounds = None if self.bounds is None else self.bounds[list(kept)]
-        return replace(self, views=tuple(self.views[number] for number in kept), bounds=bounds, splits=splits)
+        numbers = torch.full((len(self.views),), -1)
+        numbers[list(kept)] = torch.arange(len(kept))
+        tracks = torch.stack([self.tracks[:, 0], numbers[self.tracks[:, 1]]], dim=1)
+        return replace(
+            self,
+            views=tuple(self.views[number] for number in kept),
+            bounds=bounds,
+            splits=splits,
+            tracks=tracks[tracks[:, 1] >= 0],
+        )
 
 
 def common_lens_model(kinds: set[LensModel]) -> LensModel | None:

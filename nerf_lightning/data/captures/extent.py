@@ -1,5 +1,6 @@
 """How much of space is modelled, the working frame of a capture, and where along its rays content may lie."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -48,6 +49,11 @@ UNIT_BALL_HALF = 3**-0.5
 # The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in
 # normalised device coordinates.
 LEAST_AHEAD = 0.1
+CONTRACTED_SIDE = 4.0
+"""Of the cube that holds contracted space."""
+COARSEST_LEVEL, FINEST_LEVEL = 9, 12
+TABLE_SIZES = {512: 18, 1024: 19, 2048: 19, 4096: 20}
+"""log2 of the entries that a table has for a finest resolution, by measurement (docs/measurements.md)."""
 IN_A_BOX, PHOTOGRAPHS = "fast", "fast_proposal"
 """The models of model=auto."""
 
@@ -280,3 +286,20 @@ def model_for(scene: Scene) -> tuple[str, str]:
     if scene.space == "bounded":
         return IN_A_BOX, "the scene stands in a box"
     return PHOTOGRAPHS, "the photographs show whatever lies behind the content"
+
+
+def grid_for(scene: Scene) -> tuple[int, int]:
+    """Return the finest resolution of a hash grid whose cells are as small as the pixels, and log2 of its table's size.
+
+    Half of the pixels of known distance are at least as wide, where they see the scene, as a cell: of the cube from
+    -2 to 2 that all of space is contracted to, or of normalised device coordinates, in which a picture has width 2.
+    """
+    assert scene.depths is not None
+    view = scene.depths.pixels.view
+    if scene.space == "ndc":
+        cells = torch.maximum(scene.cameras.width, scene.cameras.height)[view].double()
+    else:
+        cells = CONTRACTED_SIDE * scene.cameras.focal.mean(dim=-1)[view].double() / scene.depths.distance
+    levels = math.ceil(math.log2(float(cells.median())))
+    resolution = 1 << min(max(levels, COARSEST_LEVEL), FINEST_LEVEL)
+    return resolution, TABLE_SIZES[resolution]

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
 from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
+from nerf_lightning.data.captures.known_depths import known_depths
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
 from nerf_lightning.data.pixels.decoding import read_photographs
 from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, downscaled_size, image_size
@@ -25,7 +26,7 @@ from nerf_lightning.files.trust import reading
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user
+from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
 from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
@@ -132,6 +133,9 @@ class CaptureReader(Reader):
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
         extent = extent_of(capture, cameras, space, self.near, self.far)
         to_user = (capture.undo @ extent.to_user).float()
+        depths = known_depths(capture, cameras)
+        if depths is not None:
+            depths = replace(depths, distance=(depths.distance / unit_of(extent.to_user)).float())
         require_possible(extent, to_user, capture)
         return Scene(
             name=self.name,
@@ -144,6 +148,7 @@ class CaptureReader(Reader):
             view_names=names,
             background=background_for(self.background, color, "black"),
             space=space,
+            depths=depths,
             points=points_from_user(capture.points, extent.to_user).float(),
             to_user=to_user,
             metres_per_unit=self.metres_per_unit,

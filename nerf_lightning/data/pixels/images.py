@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
 
 from nerf_lightning.files.budgets import limits
@@ -115,6 +115,21 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
                 part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))
             rgba[rows] = np.asarray(part if part.mode == "RGBA" else part.convert("RGBA"))
         return rgba
+
+
+def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
+    """Return the levels of a grey picture of 16 bits, as depth sensors write it.
+
+    Raises:
+        InputError: what `image_size` refuses, damaged, or of another kind.
+    """
+    with _opened(path) as image:
+        if image.mode not in GREY_16:
+            raise InputError(f"The depth map {path} is no grey picture of 16 bits. Save it as a 16-bit PNG.")
+        try:
+            return np.asarray(image).astype(np.uint16)
+        except DECODER_ERRORS as error:
+            raise InputError(_unreadable(path, error)) from error
 
 
 def read_mask(path: Path, keep: MaskColor = "white") -> Bool[np.ndarray, "height width"]:

@@ -8,14 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.readers.colmap_files import CURE, BinaryFiles, ColmapCamera, ColmapImage, TextFiles
+from nerf_lightning.data.readers.colmap_files import (
+    CURE,
+    BinaryFiles,
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    TextFiles,
+)
 from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -35,6 +42,7 @@ LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {
 }
 FILES = ("cameras", "images", "points3D")
 KINDS: dict[str, BinaryFiles | TextFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
+NO_POINTS = ColmapPoints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
 TOLERANCE = 1e-4
 """Relative and absolute, to which a model and its twin in text agree: few digits may have been written."""
 
@@ -46,7 +54,7 @@ class ColmapModel:
     cameras: dict[int, ColmapCamera]
     images: tuple[ColmapImage, ...]
     """In order of their names."""
-    points: Float[ndarray, "points 3"]
+    points: ColmapPoints
 
 
 @dataclass
@@ -84,7 +92,9 @@ class ColmapReader(CaptureReader):
             views=tuple(self._view(image, model.cameras[image.camera], pictures) for image in model.images),
             source=folder,
             lens_model=lens_model,
-            points=torch.from_numpy(model.points),
+            points=torch.from_numpy(model.points.positions),
+            point_errors=torch.from_numpy(model.points.errors),
+            tracks=torch.from_numpy(_tracks(model)),
             left_out=tuple(name for name in picture_files(pictures) if name not in registered),
         )
 
@@ -103,6 +113,16 @@ class ColmapReader(CaptureReader):
             size=(float(camera.width), float(camera.height)),
             lens=(k1, k2, k3, k4, p1, p2),
         )
+
+
+def _tracks(model: ColmapModel) -> Int[ndarray, "seen 2"]:
+    """Return which point was seen in which photograph, by their rows; photographs that the model lacks are left out."""
+    numbers = np.array([image.number for image in model.images])
+    order = np.argsort(numbers)
+    point, seen = model.points.tracks.T
+    row = np.searchsorted(numbers[order], seen).clip(max=len(numbers) - 1)
+    known = numbers[order][row] == seen
+    return np.stack([point[known], order[row[known]]], axis=1)
 
 
 def _absent(lost: list[str], pictures: Path, folder: Path, count: int) -> str:
@@ -181,7 +201,7 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
     if twice:
         raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
     images = sorted(files.images(images_path), key=lambda image: image.name)
-    points = files.points(points_path) if points_path.exists() else np.zeros((0, 3))
+    points = files.points(points_path) if points_path.exists() else NO_POINTS
     return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
 
 

@@ -4,6 +4,7 @@ They are parsed here, every length checked before it is believed: COLMAP's own l
 """
 
 import io
+import math
 import mmap
 import os
 import struct
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from nerf_lightning.files.budgets import limits, require_within
@@ -39,6 +40,8 @@ MOST_BYTES = 1 << 36
 """Of a file; ten million points with long tracks take a tenth."""
 LONGEST_LINE = 1 << 24
 """In characters; that of a photograph with a hundred thousand features takes less."""
+MOST_TRACKS, LONGEST_TRACK = 500_000, 1000
+"""So many points, spread over all, say where they were seen, unless in more photographs."""
 CURE = "Copy the model again, or run the reconstruction anew (nerf poses images=DIR)."
 CURE_MODEL = "The file is damaged, or of a newer COLMAP: reconstruct with the camera model OPENCV, or undistort first."
 
@@ -58,11 +61,29 @@ class ColmapCamera:
 class ColmapImage:
     """One registered photograph."""
 
+    number: int
     name: str
     camera: int
     rotation: tuple[float, float, float, float]
     """World to camera, a quaternion w, x, y, z."""
     translation: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ColmapPoints:
+    """The sparse points, and where they were seen."""
+
+    positions: Float[ndarray, "points 3"]
+    errors: Float[ndarray, "points"]
+    """Mean reprojection error in pixels; -1 or NaN where it is not known."""
+    tracks: Int[ndarray, "seen 2"]
+    """Row of a point, and number of a photograph that it was seen in."""
+
+    @classmethod
+    def of(cls, rows: Float[ndarray, "points 4"], images: ndarray, lengths: ndarray) -> "ColmapPoints":
+        """Return the points of rows (x, y, z, error), whose tracks follow each other."""
+        point = np.repeat(np.arange(len(rows)), lengths)
+        return cls(rows[:, :3].copy(), rows[:, 3].copy(), np.stack([point, images.astype(np.int64)], axis=1))
 
 
 class BinaryFiles:
@@ -86,17 +107,24 @@ class BinaryFiles:
             values = data.take("<I7dI")
             name = data.text()
             data.skip(24 * data.take("<Q")[0])
-            yield ColmapImage(name, values[8], values[1:5], values[5:8])
+            yield ColmapImage(values[0], name, values[8], values[1:5], values[5:8])
         data.end()
 
-    def points(self, path: Path) -> Float[ndarray, "points 3"]:
-        """Return the sparse points; the photographs that they were seen in are passed over."""
-        data, found = _Bytes(path), array("d")
-        for _ in range(data.count(51, "points")):
-            found.extend(data.take("<Q3d3Bd")[1:4])
-            data.skip(8 * data.take("<Q")[0])
+    def points(self, path: Path) -> ColmapPoints:
+        """Return the sparse points."""
+        data, found, tracks = _Bytes(path), array("d"), [np.zeros(0, "<u4")]
+        count = data.count(51, "points")
+        lengths, stride = np.zeros(count, np.int64), 1 + count // MOST_TRACKS
+        for number in range(count):
+            _, x, y, z, _, _, _, error, length = data.take("<Q3d3BdQ")
+            found.extend((x, y, z, error))
+            if number % stride or length > LONGEST_TRACK:
+                data.skip(8 * length)
+            else:
+                tracks.append(data.numbers("<u4", 2 * length)[::2])
+                lengths[number] = length
         data.end()
-        return np.frombuffer(found, np.float64).reshape(-1, 3)
+        return ColmapPoints.of(np.frombuffer(found, np.float64).reshape(-1, 4), np.concatenate(tracks), lengths)
 
 
 class _Bytes:
@@ -128,6 +156,12 @@ class _Bytes:
     def skip(self, size: int) -> None:
         self._need(size)
         self.place += size
+
+    def numbers(self, kind: str, count: int) -> ndarray:
+        """Return numbers of one kind, in memory of their own."""
+        place = self.place
+        self.skip(np.dtype(kind).itemsize * count)
+        return np.frombuffer(self.data, kind, count, place).copy()
 
     def text(self) -> str:
         end = self.data.find(b"\0", self.place)
@@ -177,14 +211,22 @@ class TextFiles:
             if len(words) < 10:
                 raise InputError(f"{where} lacks the photograph's name. {CURE}")
             _check_features(next(lines, ("", ""))[1].split(), where)
-            yield ColmapImage(words[9], _whole(camera, where), (qw, qx, qy, qz), (x, y, z))
+            number = _whole(_numbers(words[:1], where, 1)[0], where)
+            yield ColmapImage(number, words[9], _whole(camera, where), (qw, qx, qy, qz), (x, y, z))
 
-    def points(self, path: Path) -> Float[ndarray, "points 3"]:
+    def points(self, path: Path) -> ColmapPoints:
         """Return the sparse points."""
-        found = array("d")
+        found, tracks, lengths = array("d"), array("q"), array("q")
         for where, line in _within(_lines(path), "points", path):
-            found.extend(_numbers(line.split(maxsplit=4)[1:4], where, 3))
-        return np.frombuffer(found, np.float64).reshape(-1, 3)
+            words = line.split(maxsplit=8 + 2 * LONGEST_TRACK)
+            # Only the position must be there; what else is odd tells nothing of where the point was seen.
+            track = [int(image) for image in words[8 : 8 + 2 * LONGEST_TRACK : 2] if image.isdecimal()]
+            found.extend(_numbers(words[1:4], where, 3))
+            found.append(_error(words))
+            tracks.extend(track)
+            lengths.append(len(track))
+        numbers = (np.frombuffer(each, np.int64) for each in (tracks, lengths))
+        return ColmapPoints.of(np.frombuffer(found, np.float64).reshape(-1, 4), *numbers)
 
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
@@ -237,6 +279,13 @@ def _numbers(words: list[str], where: str, count: int) -> list[float]:
             f"{where} should hold {count} numbers there, but it holds {' '.join(words) or 'nothing'}. {CURE}"
         )
     return values
+
+
+def _error(words: list[str]) -> float:
+    try:
+        return float(words[7])
+    except (ValueError, IndexError):
+        return math.nan
 
 
 def _whole(value: float, where: str) -> int:

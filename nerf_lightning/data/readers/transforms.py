@@ -41,10 +41,12 @@ class TransformsReader(CaptureReader):
 
     Args:
         file: the json below root; the paths in it are relative to where it lies.
+        depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
     """
 
     name: str = "transforms"
     file: str = "transforms.json"
+    depth_unit: float = 1e-3
 
     def capture(self) -> Capture:
         """Return all frames, in the file's order."""
@@ -74,6 +76,7 @@ class TransformsReader(CaptureReader):
             undo=_undo(content, str(path)),
             box=_ngp_box(content, str(path)),
             left_out=self._without_pose(views),
+            depth_unit=self.depth_unit,
         )
 
     def _without_pose(self, views: list[View]) -> tuple[str, ...]:
@@ -105,8 +108,17 @@ class TransformsReader(CaptureReader):
             center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),
             size=(width, height),
             lens=lens,
+            depth=self._depth(path, where, frame),
         )
         return view, lens_model
+
+    def _depth(self, path: Path, where: str, frame: dict[str, Any]) -> Path | None:
+        name = frame.get("depth_file_path")
+        if name in (None, ""):
+            return None
+        depth = path.parent / path_of(name, "depth_file_path", where).replace("\\", "/")
+        self.require_inside(depth)
+        return depth  # one that is not there is left out and named with others that cannot be used
 
     def _own_mask(self, path: Path, where: str, frame: dict[str, Any]) -> Path | None:
         name = frame.get("mask_path")

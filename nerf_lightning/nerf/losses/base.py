@@ -4,12 +4,13 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from nerf_lightning.nerf.part import Part
 from nerf_lightning.nerf.types.rays import Target
 
 
-class Loss(nn.Module, ABC):
+class Loss(Part, ABC):
     """A weighted mean over rays, so that the losses of tiles add up to that of the batch.
 
     The weights come with a mean of 1 over the batch: a ray's number is multiplied by its weight before the plain mean.
@@ -18,6 +19,9 @@ class Loss(nn.Module, ABC):
 
     patch: int = 1
     """Side in pixels of the squares that it wants to see whole: batches hold one after the other, row by row."""
+
+    depth_every: int = 0
+    """One of so many rays of a batch runs through a pixel whose distance is known; 0: those are no special rays."""
 
     needs_weights: bool = False
     """Whether it looks at the weights and samples of renderings, which levels may leave out otherwise."""

@@ -50,7 +50,7 @@ class RobustLoss(Loss):
         super().__init__()
         require_ranges({"share": share, "times": times, "patch": patch}, RANGES)
         self.of, self.share, self.times, self.patch = of, share, times, patch
-        self.needs_weights = of.needs_weights
+        self.needs_weights, self.depth_every = of.needs_weights, of.depth_every
         self.register_buffer("threshold", torch.tensor(FIRST_THRESHOLD))
 
     threshold: Tensor

@@ -29,6 +29,7 @@ class WeightedSum(Loss):
         if len(sides) > 1:
             raise ValueError(f"the losses look at squares of {sorted(sides)} pixels a side: give all the same patch")
         self.patch = max([1, *sides])
+        self.depth_every = min((each.depth_every for each in terms.values() if each.depth_every), default=0)
         self.needs_weights = any(loss.needs_weights for loss in terms.values())
 
     def forward(self, renderings: list[Any], target: Target) -> dict[str, Float[Tensor, "levels"]]:

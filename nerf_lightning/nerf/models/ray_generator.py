@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
+from nerf_lightning.nerf.geometry.ndc import share_at_distance
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.models.subpixels import Subpixels, for_each_ray
 from nerf_lightning.nerf.part import Part
@@ -118,6 +119,19 @@ class RayGenerator(Part):
             return None
         with torch.no_grad():
             return align_untrained_cameras(self.given.to("cpu"), self.cameras.to("cpu"), trained)
+
+    @torch.no_grad()
+    def distance_along(
+        self, pixels: PixelIndex, distance: Float[Tensor, "*rays"]
+    ) -> tuple[Float[Tensor, "*rays"], Float[Tensor, "*rays"] | None]:
+        """Return where along the rays of `forward` points lie that have a distance in the world, and where those end.
+
+        The end is that of normalised device coordinates, which is infinitely far away; else None.
+        """
+        if self.ndc is None:
+            return distance, None
+        far = self(pixels).far
+        return share_at_distance(self.through_world(pixels), distance) * far, far
 
     def through_world(self, pixels: PixelIndex, subpixel_offset: Float[Tensor, "*#rays 2"] | None = None) -> RayBundle:
         """Return the rays through the world, wherever those of `forward` run."""

@@ -115,6 +115,20 @@ class PixelIndex(TensorStruct):
 
 
 @dataclass(frozen=True)
+class KnownDepths(TensorStruct):
+    """Pixels at which the distance of the surface is known, from structure from motion or a depth sensor."""
+
+    pixels: PixelIndex
+    distance: Float[Tensor, "known"]
+    """Along the unit ray through the pixel, scene units."""
+    certainty: Float[Tensor, "known"]
+    """In (0, 1]: 1 / (1 + (relative error / `CERTAIN`)^2)."""
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+
+@dataclass(frozen=True)
 class Batch(TensorStruct):
     """Pixels of photographs and what they show; the rays through them are made in the step (`RayGenerator`)."""
 
@@ -123,6 +137,10 @@ class Batch(TensorStruct):
     """Straight alpha; blended with the step's background in one place (`rendering.blending`)."""
     weight: Float[Tensor, "*rays"]
     """How much each pixel counts: 0 where it is masked, else 1."""
+    distance: Float[Tensor, "*rays"] | None = None
+    """Of the surface along the unit ray, scene units, where `certainty` is not 0; None: unknown everywhere."""
+    certainty: Float[Tensor, "*rays"] | None = None
+    """How much each distance counts, in [0, 1]; 0 where it is unknown."""
 
     @property
     def num_rays(self) -> int:
@@ -140,3 +158,9 @@ class Target(TensorStruct):
     """Of each ray, >= 0; its mean over the whole batch is 1."""
     pixels: PixelIndex
     """Where in which photograph each ray lies."""
+    distance: Float[Tensor, "*rays"] | None = None
+    """Where along each ray the surface is, in the units of its samples, if `certainty` is not 0; None: unknown."""
+    certainty: Float[Tensor, "*rays"] | None = None
+    """How much each distance counts, in [0, 1]; 0 where it is unknown."""
+    infinity: Float[Tensor, "*rays"] | None = None
+    """Where along each ray the world ends, in normalised device coordinates; None: nowhere."""

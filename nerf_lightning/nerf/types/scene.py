@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from nerf_lightning.nerf.types.rays import KnownDepths
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
 Background = Literal["white", "black", "random", "white_or_random", "black_or_random", "none"]
@@ -154,6 +155,8 @@ class Scene(SceneRecord):
     """Exact depth and normals, for scenes that know them."""
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3))
     """Sparse points of a reconstruction, in scene units; there may be none."""
+    depths: KnownDepths | None = None
+    """Of pixels of its photographs, where the capture says any."""
     left_out: tuple[str, ...] = ()
     """Photographs of the capture that have no pose, and so are no views."""
     refined: bool = False

@@ -1,8 +1,10 @@
 """Every sampler, field and encoder that make sense together learn a ball together."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from support.scenes import ball_scene
+from support.scenes import BALL_RADIUS, ball_scene
 from support.steps import rays_of
 
 from nerf_lightning.data.ray_batches import RayBatches
@@ -11,8 +13,10 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.nerf_mlp import NerfMLP
 from nerf_lightning.nerf.fields.ngp_field import NGPField
+from nerf_lightning.nerf.losses.depth import DepthLoss
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.proposal import ProposalLoss
+from nerf_lightning.nerf.losses.weighted_sum import WeightedSum
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
@@ -24,6 +28,7 @@ from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.proposal import ProposalSampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.progress import Progress
+from nerf_lightning.nerf.types.rays import KnownDepths, PixelIndex
 from nerf_lightning.training.step import TrainStep
 
 
@@ -93,6 +98,28 @@ def test_it_learns(model, field, position, direction):
         losses.append(float(step(loader.at(0, progress.rays_seen), optimizer).losses[-1]))
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
     assert step.guard.skipped == 0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_kind_of_level_learns_known_depths(model):
+    """The middle pixel of each view sees the ball's nearest point."""
+    torch.manual_seed(4)
+    scene, progress = ball_scene(num_views=8, size=16, background="random"), Progress()
+    view, middle = torch.arange(8), torch.full((8,), 8)
+    distance = scene.cameras.c2w[:, :, 3].norm(dim=-1) - BALL_RADIUS
+    scene = replace(scene, depths=KnownDepths(PixelIndex(view, middle, middle), distance, torch.ones(8)))
+    levels = RadianceModel(MODELS[model](lambda: FIELDS["ngp"](POSITIONS["hash_grid"](), DIRECTIONS["frequency"]())))
+    levels.fit_to(scene)
+    plain = ProposalLoss() if model == "proposal" else MeanSquaredError()
+    step = TrainStep(
+        model=levels, rays=rays_of(scene), loss=WeightedSum({"photo": plain, "depth": DepthLoss(every=4, fade=1.0)}),
+        optimizer=lambda groups: TableAdam(groups, lr=0.02), schedule=ExponentialDecay(decay_rate=1.0),
+        progress=progress, num_steps=60, seed=0, background="random", tile_points=4096,
+    )  # fmt: skip
+    loader, optimizer, lost = RayBatches(scene, progress, 0, 64, depth_every=4), step.new_optimizer(), []
+    for _ in range(40):
+        lost.append(float(step(loader.at(0, progress.rays_seen), optimizer).terms["depth"][-1]))
+    assert sum(lost[-5:]) < 0.5 * sum(lost[:5])
 
 
 def test_rays_per_step_follow_the_budget_in_fixed_sizes():
