@@ -1,4 +1,4 @@
-"""A loop along the photographs: where they were taken from, the content in the middle, upright."""
+"""A loop along the photographs: where they were taken from, aimed as they are, upright."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ HIGHEST = 80.0
 @final
 @dataclass
 class Sweep(CameraPath):
-    """Go along the photographs and back to the start, looking at the middle.
+    """Go along the photographs and back to the start, looking where those nearby look.
 
     A circle where photographs were taken from all sides, else to and fro along most of them. Height and distance are
     those of the photographs nearby, so every frame shows what photographs saw, about as large as they show it.
@@ -62,7 +62,10 @@ class Sweep(CameraPath):
         distance = (weights @ distances.log()).exp().clamp(min=float(torch.quantile(distances, NEAREST)))
         level = azimuth.deg2rad().cos()[:, None] * east + azimuth.deg2rad().sin()[:, None] * north
         eyes = around.center + distance[:, None] * (height.cos() * level + height.sin() * up)
-        return self.pinholes(look_at(eyes, around.center.expand_as(eyes), up), around)
+        # Aimed as those nearby, of whose axes this is the point nearest to the centre.
+        axes = -around.poses[:, :, 2]
+        aims = offsets - (offsets * axes).sum(dim=-1, keepdim=True) * axes
+        return self.pinholes(look_at(eyes, around.center + weights @ aims, up), around)
 
 
 def azimuths(taken: Float[Tensor, "views"], num_frames: int) -> Float[Tensor, "frames"]:
