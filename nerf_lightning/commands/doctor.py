@@ -56,7 +56,7 @@ def _origin(config: DictConfig, reader: Any) -> tuple[str | None, str]:
     form = HydraConfig.get().runtime.choices["scene"]
     if isinstance(reader, AutoReader):
         known = reader.known_format(reader.folder())
-        form = form if known is None else known[1]
+        form = form if known is None else known.scene
     given = (config.scene.get(key.partition(".")[2]) for key in PLACES)
     return next((str(place) for place in given if place), None), str(form)
 

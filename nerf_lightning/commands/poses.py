@@ -33,7 +33,7 @@ def run(config: DictConfig) -> int:
         require_ffmpeg()
         model, matching = from_video(source, config.every, folder, settings)
     else:
-        model, matching = from_photographs(source, folder, settings, config.allow_outside)
+        model, matching = from_photographs(source, folder, settings)
     say(
         *summary_lines(model, matching, is_video, folder, time.monotonic() - started),
         f"next                nerf train model=fast_proposal scene=colmap {to_type('scene.root', str(folder))}",
@@ -57,6 +57,4 @@ def _settings(config: DictConfig) -> SfmSettings:
         if not isinstance(config.every, int):
             raise InputError(f"every={config.every} does not fit: it must be a whole number or null.")
         require_positive(every=config.every)
-    if not isinstance(config.allow_outside, bool):
-        raise InputError(f"allow_outside={config.allow_outside} does not fit: it must be true or false.")
     return SfmSettings(**chosen)

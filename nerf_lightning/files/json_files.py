@@ -23,7 +23,7 @@ def read_json(path: Path) -> Any:
         InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
     """
     try:
-        text = read_text(path, limits().json_bytes, CURE, "utf-8-sig")
+        text = read_text(path, limits().json_bytes, CURE)
         require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
         content = json.loads(text, object_pairs_hook=_object)
     except json.JSONDecodeError as error:

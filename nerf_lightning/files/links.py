@@ -57,7 +57,7 @@ def is_absolute(name: str) -> bool:
 
 
 def require_inside(path: Path, root: Path, setting: str | None = None) -> None:
-    """Refuse a file or folder that is really somewhere else.
+    """Refuse a name that leads out of a folder; links are followed, since reading a picture or numbers does no harm.
 
     Args:
         path: as it was found.
@@ -68,12 +68,12 @@ def require_inside(path: Path, root: Path, setting: str | None = None) -> None:
         InputError: with where it leads, and the cure.
     """
     folders = [root] if setting is None or not leaves_by_name(setting) else [root, root / setting]
-    real = Path(os.path.realpath(path))
-    if not any(real.is_relative_to(os.path.realpath(folder)) for folder in folders):
+    named = Path(os.path.abspath(path))
+    if not any(named.is_relative_to(os.path.abspath(folder)) for folder in folders):
         raise InputError(
-            f"{path} leads to {real}, outside of the capture's folder {root}, and where a capture's files or links "
-            "lead is followed inside of it only: they may be a stranger's. If this capture is yours, add "
-            "scene.allow_outside=true; else copy what it needs into its folder."
+            f"{path} leads out of the capture's folder {root}, and the names in a capture are followed inside of it "
+            "only: they may be a stranger's. If this capture is yours, add scene.allow_outside=true; else copy what it "
+            "needs into its folder."
         )
 
 

@@ -4,6 +4,7 @@ An archive can carry a FIFO, which is waited for without end, and a link can lea
 without waiting, and asked what it is once it is open: nobody can put another one in its place in between.
 """
 
+import codecs
 import errno
 import io
 import os
@@ -11,6 +12,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from nerf_lightning.messages.errors import InputError
 
@@ -67,17 +69,25 @@ def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
     return content
 
 
-def read_text(path: Path, most_bytes: int, cure: str = CURE, encoding: str = "utf-8") -> str:
-    """Return the content of a text file; ends of lines become \\n.
+def read_text(path: Path, most_bytes: int, cure: str = CURE) -> str:
+    """Return the content of a text file in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n.
 
     Raises:
         InputError: what `read_bytes` refuses, or it is no text in this encoding.
     """
-    content = read_bytes(path, most_bytes, cure)
+    content = io.BytesIO(read_bytes(path, most_bytes, cure))
     try:
-        return io.TextIOWrapper(io.BytesIO(content), encoding).read()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file (byte {error.start} is not UTF-8). {cure}") from error
+        return io.TextIOWrapper(content, encoding_of(content)).read()
+    except UnicodeError as error:
+        where = f" (byte {error.start} is not UTF-8)" if isinstance(error, UnicodeDecodeError) else ""
+        raise InputError(f"{path} is not a text file{where}. {cure}") from error
+
+
+def encoding_of(file: IO[bytes]) -> str:
+    """Return how the text of a file is encoded, by its byte order mark: UTF-16, which Windows writes, or UTF-8."""
+    start = file.read(2)
+    file.seek(0)
+    return "utf-16" if start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
 
 
 @contextmanager

@@ -150,7 +150,8 @@ def _require_value(value: object, kind: Any, place: str) -> None:
     if kind is Tensor or (isinstance(kind, type) and issubclass(kind, AbstractArray)):
         _require_tensor(value, place)
         assert isinstance(value, Tensor)
-        if kind is not Tensor and not (value.dtype in RECORDED and isinstance(value, kind)):
+        recorded = (*RECORDED, torch.float64) if getattr(kind, "dtypes", ()) == ("float64",) else RECORDED
+        if kind is not Tensor and not (value.dtype in recorded and isinstance(value, kind)):
             raise Mismatch(place, f"holds {value.dtype} in the shape {tuple(value.shape)}, not {_annotated(kind)}")
     elif kind is float:
         if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:  # type: ignore[arg-type]

@@ -5,15 +5,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 
-def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+def walk(root: Path, through_links: bool = False) -> Iterator[tuple[Path, list[str], list[str]]]:
     """Yield each folder, the folders in it and the other names in it, the folder itself first, as `os.walk` does.
 
-    Links to folders are named and not followed, so that a loop of links ends; folders that cannot be read are passed
-    over. What the caller takes out of the list of folders is not entered, and their order is the caller's.
+    Links to folders are named, and followed only `through_links`, each folder once, so that a loop of links ends;
+    folders that cannot be read are passed over. What the caller takes out of the list of folders is not entered, and
+    their order is the caller's.
     """
-    waiting = [root]
+    waiting, entered = [root], set[str]()
     while waiting:
         base = waiting.pop()
+        if through_links:
+            if (real := os.path.realpath(base)) in entered:
+                continue
+            entered.add(real)
         folders, names = list[str](), list[str]()
         try:
             with os.scandir(base) as entries:
@@ -22,7 +27,7 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
         except OSError:
             continue
         yield base, folders, names
-        waiting += [base / name for name in reversed(folders) if not os.path.islink(base / name)]
+        waiting += [base / name for name in reversed(folders) if through_links or not os.path.islink(base / name)]
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:

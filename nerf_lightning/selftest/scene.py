@@ -42,7 +42,7 @@ def ball_scene() -> Scene:
         splits={"train": TRAIN, "val": HELD_OUT, "test": HELD_OUT},
         view_names=tuple(f"ball_{view}" for view in range(NUM_VIEWS)),
         background="random",
-        to_user=torch.eye(4),
+        to_user=torch.eye(4, dtype=torch.float64),
         protocol={},
         truth=None,
     )

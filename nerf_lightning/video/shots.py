@@ -74,7 +74,7 @@ class Shot:
         """Return the unit normals of what the picture shows, in the user's axes."""
         normals = normals_from_depth(self._surface(frame, picture))
         to_user = self.subject.scene.to_user
-        return normals @ (to_user[:3, :3] / unit_of(to_user)).mT
+        return normals @ (to_user[:3, :3] / unit_of(to_user)).mT.to(normals)
 
     def z_depth(self, frame: int, picture: Picture) -> Float[Tensor, "height width"]:
         """Return how far what the picture shows lies from the camera, in metres or the user's units (`unit`).

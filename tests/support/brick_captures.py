@@ -111,7 +111,7 @@ def pool(thing: str) -> Scene:
         splits={"train": tuple(range(count)), "val": (), "test": ()},
         view_names=tuple(f"{view:03d}.png" for view in range(count)),
         background="white",
-        to_user=torch.eye(4),
+        to_user=torch.eye(4, dtype=torch.float64),
         protocol={},
         truth=None,
         space="contracted" if thing == "microphone" else "bounded",

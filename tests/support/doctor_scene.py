@@ -38,7 +38,7 @@ def corner_scene() -> Scene:
         splits={"train": tuple(v for v in range(VIEWS) if v not in held), "val": held, "test": held},
         view_names=tuple(f"view {number}.png" for number in range(VIEWS)),
         background="black",
-        to_user=torch.eye(4),
+        to_user=torch.eye(4, dtype=torch.float64),
         protocol={},
         truth=None,
         space="contracted",

@@ -56,7 +56,7 @@ def ball_scene(
         splits={"train": views[:half], "val": views[half:], "test": views[half:]},
         view_names=tuple(f"ball_{view}" for view in views),
         background=background,
-        to_user=torch.eye(4),
+        to_user=torch.eye(4, dtype=torch.float64),
         protocol={},
         truth=None,
     )

@@ -111,7 +111,7 @@ class BricksReader(Reader):
             splits={split: tuple(range(starts[split], starts[split] + n)) for split, n in counts.items()},
             view_names=tuple(f"{split}_{i:03d}" for split, n in counts.items() for i in range(n)),
             background=self.background,
-            to_user=torch.eye(4),
+            to_user=torch.eye(4, dtype=torch.float64),
             protocol={"filter": "4x4 supersampling", "renderer": f"bricks {RENDER_VERSION}"},
             truth=Truth(torch.from_numpy(rendered.depth), torch.from_numpy(rendered.normals)),
         )

@@ -5,9 +5,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.nerf.types.scene import LensModel
 
@@ -53,8 +54,8 @@ class Capture:
     """Where the format names them."""
     undo: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
     """Takes the poses' frame to the frame that the capture's maker knows."""
-    left_out: tuple[str, ...] = ()
-    """Photographs that have no pose."""
+    left_out: LeftOut = field(default_factory=lambda: LeftOut(""))
+    """Views that cannot be used, and photographs that have no pose."""
     depth_unit: float = 1e-3
     """How long a level of the views' depth maps is, in units of the capture; sensors count millimetres."""
 
@@ -75,6 +76,17 @@ class Capture:
             bounds=bounds,
             splits=splits,
             tracks=tracks[tracks[:, 1] >= 0],
+        )
+
+    def some_points(self, kept: Bool[Tensor, "points"]) -> "Capture":
+        """Return the capture with some of its sparse points; the tracks follow."""
+        tracks = self.tracks[kept[self.tracks[:, 0]]]
+        numbers = kept.cumsum(dim=0) - 1
+        return replace(
+            self,
+            points=self.points[kept],
+            point_errors=self.point_errors[kept] if len(self.point_errors) else self.point_errors,
+            tracks=torch.stack([numbers[tracks[:, 0]], tracks[:, 1]], dim=1),
         )
 
 

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -17,11 +17,13 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.frames import LARGEST_UNIT, LEAST_UNIT, unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
-from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
+from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, SceneRecord
 
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 """What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
 have not lost every digit that a picture could show."""
+LEAST_SCALE, ALMOST_ONE = 1e-6, 1e-3
+"""Of a rotation's scale: less is none, and so near to 1 it is rounding."""
 WIDEST = 170.0
 """Degrees across a picture, beyond which nothing was photographed through a perspective lens."""
 
@@ -29,32 +31,52 @@ log = logging.getLogger(__name__)
 
 
 def usable(capture: Capture) -> Capture:
-    """Return the capture without the views that cannot be used, and say which they are.
+    """Return the capture without the views, points and depths that cannot be used.
 
-    Left out are views whose focal length no perspective picture of their size has.
+    A rotation that is scaled alike along all axes loses its scale; of two views of one picture the first one counts,
+    where they agree.
 
     Raises:
-        InputError: no view is left, two have one name, or a number cannot be a camera's: a pose that is no rotation,
-            a principal point outside the picture, sparse points beyond `FARTHEST`, anything that is not finite.
+        InputError: too few views remain.
     """
-    _check_names(capture)
-    for view in capture.views:
-        if fault := _fault_of(view):
-            raise InputError(f"{capture.source}: the view {view.name} {fault}")
-    _check_depths(capture)
-    if capture.lens_model not in ("pinhole", "radial_tangential"):
-        return capture
-    reasons = {number: impossible_lens(view.size, view.focal) for number, view in enumerate(capture.views)}
-    odd = [number for number, reason in reasons.items() if reason]
-    if not odd:
-        return capture
-    first, reason = capture.views[odd[0]].name, reasons[odd[0]]
-    cure = "The focal length must be in pixels of the width and height beside it, not a share of them."
-    if len(odd) == len(reasons):
-        raise InputError(f"{capture.source}: the view {first} has {reason}; so has every other. {cure}")
-    names = listed((capture.views[number].name for number in odd), cap=5)
-    log.warning("%d of %d views are left out (%s): %s. %s", len(odd), len(reasons), names, reason, cure)
-    return capture.some([number for number, reason in reasons.items() if reason is None])
+    require_within("views", len(capture.views), str(capture.source), "views")
+    if not capture.views and not capture.left_out.faults:
+        raise InputError(f"{capture.source} lists no views, so there is nothing to learn from. Export it again.")
+    views, scales = zip(*map(_without_scale, capture.views), strict=True) if capture.views else ((), ())
+    scaled = [scale for scale in scales if scale is not None]
+    if scaled:
+        log.warning(
+            "%s: the rotations of %d of %d poses are scaled (by %.4g, the first); the scale is removed, and the centres"
+            " stay",
+            *(capture.source, len(scaled), len(views), scaled[0]),
+        )
+    first: dict[str, View] = {}
+    kept = []
+    for number, view in enumerate(views):
+        with capture.left_out.unless_usable(view.name):
+            # Those that are left out are shown, and nothing is called by them.
+            require_within("name_characters", len(view.name), str(capture.source), "characters in a name")
+            require_printable(view.name, f"A photograph of {capture.source}")
+            if fault := _fault_of(view, capture.lens_model):
+                raise InputError(f"{capture.source}: the view {view.name} {fault}")
+            if view.name not in first:
+                first[view.name] = view
+                kept.append(number)
+            elif not torch.allclose(view.c2w, first[view.name].c2w):  # files and tables are written by name
+                kept = [other for other in kept if views[other] is not first[view.name]]
+                raise InputError(f"{capture.source} lists {view.name} more than once, with different poses.")
+    capture.left_out.require_enough(len(kept))
+    return _with_known_depths(replace(capture, views=views).some(kept))
+
+
+def _without_scale(view: View) -> tuple[View, float | None]:
+    """Return the view with a rotation in place of a multiple of one, and the factor; None where there was none."""
+    determinant = float(torch.linalg.det(view.c2w[:, :3])) if bool(torch.isfinite(view.c2w).all()) else 0.0
+    scale = max(determinant, 0.0) ** (1 / 3)
+    if scale < LEAST_SCALE or abs(scale - 1.0) < ALMOST_ONE:
+        return view, None
+    c2w = torch.cat([view.c2w[:, :3] / scale, view.c2w[:, 3:]], dim=-1)
+    return (replace(view, c2w=c2w), scale) if bool(is_rigid(c2w)) else (view, None)
 
 
 def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | float, int | float]) -> str | None:
@@ -73,21 +95,7 @@ def impossible_lens(size: tuple[int | float, int | float], focal: tuple[int | fl
     )
 
 
-def _check_names(capture: Capture) -> None:
-    source = str(capture.source)
-    require_within("views", len(capture.views), source, "views")
-    if not capture.views:
-        raise InputError(f"{source} lists no views, so there is nothing to learn from. Export it again.")
-    names = Counter(view.name for view in capture.views)
-    require_within("name_characters", max(map(len, names)), source, "characters in a name")
-    for name in names:  # those that are left out are shown, and nothing is called by them
-        require_printable(name, f"A photograph of {source}")
-    twice = sorted(name for name, count in names.items() if count > 1)
-    if twice:  # files and tables are written by name
-        raise InputError(f"{source} lists {listed(twice)} more than once. Remove all but one of each.")
-
-
-def _fault_of(view: View) -> str | None:
+def _fault_of(view: View, lens_model: LensModel) -> str | None:
     """Return why the numbers of a view make no camera, with the cure."""
     (width, height), (x, y), center = view.size, view.focal, view.center
     numbers = torch.tensor([*view.focal, *center, *view.size, *view.lens], dtype=torch.float64)
@@ -112,26 +120,35 @@ def _fault_of(view: View) -> str | None:
     if not bool(is_rigid(view.c2w)):
         return (
             "has a pose that is not a rotation and a centre, camera to world with axes right, up, back (it scales, "
-            "mirrors or shears). Apply the scale to the centres alone, and export it again."
+            "mirrors or shears along some axis). Export it again."
         )
+    if lens_model in ("pinhole", "radial_tangential") and (reason := impossible_lens(view.size, view.focal)):
+        return f"has {reason}. The focal length must be in pixels of the width and height beside it, not a share."
     return None
 
 
-def _check_depths(capture: Capture) -> None:
-    far = int((~(capture.points.abs() <= FARTHEST)).any(dim=-1).sum())  # NaN, too
-    if far:
-        raise InputError(
-            f"{capture.source}: {far} of the {len(capture.points)} sparse points are NaN or not within {FARTHEST:g} of "
-            "the origin, where no digit is left that a picture could show. Remove them, or estimate the poses anew."
+def _with_known_depths(capture: Capture) -> Capture:
+    """Return the capture without sparse points that are mistakes, and without bounds where one of them is."""
+    sound = (capture.points.abs() <= FARTHEST).all(dim=-1)  # not NaN
+    if not bool(sound.all()):
+        count = int((~sound).sum())
+        log.warning(
+            "%s: %d of %d sparse points are NaN or beyond %g, and are left out",
+            *(capture.source, count, len(sound), FARTHEST),
         )
-    if capture.bounds is not None:
-        near, far_ = capture.bounds.unbind(dim=-1)
-        bad = (~((near > 0) & (near < far_) & (far_ < math.inf))).nonzero()[:, 0].tolist()
-        if bad:
-            names = listed((capture.views[number].name for number in bad), cap=5)
-            raise InputError(
-                f"{capture.source}: the depths of {names} are not 0 < near < far. Estimate the poses anew."
-            )
+        capture = capture.some_points(sound)
+    if capture.bounds is None:
+        return capture
+    near, far = capture.bounds.unbind(dim=-1)
+    bad = (~((near > 0) & (near < far) & (far < math.inf))).nonzero()[:, 0].tolist()
+    if not bad:
+        return capture
+    log.warning(
+        "%s: the depths (bounds) are not used, since those of %d of %d views are not 0 < near < far (%s); scene.near=N "
+        "gives the nearest",
+        *(capture.source, len(bad), len(near), listed((capture.views[number].name for number in bad), 3)),
+    )
+    return replace(capture, bounds=None)
 
 
 def contents(folder: Path) -> str:
@@ -166,20 +183,33 @@ def known_background(name: str) -> Background:
 
 
 def pose_from_matrix(matrix: object, where: str) -> Float[Tensor, "3 4"]:
-    """Return a nested list or array of 3 x 4 numbers as a pose (float64), without a last row, which must be 0 0 0 1."""
+    """Return 3 x 4 or 4 x 4 numbers, nested or in a row, as a pose (float64); a last row must be 0 0 0 1.
+
+    A matrix whose last column is 0 0 0 1 is written column by column.
+    """
     try:
         pose = torch.as_tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{where} is not a 4 x 4 matrix of numbers. Export the camera poses again.") from None
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
     if pose.shape not in ((3, 4), (4, 4)):
         shape = " x ".join(str(size) for size in pose.shape) or "a single number"
         raise InputError(f"{where} must be a 4 x 4 matrix, but it is {shape}. Export the camera poses again.")
-    if not (pose[3:] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().le(1e-3).all():
+    if not bool(torch.isfinite(pose).all()):
         raise InputError(
-            f"{where} does not end in the row 0 0 0 1. Make sure that the matrix is not transposed, and export the "
-            "camera poses again."
+            f"{where} holds NaN or infinity: this view has no pose. Remove it, or estimate the poses anew."
         )
+    last = pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if len(pose) == 4 and not _alike(pose[3], last) and _alike(pose[:, 3], last):
+        pose = pose.mT
+    if not _alike(pose[3:], last):
+        raise InputError(f"{where} does not end in the row 0 0 0 1. Export the camera poses again.")
     return pose[:3]
+
+
+def _alike(row: Tensor, wanted: Tensor) -> bool:
+    return bool((row - wanted).abs().le(1e-3).all())
 
 
 def check_scene(scene: SceneRecord, where: str) -> None:

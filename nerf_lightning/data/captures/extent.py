@@ -42,8 +42,8 @@ NEAR_MARGIN, FAR_MARGIN = 0.5, 2.0
 BOX_MARGIN = 0.1
 # Without sparse points, in units of the farthest camera's distance from the middle.
 NEAR_BLIND, FAR_CONTRACTED, LEAST_NEAR = 0.05, 16.0, 0.01
-# Cameras that stand closer together than this share of their coordinates stand at one place.
-ONE_PLACE = 1e-6
+# Cameras that stand closer together than this share of their coordinates, which may be a map's, stand at one place.
+ONE_PLACE = 1e-9
 # Of the cube that the ball of the cameras just holds.
 UNIT_BALL_HALF = 3**-0.5
 # The least cosine between a pixel's ray and the cameras' mean direction: at 0 it would never reach infinity in

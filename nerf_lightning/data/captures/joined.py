@@ -58,7 +58,7 @@ def joined(captures: Mapping[str, Scene], unseen: Collection[str], name: str) ->
         splits=_splits(captures, unseen),
         view_names=tuple(f"{name}/{view}" for name, scene in captures.items() for view in scene.view_names),
         background=first.background,
-        to_user=torch.eye(4),
+        to_user=torch.eye(4, dtype=torch.float64),
         space=first.space,
         capture_of=tuple(number for number, length in enumerate(lengths) for _ in range(length)),
         captures=names,

@@ -12,18 +12,18 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from nerf_lightning.data.captures.capture import Capture
-from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, usable
+from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, contents, usable
 from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
 from nerf_lightning.data.captures.known_depths import known_depths
+from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.decoding import read_photographs
-from nerf_lightning.data.pixels.images import ENDINGS, MaskColor, downscaled_size, image_size
+from nerf_lightning.data.pixels.decoding import UndecodableError, read_photographs, upright_size
+from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, image_size, orientation_of
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.files.links import is_there, require_inside
+from nerf_lightning.files.links import require_inside
 from nerf_lightning.files.trust import reading
-from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import points_from_user, poses_from_user, unit_of
@@ -31,6 +31,8 @@ from nerf_lightning.nerf.geometry.lens_checks import require_invertible
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
+MOST_PIXELS = 640
+"""Of the longer side of photographs whose size the user leaves open."""
 LARGEST_STRETCH = 0.01
 """Of width and height: how far a picture's scale may differ from one axis to the other."""
 
@@ -43,11 +45,12 @@ class CaptureReader(Reader):
 
     Args:
         root: the capture's folder.
-        downscale: whole factor by which the photographs shrink; focal lengths follow.
+        downscale: whole factor by which the photographs shrink; focal lengths follow. auto: so that their longer side
+            has at most 640 pixels, of which a few minutes on a CPU see enough.
         hold_every: the first and every k-th view after it are held out to judge by, where the format names no split.
         frames: keep the views whose names fit this pattern of * and ?; null keeps all.
-        masks: a folder below root with a mask for each photograph, of the same name below it (or with .png added, or
-            with .png for its ending). null: no masks, or those that the format names.
+        masks: a folder below root with masks, called like their photographs (or with .png added, or with .png for the
+            ending); a photograph without one is kept whole. null: no masks, or those that the format names.
         masks_keep: the colour of masks that counts, white or black; the other is left out.
         space: bounded (a box around the content), ndc (forward-facing), contracted (all of space), or auto.
         near: distance at which content may begin, in the user's units; null: from the capture.
@@ -58,13 +61,14 @@ class CaptureReader(Reader):
         background: what lies behind transparent pixels or the end of the scene: white, black, random or none. null:
             black; where a plain background was cut out, white_or_random, black_or_random or random, as its colour is.
         cache_dir: where decoded photographs are kept; null: the user's cache folder.
-        allow_outside: follow names and links that lead out of root; false refuses them, since they may be a stranger's.
+        allow_outside: follow names that lead out of root; false refuses them, since they may be a stranger's. Links
+            are followed always.
         verify: compare the contents of all files with what was decoded, not their times alone.
         name: the scene's name in reports.
     """
 
     root: str
-    downscale: int = 1
+    downscale: int | Literal["auto"] = 1
     hold_every: int = 8
     frames: str | None = None
     masks: str | None = None
@@ -97,42 +101,29 @@ class CaptureReader(Reader):
         self._check_settings()
         with reading(self.root):
             capture = self.capture()
-        capture = usable(self._wanted(capture))
+        capture = self._with_masks(as_calibrated(usable(self._wanted(capture))))
+        downscale = self._factor(capture)
+        capture, pixels = self._decoded(capture, downscale)
+        capture.left_out.say(len(capture.views))
         splits = self._splits(capture)
-        if self.masks_keep == "black" and not any(view.photograph.mask for view in capture.views):
-            raise InputError(
-                f"scene.masks_keep=black, and no photograph of {capture.source} has a mask. Say where they are with "
-                "scene.masks=FOLDER, or leave masks_keep out."
-            )
-        files = [image_size(view.photograph.path) for view in capture.views]
-        pixels = read_photographs(
-            [replace(view.photograph, mask_keeps=self.masks_keep) for view in capture.views],
-            self.downscale,
-            Path(self.cache_dir) if self.cache_dir else None,
-            self.verify,
-            f"Reading {Path(self.root).name}",
-        )
+        files = [upright_size(view.photograph) for view in capture.views]
         # Panoramas have no background, and a fisheye's picture has a dark rim.
         has_edge = capture.lens_model in ("pinhole", "radial_tangential")
         pixels, color = cut_out(pixels, self.name, self.cut_out and has_edge and self.background != "none")
-        cameras = cameras_of(capture, files, pixels, self.downscale)
+        cameras = cameras_of(capture, files, pixels, downscale)
         names = tuple(view.name for view in capture.views)
         require_invertible(cameras, names)
         space, reason = choose_space(self.space, cameras, capture, pixels.has_transparency)
         log.info("%s: space=%s, %s", self.name, space, reason)
-        if capture.left_out:
-            log.warning(
-                "%d photographs have no pose and are left out: %s", len(capture.left_out), listed(capture.left_out, 5)
-            )
         protocol = {
-            "downscale": str(self.downscale),
-            "filter": "none" if self.downscale == 1 else "area, premultiplied",
+            "downscale": str(downscale),
+            "filter": "none" if downscale == 1 else "area, premultiplied",
             "hold_every": str(self.hold_every),
             "frames": self.frames or "all",
         }
         remembered = MEMORISED if set(splits["train"]) & set(splits["test"]) else {}
         extent = extent_of(capture, cameras, space, self.near, self.far)
-        to_user = (capture.undo @ extent.to_user).float()
+        to_user = capture.undo @ extent.to_user
         depths = known_depths(capture, cameras)
         if depths is not None:
             depths = replace(depths, distance=(depths.distance / unit_of(extent.to_user)).float())
@@ -154,7 +145,7 @@ class CaptureReader(Reader):
             metres_per_unit=self.metres_per_unit,
             protocol=protocol | protocol_of(color) | remembered,
             truth=None,
-            left_out=capture.left_out,
+            left_out=capture.left_out.names,
         )
 
     def folder(self) -> Path:
@@ -163,33 +154,73 @@ class CaptureReader(Reader):
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
             raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
+        if folder.is_file():
+            return folder.parent
         if not os.path.isdir(folder):
             where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
             raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder
 
     def require_inside(self, path: Path, setting: str | None = None) -> None:
-        """Refuse what is really outside of the capture's folder and of the one that a setting names, unless allowed."""
+        """Refuse a name that leads out of the capture's folder and of the one that a setting names, unless allowed."""
         if not self.allow_outside:
             require_inside(path, self.folder(), setting)
 
-    def mask_of(self, name: str) -> Path | None:
-        """Return the mask of the photograph `name`, where masks are used; then each must have one."""
-        if self.masks is None:
-            return None
-        beside = self.folder() / self.masks / name
-        candidates = (beside, beside.with_name(beside.name + ".png"), beside.with_suffix(".png"))
-        for candidate in candidates:
-            if is_there(candidate):
-                self.require_inside(candidate, self.masks)
-                return candidate
-        raise InputError(
-            f"scene.masks={self.masks} holds no mask for {name}: neither {listed(candidates)} exists. Add it "
-            f"(all {self.masks_keep} keeps the whole photograph), or leave the view out with scene.frames."
+    def _with_masks(self, capture: Capture) -> Capture:
+        """Return the views with the masks of the folder `masks`; photographs that have none there are kept whole."""
+        masks: dict[str, Path] = {}
+        if self.masks is not None:
+            folder = self.folder() / self.masks
+            names = [view.name for view in capture.views]
+            masks = find_pictures(names, folder, folder, capture.source, say=False)
+            if not masks:
+                raise InputError(
+                    f"scene.masks={self.masks} holds no mask for any photograph of {capture.source}: {folder} holds "
+                    f"{contents(folder)}. A mask is called like its photograph ({names[0]}, with .png added, or with "
+                    ".png for its ending)."
+                )
+        views = tuple(
+            replace(view, photograph=replace(view.photograph, mask=masks.get(view.name, view.photograph.mask)))
+            for view in capture.views
         )
+        whole = [view.name for view in views if view.photograph.mask is None]
+        if len(whole) == len(views) and self.masks_keep == "black":
+            raise InputError(
+                f"scene.masks_keep=black, and no photograph of {capture.source} has a mask. Say where they are with "
+                "scene.masks=FOLDER, or leave masks_keep out."
+            )
+        if whole and len(whole) < len(views):
+            log.warning(
+                "%d of %d photographs have no mask and are kept whole: %s", len(whole), len(views), listed(whole, 3)
+            )
+        return replace(capture, views=views)
+
+    def _decoded(self, capture: Capture, downscale: int) -> tuple[Capture, PixelStore]:
+        """Return the pixels, and the capture without the views whose photograph or mask cannot be decoded."""
+        while True:
+            photographs = [replace(view.photograph, mask_keeps=self.masks_keep) for view in capture.views]
+            cache, label = Path(self.cache_dir) if self.cache_dir else None, f"Reading {Path(self.root).name}"
+            try:
+                return capture, read_photographs(photographs, downscale, cache, self.verify, label)
+            except UndecodableError as error:
+                names = [view.name for view in capture.views]
+                capture.left_out.faults |= {names[number]: fault for number, fault in error.faults.items()}
+                kept = [number for number in range(len(names)) if number not in error.faults]
+                capture.left_out.require_enough(len(kept))
+                capture = capture.some(kept)
+
+    def _factor(self, capture: Capture) -> int:
+        """Return by what the photographs shrink."""
+        if self.downscale != "auto":
+            return self.downscale
+        longest = max(max(image_size(view.photograph.path)) for view in capture.views)
+        factor = -(-longest // MOST_PIXELS)
+        log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
+        return factor
 
     def _check_settings(self) -> None:
-        check_step("downscale", self.downscale)
+        if self.downscale != "auto":
+            check_step("downscale", self.downscale)
         if self.hold_every < 2:
             raise InputError(f"scene.hold_every={self.hold_every} would leave nothing to learn from: give 2 or more.")
         if self.space not in get_args(Spaces):
@@ -222,14 +253,49 @@ class CaptureReader(Reader):
         splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
         names = [view.name for view in capture.views]
         splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
-        held = splits["val"] or splits["test"]
-        if not splits["train"] or not held:
-            raise InputError(
-                f"{capture.source} splits its views into {len(splits['train'])} to learn from and {len(held)} to judge "
-                "by; each needs at least one. Mend its lists, or remove them so that every "
-                f"{self.hold_every}th view is held out."
+        if splits["train"] and not (splits["val"] or splits["test"]):
+            log.warning(
+                "%s names no view to judge by that is there: every %dth is held out", capture.source, self.hold_every
             )
+            train, held = every_kth(splits["train"], self.hold_every)
+            return {"train": train, "val": held, "test": held}
+        if not splits["train"]:
+            raise InputError(
+                f"{capture.source} names no view to learn from that is there. Mend its lists, or remove them so that "
+                f"every {self.hold_every}th view is held out."
+            )
+        held = splits["val"] or splits["test"]
         return {"train": splits["train"], "val": held, "test": splits["test"] or held}
+
+
+def as_calibrated(capture: Capture) -> Capture:
+    """Return the capture with photographs turned where their EXIF tag says so and the camera's size fits that alone.
+
+    Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which.
+    """
+    views, turned = [], []
+    for view in capture.views:
+        orientation = orientation_of(view.photograph.path)
+        photograph = view.photograph
+        if orientation != 1:
+            turned.append(view.name)
+            width, height = image_size(photograph.path)
+            quarter = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
+            photograph = replace(photograph, upright=quarter)
+        views.append(replace(view, photograph=photograph))
+    if turned:
+        as_shown = sum(view.photograph.upright for view in views)
+        log.info(
+            "%s: %d of %d photographs are to be shown turned (EXIF orientation); by the cameras' sizes, %d are read "
+            "turned and the others as they are stored",
+            *(capture.source, len(turned), len(views), as_shown),
+        )
+    return replace(capture, views=tuple(views))
+
+
+def _fits(view: View, width: int, height: int) -> bool:
+    # A shrunk picture's size is rounded: allow a pixel on either side.
+    return abs(width / view.size[0] * view.size[1] / height - 1.0) <= LARGEST_STRETCH + 1.0 / min(width, height)
 
 
 def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
@@ -254,9 +320,7 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
     scales = []
     for view, (width, height) in zip(capture.views, files, strict=True):
         x, y = width / view.size[0], height / view.size[1]
-        # A shrunk picture's size is rounded: allow a pixel on either side.
-        slack = LARGEST_STRETCH + 1.0 / min(width, height)
-        if abs(x / y - 1.0) > slack:
+        if not _fits(view, width, height):
             raise InputError(
                 f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for "
                 f"{view.size[0]:g} x {view.size[1]:g}: the sides differ by other factors ({x:.3f} and {y:.3f}). The "
@@ -285,7 +349,4 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
 
 def picture_files(folder: Path) -> list[str]:
     """Return the names of the pictures in a folder and its subfolders, sorted as text."""
-    found = []
-    for base, _, names in walk(folder):
-        found += [(base / name).relative_to(folder).as_posix() for name in names if name.lower().endswith(ENDINGS)]
-    return sorted(name for name in found if not Path(name).name.startswith("."))
+    return sorted(path.relative_to(folder).as_posix() for path in pictures_below(folder))

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from nerf_lightning.data.pixels.images import (
 )
 from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixels.placement import num_bytes
-from nerf_lightning.data.pixels.store import in_threads
+from nerf_lightning.data.pixels.store import Result, in_threads
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
@@ -46,6 +46,22 @@ class Photograph:
     mask: Path | None = None
     """A grey picture of the same size, white (brighter than 127) and black."""
     mask_keeps: MaskColor = "white"
+    upright: bool = False
+    """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
+
+
+class UndecodableError(InputError):
+    """Photographs that cannot be decoded, or masks that do not fit them: by number, what is wrong with each."""
+
+    def __init__(self, faults: dict[int, str]):
+        super().__init__(next(iter(faults.values())))
+        self.faults = faults
+
+
+def upright_size(photograph: Photograph) -> tuple[int, int]:
+    """Return (width, height) in pixels as the photograph is read."""
+    width, height = image_size(photograph.path)
+    return (height, width) if photograph.upright else (width, height)
 
 
 def read_photographs(
@@ -91,6 +107,8 @@ def _key(photographs: Sequence[Photograph], downscale: int) -> str:
         for photograph in photographs
     ]
     settings = {"format": FORMAT, "downscale": downscale, "files": files}
+    if any(upright := [photograph.upright for photograph in photographs]):
+        settings["upright"] = upright
     kept = [photograph.mask_keeps for photograph in photographs]
     if "black" in kept:
         settings["masks_keep"] = kept
@@ -135,7 +153,8 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
 
     def decode(index: int) -> bool:
         photograph, size = photographs[index], sizes[index]
-        rgba = area_downscale(crop_to_multiple(read_rgba(photograph.path), downscale), downscale)
+        rgba = read_rgba(photograph.path, photograph.upright)
+        rgba = area_downscale(crop_to_multiple(rgba, downscale), downscale)
         _check_unchanged(rgba, size, photograph.path)
         start = int(ends[index]) - rgba.shape[0] * rgba.shape[1]
         with target.open("r+b") as file:
@@ -146,7 +165,7 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
                 file.write(_mask(photograph, size, downscale).data)
         return bool((rgba[..., 3] < 255).any())
 
-    transparent = in_threads(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
+    transparent = _each(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
     return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0, checksum=0)
 
 
@@ -155,8 +174,8 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
 
     def size(index: int) -> tuple[int, int]:
         path, mask = photographs[index].path, photographs[index].mask
-        width, height = image_size(path)
-        if mask is not None and image_size(mask) != (width, height):
+        width, height = upright_size(photographs[index])
+        if mask is not None and image_size(mask) not in ((width, height), image_size(path)):
             across, down = image_size(mask)
             raise InputError(
                 f"The mask {mask} has {across} x {down} pixels, but its photograph {path} has {width} x {height}. "
@@ -164,7 +183,24 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
             )
         return downscaled_size(width, height, downscale)
 
-    return in_threads(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
+    return _each(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
+
+
+def _each(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
+    """Return what `in_threads` does, and name all that are refused, not the first alone."""
+    faults: dict[int, str] = {}
+
+    def tried(index: int) -> Result | None:
+        try:
+            return work(index)
+        except InputError as error:
+            faults[index] = str(error)
+            return None
+
+    results = in_threads(tried, count, label, shown)
+    if faults:
+        raise UndecodableError(dict(sorted(faults.items())))
+    return [result for result in results if result is not None]
 
 
 def _mask(
@@ -172,7 +208,8 @@ def _mask(
 ) -> Bool[np.ndarray, "small_height small_width"]:
     if photograph.mask is None:
         return np.ones(size[::-1], dtype=np.bool_)
-    kept = whole_blocks(read_mask(photograph.mask, photograph.mask_keeps), downscale)
+    as_shown = photograph.upright and image_size(photograph.mask) != upright_size(photograph)
+    kept = whole_blocks(read_mask(photograph.mask, photograph.mask_keeps, as_shown), downscale)
     _check_unchanged(kept, size, photograph.mask)
     if not kept.any():
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""

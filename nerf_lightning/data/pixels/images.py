@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
@@ -28,6 +28,8 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Orientations that swap width and height."""
 KEEP_ABOVE = 127
 MaskColor = Literal["white", "black"]
 PIXELS_AT_ONCE = 1 << 16
@@ -87,27 +89,39 @@ def is_heic(path: Path) -> bool:
     return start[4:8] == b"ftyp" and start[8:12] in HEIC_KINDS
 
 
-def read_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
+def orientation_of(path: Path) -> int:
+    """Return how a picture is to be turned for show, by EXIF: 1 (as it is stored) to 8; 1 where nothing sound is said.
+
+    Of a PNG only what stands before its pixels is looked at.
+    """
+    with _opened(path) as image:
+        try:
+            exif = image.getexif() if image.format != "PNG" or "exif" in image.info else {}
+            turned = exif.get(ORIENTATION, 1)
+        except DECODER_ERRORS:
+            return 1
+    return turned if isinstance(turned, int) and 1 <= turned <= 8 else 1
+
+
+def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height width 4"]:
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
     Palettes and grey levels are expanded. Of 16 bits the upper byte is kept (less than one level off).
 
+    Args:
+        path: the file.
+        upright: turn the pixels as an EXIF tag says; false returns them as they are stored.
+
     Raises:
-        InputError: what `image_size` refuses, damaged or truncated, or turned by an EXIF tag.
+        InputError: what `image_size` refuses, or damaged or truncated.
     """
     with _opened(path) as image:
         try:
             image.load()
-            turned = image.getexif().get(ORIENTATION, 1)
+            if upright:
+                image = ImageOps.exif_transpose(image)
         except DECODER_ERRORS as error:
             raise InputError(_unreadable(path, error)) from error
-        if turned != 1:
-            raise InputError(
-                f"{path} carries the EXIF orientation {turned}: it is stored turned or mirrored, so its "
-                "camera may be that of the turned picture or of the stored one. If the cameras were estimated from "
-                "the pixels as they are stored, remove the tag alone (`exiftool -Orientation= FILE`); else turn the "
-                "pixels (`magick mogrify -auto-orient FILE`) and estimate the cameras anew."
-            )
         rgba = np.empty((image.height, image.width, 4), np.uint8)
         for rows in bands(*rgba.shape[:2]):  # several copies of the whole would be held at once
             part = image.crop((0, rows.start, image.width, rows.stop))
@@ -132,20 +146,25 @@ def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
             raise InputError(_unreadable(path, error)) from error
 
 
-def read_mask(path: Path, keep: MaskColor = "white") -> Bool[np.ndarray, "height width"]:
-    """Return which pixels a grey picture keeps: those brighter than 127 of 255 or, where black is kept, the others.
+def read_mask(path: Path, keep: MaskColor = "white", upright: bool = False) -> Bool[np.ndarray, "height width"]:
+    """Return which pixels a picture keeps: those brighter than 127 of 255 or, where black is kept, the others.
+
+    Where alpha, or red, is all that differs from pixel to pixel, it is the mask.
 
     Raises:
-        InputError: what `read_rgba` refuses, and pictures with colour or transparency.
+        InputError: what `read_rgba` refuses, and pictures with several channels that say different things.
     """
-    rgba = read_rgba(path)
-    grey = rgba[..., 0]
-    if (rgba[..., 1] != grey).any() or (rgba[..., 2] != grey).any() or (rgba[..., 3] < 255).any():
+    rgba = read_rgba(path, upright)
+    # Of red, green, blue and alpha, those that differ from pixel to pixel.
+    said = [rgba[..., channel] for channel in range(4) if np.ptp(rgba[..., channel])]
+    said = said or [rgba[..., 0]]
+    bright = [channel > KEEP_ABOVE for channel in said]
+    if any((channel != bright[0]).any() for channel in bright[1:]):
         raise InputError(
             f"The mask {path} has colours or transparent pixels, so which pixels it keeps is not clear. Save it as a "
             f"grey picture without alpha: {keep} is kept (scene.masks_keep), the other is left out."
         )
-    return grey > KEEP_ABOVE if keep == "white" else grey <= KEEP_ABOVE
+    return bright[0] if keep == "white" else ~bright[0]
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:

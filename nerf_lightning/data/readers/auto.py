@@ -1,40 +1,54 @@
-"""A capture of whatever format: the files in its folder tell which."""
+"""A capture of whatever format: the files in its folder, or in one just below or above, tell which."""
 
 import inspect
 import logging
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import contents
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
 from nerf_lightning.data.captures.reader import CaptureReader
-from nerf_lightning.data.pixels.images import image_size
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.readers.llff import LlffReader
+from nerf_lightning.data.readers.metashape import MetashapeReader
+from nerf_lightning.data.readers.neus import NeusReader
+from nerf_lightning.data.readers.polycam import PolycamReader
+from nerf_lightning.data.readers.text_poses import NerfPlusPlusReader, NsvfReader
 from nerf_lightning.data.readers.transforms import TransformsReader
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
-# The file that tells a format, how scene= names it, and who reads it. Where several are there, the first says more:
-# a COLMAP model has lenses and points, which poses_bounds.npy beside it lacks.
-FORMATS: tuple[tuple[str, str, type[Reader]], ...] = (
-    ("transforms_train.json", "blender", BlenderReader),
-    ("transforms.json", "transforms", TransformsReader),
-    ("sparse/0/cameras.bin", "colmap", ColmapReader),
-    ("sparse/0/cameras.txt", "colmap", ColmapReader),
-    ("sparse/cameras.bin", "colmap", ColmapReader),
-    ("sparse/cameras.txt", "colmap", ColmapReader),
-    ("poses_bounds.npy", "llff", LlffReader),
+READERS: tuple[type[Reader], ...] = (
+    *(BlenderReader, TransformsReader, ColmapReader, LlffReader),
+    *(PolycamReader, NeusReader, NsvfReader, NerfPlusPlusReader, MetashapeReader),
 )
-
-MOST_PIXELS = 640
-"""Of the longer side of photographs whose size the user leaves open."""
+"""Where a folder has the files of several, the first says more: a COLMAP model has lenses and points, which
+poses_bounds.npy beside it lacks."""
+PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0")
+"""Folders within a capture, whose parent is meant where one of them is given."""
+MOST_FOLDERS = 200
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Known:
+    """A folder whose format is known."""
+
+    folder: Path
+    file: str
+    """That tells the format."""
+    reader: type[Reader]
+
+    @property
+    def scene(self) -> str:
+        """How scene= names the format."""
+        return str(inspect.signature(self.reader).parameters["name"].default)
 
 
 @dataclass
@@ -44,12 +58,11 @@ class AutoReader(CaptureReader):
     Settings that are left as they are have the values that the format's own reader has.
 
     Args:
-        downscale: whole factor by which the photographs shrink; auto: so that their longer side has at most 640 pixels,
-            of which a few minutes on a CPU see enough.
+        images: the folder of the photographs below root; null: where the format has it.
     """
 
-    downscale: int | Literal["auto"] = 1  # type: ignore[assignment]
     name: str = "auto"
+    images: str | None = None
 
     def read(self) -> Scene:
         """Return the capture, as the format's own reader does.
@@ -57,7 +70,7 @@ class AutoReader(CaptureReader):
         Raises:
             InputError: no known format, a setting that the format does not have, or anything wrong with the files.
         """
-        return self._handy(self.reader()).read()
+        return self.reader().read()
 
     def capture(self) -> Capture:
         """Return what the format says, where it is one of photographs with their poses."""
@@ -72,34 +85,76 @@ class AutoReader(CaptureReader):
         Raises:
             InputError: no known format, or a setting that the format does not have.
         """
-        found = self.known_format(self.folder())
-        if found is None:
-            raise InputError(
-                f"{self.root} holds none of {listed(dict.fromkeys(file for file, _, _ in FORMATS))}; it holds "
-                f"{contents(self.folder())}. If these are photographs whose cameras nobody knows yet, use scene=photos."
-            )
-        file, scene, kind = found
-        log.info("%s: read as scene=%s, for it has %s", self.root, scene, file)
-        chosen = self._chosen() | {"root": self.root, "name": self.name}
-        refused = sorted(chosen.keys() - inspect.signature(kind).parameters.keys())
+        known = self._search()
+        root = self.root if known.folder == self.folder() else str(known.folder)
+        log.info("%s: read as scene=%s, for it has %s", root, known.scene, known.file)
+        chosen = self._chosen() | {"root": root, "name": self.name}
+        if not issubclass(known.reader, CaptureReader) and chosen.get("downscale") == "auto":
+            del chosen["downscale"]  # of renderings, which are small
+        refused = sorted(chosen.keys() - inspect.signature(known.reader).parameters.keys())
         if refused:
-            raise InputError(f"scene.{refused[0]}: scene={scene}, which {self.root} is, has no such setting. Leave it.")
-        return kind(**chosen)
+            raise InputError(
+                f"scene.{refused[0]}: scene={known.scene}, which {root} is, has no such setting. Leave it."
+            )
+        return known.reader(**chosen)
 
     @staticmethod
-    def known_format(folder: Path) -> tuple[str, str, type[Reader]] | None:
-        """Return which format's file is in a folder, how scene= names it, and its reader; None for no known one."""
-        return next((found for found in FORMATS if (folder / found[0]).is_file()), None)
+    def known_format(folder: Path) -> Known | None:
+        """Return what a folder itself is; None for no known format."""
+        for reader in READERS:
+            if (file := reader.found_in(folder)) is not None:
+                return Known(folder, file, reader)
+        return None
 
-    def _handy(self, reader: Reader) -> Reader:
-        if self.downscale != "auto" or not isinstance(reader, CaptureReader):
-            return reader
-        longest = max(max(image_size(view.photograph.path)) for view in reader.capture().views)
-        factor = -(-longest // MOST_PIXELS)
-        log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
-        return replace(reader, downscale=factor)
+    def _search(self) -> Known:
+        """Return what the folder is, or the one capture just below it, or the one that it is a part of."""
+        folder = self.folder()
+        if known := self.known_format(folder):
+            return known
+        below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+        found = [known for path in below[:MOST_FOLDERS] if (known := self.known_format(path))]
+        if not found and folder.name in PARTS and (known := self.known_format(folder.resolve().parent)):
+            found = [known]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            captures = listed((f"scene.root={known.folder}" for known in found), 4)
+            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {captures}.")
+        raise InputError(
+            f"{self.root} holds no capture of a format that is known here: it holds {contents(folder)}.{self._hint()} "
+            "If these are photographs whose cameras nobody knows yet, use scene=photos."
+        )
+
+    def _hint(self) -> str:
+        """Say what program has written the folder, where that is clear, and how its captures are read."""
+        folder = self.folder()
+        for files, words in OF_OTHERS:
+            if all(any(folder.glob(pattern)) for pattern in files):
+                return f" {words}"
+        return ""
 
     def _chosen(self) -> dict[str, Any]:
         """Return the settings that say something."""
         values = {field.name: (getattr(self, field.name), field.default) for field in fields(AutoReader)}
-        return {name: value for name, (value, default) in values.items() if value not in (default, "auto")}
+        return {name: value for name, (value, default) in values.items() if value != default}
+
+
+OF_OTHERS: tuple[tuple[tuple[str, ...], str], ...] = (
+    (
+        ("metadata.json", "rgb*"),
+        "It looks like an export of Record3D: convert it with nerfstudio (ns-process-data record3d), which writes a "
+        "transforms.json.",
+    ),
+    (("*.r3d",), "A .r3d file of Record3D is an archive: unpack it, and convert it with nerfstudio (ns-process-data)."),
+    (
+        ("*.csv",),
+        "If the csv file is RealityScan's (RealityCapture's) list of cameras, export its COLMAP format instead.",
+    ),
+    (("*.xmp",), "XMP files beside photographs are RealityScan's cameras: export its COLMAP format instead."),
+    (
+        ("ARWorldMap*",),
+        "It looks like a recording of ARKit: convert it to a transforms.json (nerfstudio reads several such apps).",
+    ),
+    (("*.glb", "*.zip"), "Kiri Engine's export for developers holds a transforms.json: unpack that one."),
+)
+"""Files of formats that are not read, and what to do with them."""

@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -16,6 +17,11 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, PixelStore, Sce
 
 class Reader(ABC):
     """Read a capture. The constructor only keeps its arguments; every file access happens in `read`."""
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it; formats that are not searched: None."""
+        return None
 
     @abstractmethod
     def read(self) -> Scene:
@@ -99,7 +105,7 @@ class GivenFrameReader(Reader):
             splits=splits,
             view_names=tuple(names),
             background=background_for(self.background, color, otherwise),
-            to_user=torch.eye(4),
+            to_user=torch.eye(4, dtype=torch.float64),
             metres_per_unit=metres_per_unit,
             protocol={"downscale": str(self.downscale)} | protocol | protocol_of(color),
             truth=None,

@@ -8,27 +8,27 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
 
-from nerf_lightning.data.captures.capture import Capture, View
-from nerf_lightning.data.captures.checks import check_step, contents, pose_from_matrix, usable
+from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
+from nerf_lightning.data.captures.checks import check_step, contents, usable
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.reader import cameras_of
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import ENDINGS, image_size
+from nerf_lightning.data.pixels.images import ENDINGS, read_rgba
+from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import GivenFrameReader
-from nerf_lightning.data.readers.frames import focal_of_angle, list_of_frames, path_of
-from nerf_lightning.files.json_files import keys_of, read_json
-from nerf_lightning.files.links import is_there, require_inside
+from nerf_lightning.data.readers.frames import FrameFile, views_of
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import LensModel, Scene
 
 FORMAT = "The Blender format"
+STEMS = ("transforms", "transform")
+OF_PHOTOGRAPHS = ("fl_x", "fl_y", "k1", "k2", "p1", "p2", "camera_model", "aabb_scale")
+"""Keys that renderings of the original format do not have."""
 SPLITS = ("train", "val", "test")
 HOLD_EVERY = 8
 
@@ -54,6 +54,12 @@ class BlenderReader(GivenFrameReader):
     metres_per_unit: float | None = None
     allow_outside: bool = False
     name: str = field(default="blender", kw_only=True)
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        path = _file_of(folder, "train")
+        return None if path is None or _is_photographed(path) else path.name
 
     def read(self) -> Scene:
         """Return the capture: the views of train, val and test in this order.
@@ -84,13 +90,13 @@ class BlenderReader(GivenFrameReader):
             splits["test"] = splits["val"]
             log.info("%s has no test split: the %d val views serve as test.", self.root, len(splits["val"]))
         pixels = read_pixels(paths, [(width, height)] * len(paths), self.downscale, f"Reading {Path(self.root).name}")
-        c2w = torch.stack([view.c2w for view in capture.views]).float()
-        focal = torch.tensor([[view.focal[0] / self.downscale] * 2 for view in capture.views])
-        cameras = pinhole_cameras(c2w, 1.0, width // self.downscale, height // self.downscale)
+        capture.left_out.say(len(capture.views))
+        files = [(width, height)] * len(paths)
+        cameras = cameras_of(capture, files, pixels, self.downscale)
         learnt = {paths[view] for view in splits["train"]}
         remembered = MEMORISED if any(paths[view] in learnt for view in splits["test"]) else {}
         return self.scene(
-            replace(cameras, focal=focal),
+            replace(cameras, c2w=cameras.c2w.float()),
             pixels,
             splits,
             [view.name for view in capture.views],
@@ -106,16 +112,34 @@ class BlenderReader(GivenFrameReader):
 
     def _capture(self) -> Capture:
         """Return the views of train, val and test; a split without a file, or without frames, has none."""
-        root = Path(self.root)
+        root = Path(self.root).expanduser()
+        root = root.parent if root.is_file() else root
         if not os.path.isdir(root):
             raise InputError(f"The folder {root} does not exist. Set scene.root to the capture's folder.")
-        files = {split: root / f"transforms_{split}.json" for split in SPLITS}
-        if not files["train"].is_file():
+        files = {split: _file_of(root, split) for split in SPLITS}
+        if files["train"] is None:
             raise InputError(
-                f"{files['train']} does not exist; the folder holds {contents(root)}. "
+                f"{root / 'transforms_train.json'} does not exist; the folder holds {contents(root)}. "
                 "Set scene.root to the folder that holds transforms_train.json."
             )
-        views = {split: self._views(path, split) if path.is_file() else [] for split, path in files.items()}
+        left_out = LeftOut(str(files["train"]))
+        views: dict[str, list[View]] = {split: [] for split in SPLITS}
+        lenses = set[LensModel]()
+        for split, path in files.items():
+            if path is None:
+                continue
+            skip = (self.skip or {}).get(split, 1)
+            for found in views_of(FrameFile.read(path, FORMAT), root, self.allow_outside, left_out, skip):
+                name = found.name.replace("\\", "/")
+                name = (
+                    Path(name).with_suffix("").as_posix() if name.lower().endswith(ENDINGS) else Path(name).as_posix()
+                )
+                views[split].append(replace(found.view, name=name))
+                lenses.add(found.lens_model)
+        left_out.require_enough(sum(map(len, views.values())))
+        lens_model = common_lens_model(lenses or {"pinhole"})
+        if lens_model is None:
+            raise InputError(f"{root} mixes lenses of several kinds ({listed(sorted(lenses))}). Split the capture.")
         train, val, test = ([view.photograph.path for view in views[split]] for split in SPLITS)
         kept = set(apart(train, val, test, lambda image: image.name, self.root))
         views["train"] = [view for view in views["train"] if view.photograph.path in kept]
@@ -123,36 +147,33 @@ class BlenderReader(GivenFrameReader):
         named = [replace(view, name=name) for view, name in zip(chain(*views.values()), names, strict=True)]
         numbers = iter(range(len(named)))
         splits = {split: tuple(next(numbers) for _ in views[split]) for split in SPLITS}
-        return Capture(views=tuple(named), source=root, splits=splits)
+        return Capture(
+            views=tuple(named), source=files["train"], lens_model=lens_model, splits=splits, left_out=left_out
+        )
 
-    def _views(self, path: Path, split: str) -> list[View]:
-        """Return the views of a file, whose images lie relative to its folder; their names are the file's."""
-        content = read_json(path)
-        _, entries = keys_of(content, ("camera_angle_x", "frames"), str(path), FORMAT)
-        found: list[tuple[Path, str, Float[Tensor, "3 4"]]] = []
-        for index, entry in list(enumerate(list_of_frames(entries, path)))[:: (self.skip or {}).get(split, 1)]:
-            where = f"{path}: frames[{index}]"
-            name, matrix = keys_of(entry, ("file_path", "transform_matrix"), where, FORMAT)
-            # Only known endings count: the original files leave ".png" out, and a name may hold a dot of its own.
-            name = path_of(name, "file_path", where)
-            image = Path(name if name.lower().endswith(ENDINGS) else name + ".png")
-            pose = pose_from_matrix(matrix, f"{where} ({name}): transform_matrix")
-            found.append((path.parent / image, image.with_suffix("").as_posix(), pose))
-        absent = [image for image, _, _ in found if not is_there(image)]
-        if absent:
-            raise InputError(
-                f"{path} names {len(absent)} image(s) that do not exist: {listed(absent)}. Copy them there, "
-                "or remove their frames from the file."
-            )
-        if not self.allow_outside:
-            for inner in (path, *(image for image, _, _ in found)):
-                require_inside(inner, Path(self.root))
-        views = []
-        for image, name, c2w in found:
-            width, height = map(float, image_size(image))
-            focal = focal_of_angle(content, "x", width, str(path))
-            views.append(View(name, Photograph(image), c2w, (focal, focal), (width / 2, height / 2), (width, height)))
-        return views
+
+def _file_of(root: Path, split: str) -> Path | None:
+    return next((path for stem in STEMS if (path := root / f"{stem}_{split}.json").is_file()), None)
+
+
+def _is_photographed(path: Path) -> bool:
+    """Tell whether a file lists photographs, as instant-ngp's do, and not renderings of the original format.
+
+    Photographs have a lens, or opaque pictures without one colour at all four corners.
+    """
+    file = FrameFile.read(path, FORMAT)
+    first = file.frames[0] if file.frames and isinstance(file.frames[0], dict) else {}
+    if any(key in {**file.content, **first} for key in OF_PHOTOGRAPHS):
+        return True
+    seen = views_of(file, path.parent, False, LeftOut(str(path)), max(1, len(file.frames)))
+    if not seen:
+        return False
+    try:
+        picture = read_rgba(seen[0].view.photograph.path)
+    except InputError:
+        return False
+    corners = picture[:: picture.shape[0] - 1 or 1, :: picture.shape[1] - 1 or 1].reshape(-1, 4).astype(int)
+    return bool((picture[..., 3] == 255).all() and np.ptp(corners, axis=0).max() > 2 * TOLERANCE)
 
 
 def _one_size(capture: Capture) -> tuple[int, int]:

@@ -1,8 +1,10 @@
 """COLMAP reconstructions: a model in `sparse/0` (or `sparse`), binary or text, beside a folder of photographs."""
 
+import logging
+import math
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +15,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.colmap_files import (
     CURE,
@@ -23,28 +27,42 @@ from nerf_lightning.data.readers.colmap_files import (
     ColmapPoints,
     TextFiles,
 )
-from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.data.readers.ply_points import read_ply_points
+from nerf_lightning.files.links import is_absolute
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
+from nerf_lightning.nerf.geometry.poses import from_opencv_axes, rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import LensModel
 
 # Which of its parameters are fx, fy, cx, cy, and which k1, k2, k3, k4, p1, p2; -1: none.
+NONE = (-1, -1, -1, -1, -1, -1)
 LAYOUTS: dict[str, tuple[LensModel, tuple[int, ...], tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": ("pinhole", (0, 0, 1, 2), (-1, -1, -1, -1, -1, -1)),
-    "PINHOLE": ("pinhole", (0, 1, 2, 3), (-1, -1, -1, -1, -1, -1)),
+    "SIMPLE_PINHOLE": ("pinhole", (0, 0, 1, 2), NONE),
+    "PINHOLE": ("pinhole", (0, 1, 2, 3), NONE),
     "SIMPLE_RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
     "RADIAL": ("radial_tangential", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
     "OPENCV": ("radial_tangential", (0, 1, 2, 3), (4, 5, -1, -1, 6, 7)),
     "OPENCV_FISHEYE": ("fisheye", (0, 1, 2, 3), (4, 5, 6, 7, -1, -1)),
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, -1, -1, -1, -1, -1)),
     "RADIAL_FISHEYE": ("fisheye", (0, 0, 1, 2), (3, 4, -1, -1, -1, -1)),
+    "SIMPLE_FISHEYE": ("fisheye", (0, 0, 1, 2), NONE),
+    "FISHEYE": ("fisheye", (0, 1, 2, 3), NONE),
+    "FULL_OPENCV": ("radial_tangential", (0, 1, 2, 3), (4, 5, 8, -1, 6, 7)),
+    "THIN_PRISM_FISHEYE": ("fisheye", (0, 1, 2, 3), (4, 5, 8, 9, -1, -1)),
+    "EQUIRECTANGULAR": ("equirectangular", (0, 1, 0, 1), NONE),
 }
+ONLY_WITHOUT = {"FULL_OPENCV": (9, 10, 11), "THIN_PRISM_FISHEYE": (6, 7, 10, 11)}
+"""Parameters that must be 0 where a model is read as one of ours: rational, tangential and thin-prism terms."""
+MODEL_FOLDERS = ("sparse", "", "colmap/sparse", "colmap", "colmap_text", "distorted/sparse")
+"""Where models lie below a capture's folder, or in folders of these, the likeliest first."""
 FILES = ("cameras", "images", "points3D")
 KINDS: dict[str, BinaryFiles | TextFiles] = {".bin": BinaryFiles(), ".txt": TextFiles()}
 NO_POINTS = ColmapPoints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2), np.int64))
+PLY = "points3D.ply"
 TOLERANCE = 1e-4
 """Relative and absolute, to which a model and its twin in text agree: few digits may have been written."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -62,79 +80,123 @@ class ColmapReader(CaptureReader):
     """Read a COLMAP model, binary or text, with one camera for all photographs or one for each.
 
     Args:
-        images: the folder of the photographs below root; a shrunk copy such as images_4 will do.
+        images: the folder of the photographs below root; a shrunk copy such as images_4 will do. null: images, input or
+            another usual one, whose files the model's names fit.
+        model: the folder of the model below root. null: where models usually lie, the one with most photographs.
     """
 
     name: str = "colmap"
-    images: str = "images"
+    images: str | None = None
+    model: str | None = None
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the model by which this format is known, where a folder has one."""
+        found = models_in(folder)
+        return found[0].relative_to(folder).as_posix() if found else None
 
     def capture(self) -> Capture:
         """Return the registered photographs, in order of their names."""
         root = self.folder()
-        folder = find_model(root)
-        for path in (folder / f"{name}{ending}" for name in FILES for ending in KINDS):
-            if path.is_file():
-                self.require_inside(path)
+        folder = self._model(root)
         model = read_model(folder)
-        pictures = root / self.images
-        if not os.path.isdir(pictures):
-            raise InputError(
-                f"{pictures} does not exist, and the model's photographs are looked for there. Set scene.images to "
-                f"their folder below {root}."
-            )
-        self.require_inside(pictures, self.images)
-        lost = [image.name for image in model.images if not is_there(pictures / image.name)]
-        if lost:
-            raise InputError(_absent(lost, pictures, folder, len(model.images)))
-        lens_model = _lens_model({model.cameras[image.camera].model for image in model.images}, folder)
-        registered = {image.name for image in model.images}
+        names, left_out = [image.name for image in model.images], LeftOut(str(folder))
+        where = root if self.images is None else root / self.images
+        if not os.path.isdir(where):
+            raise InputError(f"{where} does not exist. Set scene.images to the photographs' folder below {root}.")
+        usual = [where] if self.images else [root / name for name in (*_beside(folder, root), *PICTURE_FOLDERS)]
+        pictures = next((place for place in usual if os.path.isdir(place)), where)
+        files = find_pictures(names, pictures, where, folder, self.allow_outside)
+        views, kept = [], []
+        for image in model.images:
+            with left_out.unless_usable(image.name):
+                if image.name not in files:
+                    raise InputError(_absent(image.name, where, folder))
+                camera = model.cameras[image.camera]
+                _require_known(camera, folder)
+                views.append(_view(image, camera, files[image.name]))
+                kept.append(image)
+        left_out.require_enough(len(views))
+        lens_model = _lens_model({model.cameras[image.camera].model for image in kept}, folder)
+        taken = {view.photograph.path for view in views}
+        base = os.path.commonpath([path.parent for path in taken])
+        others = [path for path in pictures_below(Path(base)) if path not in taken and path.stem not in left_out.faults]
+        left_out.without_pose = tuple(path.relative_to(base).as_posix() for path in others) if self._own(base) else ()
         return Capture(
-            views=tuple(self._view(image, model.cameras[image.camera], pictures) for image in model.images),
+            views=tuple(views),
             source=folder,
             lens_model=lens_model,
             points=torch.from_numpy(model.points.positions),
             point_errors=torch.from_numpy(model.points.errors),
-            tracks=torch.from_numpy(_tracks(model)),
-            left_out=tuple(name for name in picture_files(pictures) if name not in registered),
+            tracks=torch.from_numpy(_tracks(kept, model.points)),
+            left_out=left_out,
         )
 
-    def _view(self, image: ColmapImage, camera: ColmapCamera, pictures: Path) -> View:
-        _, pinhole, lens = LAYOUTS[camera.model]
-        fx, fy, cx, cy = (camera.params[place] for place in pinhole)
-        k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
-        path = pictures / image.name
-        self.require_inside(path, self.images)
-        return View(
-            name=image.name,
-            photograph=Photograph(path, self.mask_of(image.name)),
-            c2w=_c2w(image),
-            focal=(fx, fy),
-            center=(cx, cy),
-            size=(float(camera.width), float(camera.height)),
-            lens=(k1, k2, k3, k4, p1, p2),
-        )
+    def _own(self, folder: str) -> bool:
+        """Tell whether a folder is one of photographs, and not one that holds all kinds of pictures."""
+        return Path(folder) != self.folder()
+
+    def _model(self, root: Path) -> Path:
+        if self.model is not None:
+            return root / self.model
+        found = models_in(root)
+        if not found:
+            raise InputError(
+                f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in {listed(MODEL_FOLDERS, 9)}, "
+                "or in the folder itself. Point scene.root at the folder above sparse/, or make a model with "
+                "nerf poses images=DIR."
+            )
+        if len(found) > 1:
+            log.info(
+                "%s: of %d models the one with most photographs is read; scene.model=FOLDER reads another (%s)",
+                *(found[0], len(found), listed((path.relative_to(root) for path in found[1:]), 3)),
+            )
+        return found[0]
 
 
-def _tracks(model: ColmapModel) -> Int[ndarray, "seen 2"]:
-    """Return which point was seen in which photograph, by their rows; photographs that the model lacks are left out."""
-    numbers = np.array([image.number for image in model.images])
+def _view(image: ColmapImage, camera: ColmapCamera, path: Path) -> View:
+    _, pinhole, lens = LAYOUTS[camera.model]
+    fx, fy, cx, cy = (camera.params[place] for place in pinhole)
+    k1, k2, k3, k4, p1, p2 = (camera.params[place] if place >= 0 else 0.0 for place in lens)
+    if camera.model == "EQUIRECTANGULAR":  # its parameters are its size; pixels per radian
+        fx, fy, cx, cy = fx / (2 * math.pi), fy / math.pi, fx / 2, fy / 2
+    return View(
+        name=image.name,
+        photograph=Photograph(path),
+        c2w=_c2w(image),
+        focal=(fx, fy),
+        center=(cx, cy),
+        size=(float(camera.width), float(camera.height)),
+        lens=(k1, k2, k3, k4, p1, p2),
+    )
+
+
+def _beside(model: Path, root: Path) -> tuple[str, ...]:
+    """Return the photographs' folder that belongs to a model's, before the usual ones."""
+    return ("input",) if "distorted" in model.relative_to(root).parts else ()
+
+
+def _tracks(images: Sequence[ColmapImage], points: ColmapPoints) -> Int[ndarray, "seen 2"]:
+    """Return which point was seen in which photograph, by their rows; other photographs are left out."""
+    if not images:
+        return np.zeros((0, 2), np.int64)
+    numbers = np.array([image.number for image in images])
     order = np.argsort(numbers)
-    point, seen = model.points.tracks.T
+    point, seen = points.tracks.T
     row = np.searchsorted(numbers[order], seen).clip(max=len(numbers) - 1)
     known = numbers[order][row] == seen
     return np.stack([point[known], order[row[known]]], axis=1)
 
 
-def _absent(lost: list[str], pictures: Path, folder: Path, count: int) -> str:
-    if any(is_absolute(name) for name in lost):
+def _absent(name: str, pictures: Path, folder: Path) -> str:
+    if is_absolute(name):
         return (
-            f"The model in {folder} names photographs by absolute paths of another machine: {listed(lost, cap=3)}. "
-            "Make the names relative to the folder of the photographs (reconstruct with that folder as COLMAP's "
-            "image_path)."
+            f"The model in {folder} names photographs by absolute paths of another machine: {name}. No picture below "
+            f"{pictures} fits its end. Copy the photographs there, or set scene.images to their folder."
         )
     return (
-        f"{pictures} lacks {len(lost)} of the {count} photographs of the model in {folder}: {listed(lost)}. Copy them "
-        "there, or set scene.images to the folder that has them."
+        f"{pictures} lacks the photograph {name} of the model in {folder}. Copy it there, or set scene.images to the "
+        "folder that has it."
     )
 
 
@@ -143,35 +205,47 @@ def _c2w(image: ColmapImage) -> Float[Tensor, "3 4"]:
     rotation = rotation_from_quaternion(torch.tensor(image.rotation, dtype=torch.float64))
     translation = torch.tensor(image.translation, dtype=torch.float64)
     center = -rotation.mT @ translation
-    return torch.cat([rotation.mT * torch.tensor([1.0, -1.0, -1.0]), center[:, None]], dim=-1)
+    return from_opencv_axes(torch.cat([rotation.mT, center[:, None]], dim=-1))
+
+
+def _require_known(camera: ColmapCamera, folder: Path) -> None:
+    """Refuse a lens that ours are not, and one that ours are only without some of its terms."""
+    unknown = [camera.params[place] for place in ONLY_WITHOUT.get(camera.model, ())]
+    if camera.model in LAYOUTS and not any(unknown):
+        return
+    terms = " with terms that ours do not have" if camera.model in LAYOUTS else ""
+    raise InputError(
+        f"{folder} uses the camera model {camera.model}{terms}, whose lens is not known here; known are "
+        f"{listed(LAYOUTS, len(LAYOUTS))}. Undistort the photographs with `colmap image_undistorter`, or reconstruct "
+        "with OPENCV (or OPENCV_FISHEYE)."
+    )
 
 
 def _lens_model(used: set[str], folder: Path) -> LensModel:
-    unknown = sorted(used - LAYOUTS.keys())
-    if unknown:
-        raise InputError(
-            f"{folder} uses the camera model {listed(unknown)}, whose lens is not known here; known are "
-            f"{listed(LAYOUTS)}. Undistort the photographs with `colmap image_undistorter`, or reconstruct with "
-            "OPENCV (or OPENCV_FISHEYE)."
-        )
     lens_model = common_lens_model({LAYOUTS[name][0] for name in used})
     if lens_model is None:
         raise InputError(
-            f"{folder} mixes fisheye lenses with others ({listed(sorted(used))}), and a scene has one kind. Undistort "
-            "the photographs with `colmap image_undistorter`, or split the capture."
+            f"{folder} mixes fisheye lenses or panoramas with others ({listed(sorted(used))}), and a scene has one "
+            "kind. Undistort the photographs with `colmap image_undistorter`, or split the capture."
         )
     return lens_model
 
 
-def find_model(root: Path) -> Path:
-    """Return the folder of the model in a capture, which must be `sparse/0`, `sparse`, or the folder itself."""
-    for folder in (root / "sparse" / "0", root / "sparse", root):
-        if any((folder / f"cameras{ending}").is_file() for ending in KINDS):
-            return folder
-    raise InputError(
-        f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in sparse/0, in sparse, or in the "
-        "folder itself. Point scene.root at the folder above sparse/, or make a model with nerf poses images=DIR."
-    )
+def models_in(root: Path) -> list[Path]:
+    """Return the folders of the models of a capture, of the first place that has any, that with most images first."""
+    for place in MODEL_FOLDERS:
+        folder = root / place
+        below = sorted(path for path in folder.iterdir() if path.is_dir()) if place and folder.is_dir() else []
+        found = [path for path in (*below, folder) if any((path / f"cameras{e}").is_file() for e in KINDS)]
+        if found:
+            return sorted(found, key=_number_of_images, reverse=True)
+    return []
+
+
+def _number_of_images(folder: Path) -> int:
+    """Return about how many photographs a model has, from the size of its list; 0 where there is none."""
+    sizes = [path.stat().st_size for ending in KINDS if (path := folder / f"images{ending}").is_file()]
+    return max(sizes, default=0)
 
 
 def read_model(folder: Path) -> ColmapModel:
@@ -202,6 +276,8 @@ def _read_kind(folder: Path, ending: str) -> ColmapModel:
         raise InputError(f"{cameras_path} holds {listed(twice)} more than once. {CURE}")
     images = sorted(files.images(images_path), key=lambda image: image.name)
     points = files.points(points_path) if points_path.exists() else NO_POINTS
+    if points is NO_POINTS and (folder / PLY).is_file():
+        points = read_ply_points(folder / PLY)
     return ColmapModel({camera.number: camera for camera in cameras}, tuple(images), points)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.regular import open_regular
+from nerf_lightning.files.regular import encoding_of, open_regular
 from nerf_lightning.messages.errors import InputError
 
 MODELS = {
@@ -33,6 +33,13 @@ MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
 """COLMAP's numbers of camera models, with their names and counts of parameters."""
 COUNTS = dict(MODELS.values())
@@ -232,7 +239,10 @@ class TextFiles:
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
     """Return each line with where it stands, one at a time: a file of empty lines is small on the disk alone."""
     try:
-        with open_regular(path, MOST_BYTES, CURE) as binary, io.TextIOWrapper(binary, "utf-8", newline="\n") as file:
+        with (
+            open_regular(path, MOST_BYTES, CURE) as binary,
+            io.TextIOWrapper(binary, encoding_of(binary), newline="\n") as file,
+        ):
             for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE + 1), ""), start=1):
                 if len(line) > LONGEST_LINE:
                     raise InputError(f"{path}, line {number} has more than {LONGEST_LINE:,} characters. {CURE}")

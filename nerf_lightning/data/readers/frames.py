@@ -1,14 +1,24 @@
-"""The frames of json files, in the flavours of Blender, nerfstudio and instant-ngp: paths, poses and intrinsics.
+"""The frames of json files, in the flavours of Blender, nerfstudio and instant-ngp: pictures, poses and intrinsics.
 
-`settings` are a frame's keys over those at the file's top. What is read here is numbers; whether they make a camera is
-judged by `captures.checks`.
+`settings` are a frame's keys over those at the file's top; a key that is null is one that is not there. What is read
+here is numbers; whether they make a camera is judged by `captures.checks`.
 """
 
+import logging
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.captures.capture import View
+from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import find_pictures
+from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.images import ENDINGS, image_size
 from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.json_files import keys_of, read_json
+from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
@@ -17,21 +27,121 @@ from nerf_lightning.nerf.types.scene import LensModel
 LENSES: dict[str, LensModel] = {
     "PINHOLE": "pinhole",
     "SIMPLE_PINHOLE": "pinhole",
+    "PERSPECTIVE": "radial_tangential",
     "SIMPLE_RADIAL": "radial_tangential",
     "RADIAL": "radial_tangential",
     "OPENCV": "radial_tangential",
+    "FULL_OPENCV": "radial_tangential",
     "OPENCV_FISHEYE": "fisheye",
+    "FISHEYE": "fisheye",
+    "SIMPLE_FISHEYE": "fisheye",
+    "SIMPLE_RADIAL_FISHEYE": "fisheye",
+    "RADIAL_FISHEYE": "fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+RATIONAL = ("k4", "k5", "k6")
+"""Of FULL_OPENCV: what the radial distortion is divided by."""
+FORMAT = "A transforms.json of nerfstudio or instant-ngp"
+
+log = logging.getLogger(__name__)
 
 
-def list_of_frames(frames: object, path: Path) -> list[Any]:
-    """Return the frames of a file; refuse no list, and more than a person has agreed to."""
-    if not isinstance(frames, list):
-        raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
-    require_within("views", len(frames), str(path), "views")
-    return frames
+@dataclass(frozen=True)
+class FrameFile:
+    """A json file with frames."""
+
+    path: Path
+    content: dict[str, Any]
+    frames: list[Any]
+
+    @classmethod
+    def read(cls, path: Path, wanted_by: str = FORMAT) -> "FrameFile":
+        """Return the content of a file; `InputError` refuses one without a list of frames."""
+        content = read_json(path)
+        (frames,) = keys_of(content, ("frames",), str(path), wanted_by)
+        if not isinstance(frames, list):
+            raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
+        require_within("views", len(frames), str(path), "views")
+        times = {repr(frame["time"]) for frame in frames if isinstance(frame, dict) and "time" in frame}
+        if len(times) > 1:
+            log.warning("%s: time differs between frames, and the scene is taken as static: what moves blurs", path)
+        return cls(path, {key: value for key, value in content.items() if value is not None}, frames)
+
+
+@dataclass(frozen=True)
+class FoundFrame:
+    """A frame whose picture is there."""
+
+    name: str
+    """Of the picture, as the file has it."""
+    settings: dict[str, Any]
+    view: View
+    lens_model: LensModel
+
+
+def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, every: int = 1) -> list[FoundFrame]:
+    """Return the views of a file, and leave out those that cannot be used.
+
+    Args:
+        file: what lists them.
+        root: the capture's folder.
+        outside: whether names may lead out of it.
+        left_out: takes the others.
+        every: take every k-th frame.
+    """
+    named: list[tuple[str, str, Any]] = []
+    for index, frame in list(enumerate(file.frames))[::every]:
+        where = f"{file.path}: frames[{index}]"
+        with left_out.unless_usable(f"frames[{index}]"):
+            name, _ = keys_of(frame, ("file_path", "transform_matrix"), where, FORMAT)
+            named.append((where, path_of(name, "file_path", where), frame))
+    pictures = find_pictures([name for _, name, _ in named], file.path.parent, root, file.path, outside)
+    found = []
+    for where, name, frame in named:
+        with left_out.unless_usable(name):
+            if name not in pictures:
+                raise InputError(_absent(file.path, root, where, name))
+            found.append(_found(file, f"{where} ({name})", name, frame, pictures[name]))
+    return found
+
+
+def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], picture: Path) -> FoundFrame:
+    settings = file.content | {key: value for key, value in frame.items() if value is not None}
+    lens_model, lens = lens_of(settings, where)
+    stored_width, stored_height = image_size(picture)
+    # The intrinsics may be those of another size.
+    width, height = number_of(settings, "w", where, stored_width), number_of(settings, "h", where, stored_height)
+    focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
+    folder = file.path.parent
+    view = View(
+        name=picture.relative_to(folder).as_posix() if picture.is_relative_to(folder) else picture.name,
+        photograph=Photograph(picture),
+        c2w=pose_from_matrix(settings["transform_matrix"], f"{where}: transform_matrix"),
+        focal=focal(settings, width, height, where),
+        center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),
+        size=(width, height),
+        lens=lens,
+    )
+    return FoundFrame(name, settings, view, lens_model)
+
+
+def _absent(path: Path, root: Path, where: str, name: str) -> str:
+    named = path.parent / name.replace("\\", "/")
+    if is_there(named):
+        return (
+            f"{where}: file_path is {name}, which leads out of the capture's folder {root}: it may be a stranger's. If "
+            "this capture is yours, add scene.allow_outside=true; else copy the picture into the folder."
+        )
+    if is_absolute(name):
+        return (
+            f"{where}: file_path is {name}, an absolute path of another machine, and no picture below {root} fits its "
+            "end. Copy the pictures there."
+        )
+    return (
+        f"{where}: the image {named} does not exist (with none of the endings {', '.join(ENDINGS)} either). Copy it "
+        "there, or remove its frame from the file."
+    )
 
 
 def path_of(name: object, key: str, where: str) -> str:
@@ -109,14 +219,19 @@ def lens_of(settings: dict[str, Any], where: str) -> tuple[LensModel, tuple[floa
     k1, k2, k3, k4, p1, p2 = (number_of(settings, key, where, 0.0) for key in COEFFICIENTS)
     lens = (k1, k2, k3, k4, p1, p2)
     model = settings.get("camera_model", "OPENCV_FISHEYE" if settings.get("is_fisheye") else "OPENCV")
-    kind = LENSES.get(model) if isinstance(model, str) else None
+    kind = LENSES.get(model.strip().upper()) if isinstance(model, str) else None
     if kind is None:
         raise InputError(
-            f"{where} has the camera_model {model!r}; known are {listed(LENSES)}. Undistort the photographs first, or "
-            "export them as perspective pictures."
+            f"{where} has the camera_model {model!r}; known are {listed(LENSES, len(LENSES))}. Undistort the "
+            "photographs first, or export them as perspective pictures."
         )
     if kind in ("pinhole", "equirectangular") and any(lens):
         raise InputError(
             f"{where} has the camera_model {model} and distortion coefficients. Remove the one or the other."
+        )
+    if str(model).upper() == "FULL_OPENCV" and any(number_of(settings, key, where, 0.0) for key in RATIONAL):
+        raise InputError(
+            f"{where} has the camera_model {model} with k4, k5 or k6, which divide the distortion and are not known "
+            "here. Calibrate with OPENCV, or undistort the photographs."
         )
     return ("pinhole" if kind == "radial_tangential" and not any(lens) else kind), lens

@@ -1,8 +1,11 @@
-"""The LLFF format: `poses_bounds.npy` beside folders of photographs (images, images_2, images_4, images_8)."""
+"""The LLFF format: `poses_bounds.npy` beside folders of photographs (images, or shrunk ones such as images_4)."""
 
+import logging
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,17 +14,25 @@ from numpy import ndarray
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import contents
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.images import ENDINGS
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import HEADER_BYTES, array_header
-from nerf_lightning.files.regular import open_regular
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.files.regular import open_regular, read_text
+from nerf_lightning.messages.errors import InputError, require_one_of
+from nerf_lightning.messages.escaping import listed
 
+FILE = "poses_bounds.npy"
+JPEG = (".jpg", ".jpeg")
 COLUMNS = 17
 MOST_BYTES = 1 << 28
 """A hundred thousand views take a twentieth."""
 CURE = "Make it again with LLFF's imgs2poses, or read the COLMAP model instead (scene=colmap)."
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -29,47 +40,94 @@ class LlffReader(CaptureReader):
     """Read an LLFF capture. Rows belong to the photographs in order of their names, sorted as text.
 
     Args:
-        images: the folder of photographs below root; null takes the least shrunk of images, images_2, images_4 and
-            images_8 that is there.
+        images: the folder of photographs below root; null takes the first of images, image, rgb, input, root itself and
+            the shrunk images_2, images_4 and images_8 that has pictures.
+        order: how names are sorted: as text, as imgs2poses does it, or by the numbers in them.
     """
 
     name: str = "llff"
     images: str | None = None
+    order: Literal["text", "numbers"] = "text"
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        return FILE if (folder / FILE).is_file() else None
 
     def capture(self) -> Capture:
         """Return all views with their bounds."""
         root = self.folder()
-        path = root / "poses_bounds.npy"
-        self.require_inside(path)
+        path = root / FILE
         rows = _rows(path)
-        asked = [self.images] if self.images else ["images", "images_2", "images_4", "images_8"]
-        pictures = next((root / name for name in asked if os.path.isdir(root / name)), None)
-        if pictures is None:
-            raise InputError(f"{root} has no folder {' or '.join(asked)} with the photographs. Set scene.images to it.")
-        self.require_inside(pictures, self.images)
-        names = picture_files(pictures)
+        asked = [self.images] if self.images else PICTURE_FOLDERS
+        found = {root / name: _pictures_in(root / name) for name in asked}
+        folder = next((folder for folder, names in found.items() if names), None)
+        if folder is None:
+            raise InputError(f"{root} has no photographs in {listed(asked, 9)}. Set scene.images to their folder.")
+        names, left_out = found[folder], LeftOut(str(path))
+        registered = _registered(root, names)
+        if len(registered) == len(rows):
+            left_out.without_pose = tuple(name for name in names if name not in registered)
+            names = registered
         if len(names) != len(rows):
             raise InputError(
-                f"{path} has {len(rows)} poses, but {pictures} has {len(names)} photographs, and they belong together "
-                "in order of names. Remove the photographs that were not registered, or add those that are missing."
+                f"{path} has {len(rows)} poses, but {folder} has {len(names)} photographs, and they belong together "
+                "in order of names. Remove the photographs that were not registered (or name those that were in "
+                "view_imgs.txt, a line for each), or add those that are missing."
             )
+        names = self._sorted(names, path)
         views = []
         for name, row in zip(names, rows, strict=True):
-            self.require_inside(pictures / name, self.images)
             matrix = torch.from_numpy(row[:15].reshape(3, 5).copy())
             down, right, back, center = matrix[:, :4].unbind(dim=-1)
             height, width, focal = matrix[:, 4].tolist()
             views.append(
                 View(
                     name=name,
-                    photograph=Photograph(pictures / name, self.mask_of(name)),
+                    photograph=Photograph(folder / name),
                     c2w=torch.stack([right, -down, back, center], dim=-1),
                     focal=(focal, focal),
                     center=(width / 2, height / 2),
                     size=(width, height),
                 )
             )
-        return Capture(views=tuple(views), source=path, bounds=torch.from_numpy(rows[:, 15:]))
+        return Capture(views=tuple(views), source=path, bounds=torch.from_numpy(rows[:, 15:]), left_out=left_out)
+
+    def _sorted(self, names: list[str], path: Path) -> list[str]:
+        """Return the names in the order of the poses; say so where text and numbers differ."""
+        require_one_of(("text", "numbers"), **{"scene.order": self.order})
+        by_text, by_numbers = sorted(names), sorted(names, key=_numbers_in)
+        if by_text != by_numbers:
+            log.warning(
+                "%s: the names of the photographs in text order (%s) and in numeric order (%s) differ, and the poses do"
+                " not say which was meant. Read in %s order; if renderings are blurred, try scene.order=%s",
+                *(path, listed(by_text, 3), listed(by_numbers, 3)),
+                *(("text", "numbers") if self.order == "text" else ("numeric", "text")),
+            )
+        return by_text if self.order == "text" else by_numbers
+
+
+def _pictures_in(folder: Path) -> list[str]:
+    """Return the pictures in a folder, one for each name: of twins in two formats the JPEG, which cameras write."""
+    if not os.path.isdir(folder):
+        return []
+    names = [path.name for path in folder.iterdir() if path.suffix.lower() in ENDINGS and not path.name.startswith(".")]
+    by_stem = {Path(name).stem: name for name in sorted(names, key=lambda name: Path(name).suffix.lower() in JPEG)}
+    return sorted(by_stem.values())
+
+
+def _registered(root: Path, names: list[str]) -> list[str]:
+    """Return the photographs that view_imgs.txt says have poses (LLFF writes it), or none."""
+    path = root / "view_imgs.txt"
+    if not path.is_file():
+        return []
+    wanted = {Path(word).stem for word in read_text(path, MOST_BYTES, CURE).split()}
+    return [name for name in names if Path(name).stem in wanted]
+
+
+def _numbers_in(name: str) -> list[tuple[int, str]]:
+    """Return what sorts picture_2 before picture_10."""
+    return [(int(digits or 0), text) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:

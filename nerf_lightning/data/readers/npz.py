@@ -14,6 +14,7 @@ from jaxtyping import Shaped
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import pose_from_matrix, usable
+from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.splits import every_kth, in_order
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import area_downscale
@@ -71,18 +72,22 @@ class NpzReader(GivenFrameReader):
             images, poses, focal = _load(path, self.max_gigabytes)
         count, height, width, _ = images.shape
         self.check_divisible(width, height)
-        views = [
-            View(
-                name=str(number),
-                photograph=Photograph(path),
-                c2w=pose_from_matrix(pose, f"{path}: poses[{number}]"),
-                focal=(focal, focal),
-                center=(width / 2, height / 2),
-                size=(float(width), float(height)),
-            )
-            for number, pose in enumerate(poses)
-        ]
-        usable(Capture(tuple(views), path))
+        left_out, views = LeftOut(str(path)), []
+        for number, pose in enumerate(poses):
+            with left_out.unless_usable(str(number)):
+                views.append(
+                    View(
+                        name=str(number),
+                        photograph=Photograph(path),
+                        c2w=pose_from_matrix(pose, f"{path}: poses[{number}]"),
+                        focal=(focal, focal),
+                        center=(width / 2, height / 2),
+                        size=(float(width), float(height)),
+                    )
+                )
+        views = list(usable(Capture(tuple(views), path, left_out=left_out)).views)
+        left_out.say(len(views))
+        images, count = images[[int(view.name) for view in views]], len(views)
         cameras = pinhole_cameras(torch.stack([view.c2w for view in views]).float(), focal, width, height)
         if self.hold_every:
             train, held = every_kth(range(count), self.hold_every)

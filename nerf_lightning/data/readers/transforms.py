@@ -1,6 +1,7 @@
 """`transforms.json` in the flavours of nerfstudio and instant-ngp: poses, intrinsics, lenses, masks, splits."""
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -10,29 +11,21 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.checks import contents, pose_from_matrix
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
-from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import ENDINGS, image_size
-from nerf_lightning.data.readers.frames import (
-    focal_of,
-    lens_of,
-    list_of_frames,
-    number_of,
-    panorama_focal_of,
-    path_of,
-    positive_of,
-)
-from nerf_lightning.files.json_files import keys_of, read_json
-from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.data.readers.frames import FoundFrame, FrameFile, number_of, path_of, positive_of, views_of
+from nerf_lightning.data.readers.ply_points import read_ply_points
+from nerf_lightning.files.links import is_there
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.frames import unit_of
 from nerf_lightning.nerf.geometry.poses import is_rigid
-from nerf_lightning.nerf.types.scene import LensModel
 
-FORMAT = "A transforms.json of nerfstudio or instant-ngp"
 NGP_SCALE = 0.33
 SPLITS = ("train", "val", "test")
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -40,153 +33,167 @@ class TransformsReader(CaptureReader):
     """Read a transforms.json; intrinsics may stand at the top, for all views, or in a frame.
 
     Args:
-        file: the json below root; the paths in it are relative to where it lies.
+        file: the json below root; the paths in it are relative to where it lies. null: transforms.json, or all files
+            transforms_*.json as one capture, whose splits those of train, val and test are.
         depth_unit: length of a level of the 16-bit pictures that `depth_file_path` names, in the capture's units.
     """
 
     name: str = "transforms"
-    file: str = "transforms.json"
+    file: str | None = None
     depth_unit: float = 1e-3
 
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        return next((path.name for path in _files_in(folder)), None)
+
     def capture(self) -> Capture:
-        """Return all frames, in the file's order."""
-        path = self.folder() / self.file
-        if not is_there(path):
-            raise InputError(_absent(path))
-        self.require_inside(path, self.file)
-        content = read_json(path)
-        (frames,) = keys_of(content, ("frames",), str(path), FORMAT)
-        views, lenses = [], set[LensModel]()
-        for index, frame in enumerate(list_of_frames(frames, path)):
-            view, lens = self._view(path, f"{path}: frames[{index}]", content, frame)
-            views.append(view)
-            lenses.add(lens)
+        """Return all frames, in the files' order."""
+        paths = self._paths()
+        left_out, files = LeftOut(str(paths[0])), [FrameFile.read(path) for path in paths]
+        each = [views_of(file, self.folder(), self.allow_outside, left_out) for file in files]
+        found = [frame for frames in each for frame in frames]
+        left_out.require_enough(len(found))
+        lenses = {frame.lens_model for frame in found} or {"pinhole"}
         lens_model = common_lens_model(lenses)
         if lens_model is None:
             mixed = "panoramas (EQUIRECTANGULAR)" if "equirectangular" in lenses else "fisheye lenses"
             raise InputError(
-                f"{path} mixes {mixed} with others, and a scene has one kind. Split the capture: one file for each "
+                f"{paths[0]} mixes {mixed} with others, and a scene has one kind. Split the capture: one file for each "
                 "kind, whose frames may share the photographs' folder."
             )
+        views = self._with_masks_and_depths(paths[0], found)
+        left_out.without_pose = self._without_pose(views, left_out)
+        content, where = files[0].content, str(paths[0])
         return Capture(
             views=tuple(views),
-            source=path,
+            source=paths[0],
             lens_model=lens_model,
-            splits=_splits(content, frames, views, path),
-            undo=_undo(content, str(path)),
-            box=_ngp_box(content, str(path)),
-            left_out=self._without_pose(views),
+            points=_points(files[0], self.folder()),
+            splits=_splits(files[0], found)
+            if len(files) == 1
+            else _splits_of_files(paths, [len(each_) for each_ in each]),
+            undo=_undo(content, where),
+            box=_ngp_box(content, where),
+            left_out=left_out,
             depth_unit=self.depth_unit,
         )
 
-    def _without_pose(self, views: list[View]) -> tuple[str, ...]:
+    def _paths(self) -> list[Path]:
+        root = Path(self.root).expanduser()
+        if self.file is not None or root.is_file():
+            path = self.folder() / self.file if self.file is not None else root
+            if not is_there(path):
+                raise InputError(_absent(path))
+            return [path]
+        paths = _files_in(self.folder())
+        if not paths:
+            raise InputError(_absent(self.folder() / "transforms.json"))
+        others = [path for path in sorted(self.folder().glob("transforms_*.json")) if path not in paths]
+        if others:
+            log.warning(
+                "%s is read; %s beside it %s not (scene.file=NAME reads another)",
+                *(paths[0], listed(path.name for path in others), "is" if len(others) == 1 else "are"),
+            )
+        return paths
+
+    def _without_pose(self, views: list[View], left_out: LeftOut) -> tuple[str, ...]:
         """Return the pictures that lie beside those that are named, where these lie in one folder of their own."""
         folders, root = {view.photograph.path.parent for view in views}, self.folder()
         folder = folders.pop() if len(folders) == 1 else root
         if folder == root or not folder.is_relative_to(root):
             return ()
-        named, base = {view.name for view in views}, folder.relative_to(root)
-        return tuple(path for name in picture_files(folder) if (path := (base / name).as_posix()) not in named)
+        named = {view.photograph.path for view in views} | {folder / Path(name).name for name in left_out.faults}
+        base = folder.relative_to(root)
+        return tuple((base / name).as_posix() for name in picture_files(folder) if folder / name not in named)
 
-    def _view(self, path: Path, where: str, content: dict[str, Any], frame: Any) -> tuple[View, LensModel]:
-        name, matrix = keys_of(frame, ("file_path", "transform_matrix"), where, FORMAT)
-        picture = _picture(path, where, path_of(name, "file_path", where))
-        self.require_inside(picture)
-        where = f"{where} ({name})"
-        settings = content | frame
-        lens_model, lens = lens_of(settings, where)
-        width, height = map(float, image_size(picture))
-        if "w" in settings or "h" in settings:  # the intrinsics may be those of another size
-            width, height = number_of(settings, "w", where), number_of(settings, "h", where)
-        focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
-        named = picture.relative_to(path.parent).as_posix() if picture.is_relative_to(path.parent) else picture.name
-        view = View(
-            name=named,
-            photograph=Photograph(picture, self.mask_of(named) if self.masks else self._own_mask(path, where, frame)),
-            c2w=pose_from_matrix(matrix, f"{where}: transform_matrix"),
-            focal=focal(settings, width, height, where),
-            center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),
-            size=(width, height),
-            lens=lens,
-            depth=self._depth(path, where, frame),
-        )
-        return view, lens_model
+    def _with_masks_and_depths(self, path: Path, found: list[FoundFrame]) -> list[View]:
+        """Return the views with the files that frames name beside their pictures."""
+        files: dict[str, dict[str, Path]] = {}
+        for key in ("mask_path", "depth_file_path"):
+            names = [path_of(name, key, str(path)) for frame in found if (name := frame.settings.get(key))]
+            files[key] = find_pictures(names, path.parent, self.folder(), path, self.allow_outside, say=False)
+        masks, depths = files["mask_path"], files["depth_file_path"]
+        views = []
+        for frame in found:
+            view, mask, depth = frame.view, frame.settings.get("mask_path"), frame.settings.get("depth_file_path")
+            if mask in masks:
+                view = replace(view, photograph=replace(view.photograph, mask=masks[mask]))
+            # A depth map that is not there is left out, and named with others that cannot be used.
+            views.append(replace(view, depth=depths.get(depth, path.parent / depth)) if depth else view)
+        return views
 
-    def _depth(self, path: Path, where: str, frame: dict[str, Any]) -> Path | None:
-        name = frame.get("depth_file_path")
-        if name in (None, ""):
-            return None
-        depth = path.parent / path_of(name, "depth_file_path", where).replace("\\", "/")
-        self.require_inside(depth)
-        return depth  # one that is not there is left out and named with others that cannot be used
 
-    def _own_mask(self, path: Path, where: str, frame: dict[str, Any]) -> Path | None:
-        name = frame.get("mask_path")
-        if name in (None, ""):
-            return None
-        mask = path.parent / path_of(name, "mask_path", where).replace("\\", "/")
-        if not is_there(mask):
-            raise InputError(f"{where}: the mask {mask} does not exist. Copy it there, or remove mask_path.")
-        self.require_inside(mask)
-        return mask
+def _files_in(folder: Path) -> list[Path]:
+    """Return transforms.json, or else all files that are one capture: of the splits, or of parts."""
+    for name in ("transforms.json", "transform.json"):
+        if is_there(folder / name):
+            return [folder / name]
+    found = [path for path in sorted(folder.glob("transform*_*.json")) if is_there(path)]
+    order = {name: number for number, name in enumerate(SPLITS)}
+    return sorted(found, key=lambda path: (order.get(_split_of(path), len(order)), path.name))
+
+
+def _split_of(path: Path) -> str:
+    return path.stem.rpartition("_")[2]
 
 
 def _absent(path: Path) -> str:
-    if is_there(path.parent / "transforms_train.json"):
-        return (
-            f"{path} does not exist, but transforms_train.json does: this is the Blender format. "
-            f"Use scene=blender scene.root={path.parent}."
-        )
     held = contents(path.parent)
     return f"{path} does not exist; the folder holds {held}. Point scene.root at the folder with {path.name}."
 
 
-def _picture(path: Path, where: str, name: str) -> Path:
-    # Windows writes backslashes; instant-ngp leaves endings out.
-    named = path.parent / name.replace("\\", "/")
-    found = [named] if named.suffix.lower() in ENDINGS else []
-    found += [named.with_name(named.name + ending) for ending in ENDINGS]
-    found += [named]  # of another format, which is named where it is opened
-    there = next(filter(is_there, found), None)
-    if there is not None:
-        return there
-    if is_absolute(name):
-        raise InputError(
-            f"{where}: file_path is {name}, an absolute path of another machine. Make the paths in {path.name} "
-            "relative to its own folder."
-        )
-    raise InputError(
-        f"{where}: the image {named} does not exist (with none of the endings {', '.join(ENDINGS)} either). Copy it "
-        "there, or remove its frame from the file."
-    )
+def _points(file: FrameFile, root: Path) -> Float[Tensor, "points 3"]:
+    """Return the points of `ply_file_path` (nerfstudio), or none."""
+    name = file.content.get("ply_file_path")
+    if not name:
+        return torch.zeros(0, 3, dtype=torch.float64)
+    path = file.path.parent / path_of(name, "ply_file_path", str(file.path)).replace("\\", "/")
+    if not is_there(path):
+        path = root / path.name
+    if not is_there(path):
+        log.warning("%s: the points of ply_file_path=%s are not there, and are left out", file.path, name)
+        return torch.zeros(0, 3, dtype=torch.float64)
+    return torch.from_numpy(read_ply_points(path).positions)
 
 
-def _splits(
-    content: dict[str, Any], frames: list[dict[str, Any]], views: list[View], path: Path
-) -> dict[str, tuple[int, ...]] | None:
+def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[int, ...]] | None:
+    """Return the splits of files called after them; others are learnt from."""
+    splits: dict[str, tuple[int, ...]] = {split: () for split in SPLITS}
+    start = 0
+    for path, count in zip(paths, counts, strict=True):
+        split = _split_of(path) if _split_of(path) in SPLITS else "train"
+        splits[split] += tuple(range(start, start + count))
+        start += count
+    return splits if splits["val"] or splits["test"] else None
+
+
+def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ...]] | None:
     """Return the splits that the file names, or that folders called train and test make."""
+    content, path = file.content, file.path
     lists = {split: content[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in content}
     if not lists:
-        lists = {split: [view.name for view in views if split in Path(view.name).parts[:-1]] for split in SPLITS}
+        lists = {split: [each.view.name for each in found if split in Path(each.name).parts[:-1]] for split in SPLITS}
         if not lists["train"] or not (lists["val"] or lists["test"]):
             return None
-    places = {view.name: number for number, view in enumerate(views)}
+    numbers = {each.view.name: number for number, each in enumerate(found)}
     # As the frames write them, too: without an ending, say.
-    places |= {_plain(frame["file_path"]): number for number, frame in enumerate(frames)}
+    numbers |= {_plain(each.name): number for number, each in enumerate(found)}
+    listed_at_all = {_plain(frame["file_path"]) for frame in file.frames if isinstance(frame, dict)}
     splits = {}
     for split in SPLITS:
         names = lists.get(split, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{path}: {split}_filenames must be a list of file names. Mend it, or remove it.")
-        lost = [name for name in names if _plain(name) not in places]
+        lost = [name for name in names if _plain(name) not in numbers and _plain(name) not in listed_at_all]
         if lost:
-            raise InputError(f"{path}: {split}_filenames lists {listed(lost)}, which no frame has. Mend the list.")
-        splits[split] = tuple(dict.fromkeys(places[_plain(name)] for name in names))
+            log.warning("%s: %s_filenames lists %s, which no frame has; this is passed over", path, split, listed(lost))
+        splits[split] = tuple(dict.fromkeys(numbers[_plain(name)] for name in names if _plain(name) in numbers))
     return splits
 
 
-def _plain(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).as_posix()
+def _plain(name: object) -> str:
+    return PurePosixPath(str(name).replace("\\", "/")).as_posix()
 
 
 def _ngp_box(content: dict[str, Any], where: str) -> Float[Tensor, "2 3"] | None:

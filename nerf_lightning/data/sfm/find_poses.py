@@ -53,7 +53,7 @@ def _unfinished(folder: Path) -> Iterator[Path]:
             remove_empty(folder)
 
 
-def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_outside: bool) -> tuple[SparseModel, str]:
+def from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple[SparseModel, str]:
     """Find the cameras of photographs, and write a capture; return what was found, and how photographs were paired.
 
     The folder to write may be the one that holds the photographs, in `images`.
@@ -61,7 +61,7 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings, allow_ou
     Raises:
         InputError: photographs that cannot be used, or whose cameras cannot be found.
     """
-    photographs = find_photographs(source, allow_outside)
+    photographs = find_photographs(source)
     in_place = (folder / "images").exists()
     turned = [photograph.path.name for photograph in photographs if not photograph.upright]
     if in_place and turned:

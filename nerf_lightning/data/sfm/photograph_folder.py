@@ -54,12 +54,11 @@ class FoundPhotograph:
         return self.width, self.height, self.lens
 
 
-def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPhotograph]:
+def find_photographs(folder: Path) -> list[FoundPhotograph]:
     """Return the photographs that lie in a folder, sorted by name; folders inside it are not searched.
 
     Args:
-        folder: where they lie; it may be a link itself.
-        allow_outside: follow links that lead out of it.
+        folder: where they lie; it, and they, may be links.
 
     Raises:
         InputError: no such folder, fewer than three pictures in it, more than a person has agreed to, or one
@@ -88,12 +87,6 @@ def find_photographs(folder: Path, allow_outside: bool = False) -> list[FoundPho
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
     require_within("views", len(pictures), f"images={folder}", "photographs")
-    outside = [path for path in pictures if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))]
-    if outside and not allow_outside:
-        raise InputError(
-            f"images={folder}: {listed((path.name for path in outside), 4)} are symbolic links out of this folder. If "
-            "you made them, add allow_outside=true; else copy the photographs that you want into the folder."
-        )
     photographs = [_photograph(path) for path in pictures]
     around = [photograph.path.name for photograph in photographs if photograph.is_panorama]
     if around:

@@ -68,7 +68,7 @@ class PhotosReader(AutoReader):
         if self.video is not None:
             model, matching = from_video(source, None, folder, settings)
         else:
-            model, matching = from_photographs(source, folder, settings, self.allow_outside)
+            model, matching = from_photographs(source, folder, settings)
         found, total = len(model.registered), len(model.registered) + len(model.left_out)
         log.info("cameras: found those of %d of %d, to %.2f pixels", found, total, model.reprojection_error)
         for remark in remarks(model, matching, self.video is not None):

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.nerf.types.rays import KnownDepths
@@ -120,8 +120,8 @@ class SceneRecord:
     `sources`, which adds to `train` the training views of those captures that are never trained on."""
     view_names: tuple[str, ...]
     background: Background
-    to_user: Float[Tensor, "4 4"]
-    """Similarity that takes scene coordinates to the user's own frame."""
+    to_user: Float64[Tensor, "4 4"]
+    """Similarity that takes scene coordinates to the user's own frame, which may be a map's: millions of metres."""
     space: Space = "bounded"
     metres_per_unit: float | None = None
     """How long a unit of the user's frame is; None: nobody has said."""

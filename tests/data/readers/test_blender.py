@@ -36,7 +36,7 @@ def test_reads_all_splits_in_order(root):
     assert (scene.near.tolist(), scene.far.tolist()) == ([2.0] * 14, [6.0] * 14)
     assert scene.aabb.tolist() == [[-1.5] * 3, [1.5] * 3]
     assert (scene.name, scene.background, scene.truth) == ("toy", "white", None)
-    assert torch.equal(scene.to_user, torch.eye(4))
+    assert torch.equal(scene.to_user, torch.eye(4, dtype=torch.float64))
 
 
 def test_keeps_straight_alpha_and_the_colour_under_it(root):

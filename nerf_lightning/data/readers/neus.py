@@ -1,0 +1,127 @@
+"""Captures of NeuS and IDR (DTU, BlendedMVS): `cameras_sphere.npz` beside `image/` and `mask/`."""
+
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
+from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.numpy_files import archive_headers, read_member
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+
+FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+MOST_BYTES = 1 << 28
+CURE = "Copy the file again."
+
+
+@dataclass
+class NeusReader(CaptureReader):
+    """Read projection matrices `world_mat_N`; `scale_mat_N` takes the unit cube to the box that holds the content.
+
+    The photographs belong to the matrices in order of their names. `scene.masks=mask` uses the masks.
+
+    Args:
+        images: the folder of the photographs below root; null: image, images or rgb.
+    """
+
+    name: str = "neus"
+    images: str | None = None
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        return next((name for name in FILES if (folder / name).is_file()), None)
+
+    def capture(self) -> Capture:
+        """Return the photographs in order of their names."""
+        root = self.folder()
+        path = root / (self.found_in(root) or FILES[0])
+        world, scale = _matrices(path)
+        asked = [self.images] if self.images else PICTURE_FOLDERS
+        folder = next((root / name for name in asked if (root / name).is_dir() and picture_files(root / name)), root)
+        names = picture_files(folder)
+        if len(names) != len(world):
+            raise InputError(
+                f"{path} has {len(world)} cameras, but {folder} has {len(names)} photographs, and they belong together "
+                "in order of names. Copy those that are missing, or set scene.images to their folder."
+            )
+        left_out, views = LeftOut(str(path)), []
+        for name, number in zip(names, sorted(world), strict=True):
+            with left_out.unless_usable(name):
+                views.append(_view(folder / name, name, world[number][:3], f"{path}: world_mat_{number}"))
+        left_out.require_enough(len(views))
+        return Capture(tuple(views), path, box=_box(scale), left_out=left_out)
+
+
+def _matrices(path: Path) -> tuple[dict[int, Float[ndarray, "4 4"]], dict[int, Float[ndarray, "4 4"]]]:
+    """Return the world and the scale matrices by their numbers."""
+    try:
+        with open_regular(path, MOST_BYTES, CURE) as file, zipfile.ZipFile(file) as archive:
+            keys = [Path(name).stem for name in archive.namelist()]
+            found: dict[str, dict[int, ndarray]] = {"world": {}, "scale": {}}
+            wanted = [match for key in keys if (match := re.fullmatch(r"(world|scale)_mat_(\d{1,9})", key))]
+            require_within("views", len(wanted) // 2, str(path), "views")
+            headers = archive_headers(archive, [match[0] for match in wanted])
+            for match in wanted:
+                if headers[match[0]].shape == (4, 4):
+                    found[match[1]][int(match[2])] = np.asarray(read_member(archive, match[0]), np.float64)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputError(f"{path} cannot be read: {error}. {CURE}") from error
+    if not found["world"]:
+        raise InputError(
+            f"{path} holds no world_mat_0, world_mat_1, ... of 4 x 4 numbers, as NeuS and IDR have. {CURE}"
+        )
+    return found["world"], found["scale"]
+
+
+def _view(picture: Path, name: str, projection: Float[ndarray, "3 4"], where: str) -> View:
+    intrinsics, rotation, center = _decomposed(projection, where)
+    width, height = image_size(picture)
+    c2w = torch.from_numpy(np.concatenate([rotation.T, center[:, None]], axis=1))
+    return View(
+        name=name,
+        photograph=Photograph(picture),
+        c2w=from_opencv_axes(c2w),
+        focal=(float(intrinsics[0, 0]), float(intrinsics[1, 1])),
+        center=(float(intrinsics[0, 2]), float(intrinsics[1, 2])),
+        size=(float(width), float(height)),
+    )
+
+
+def _decomposed(
+    projection: Float[ndarray, "3 4"], where: str
+) -> tuple[Float[ndarray, "3 3"], Float[ndarray, "3 3"], Float[ndarray, "3"]]:
+    """Return K, R (world to camera) and the centre of P = K [R | -R c], by an RQ decomposition."""
+    flipped = np.flipud(projection[:, :3]).T
+    if not np.isfinite(projection).all() or abs(np.linalg.det(flipped)) < 1e-12:
+        raise InputError(f"{where} is no projection: it holds NaN or infinity, or is singular. {CURE}")
+    q, r = np.linalg.qr(flipped)
+    k, rotation = np.flipud(np.fliplr(r.T)), np.flipud(q.T)
+    signs = np.sign(np.diag(k))
+    k, rotation = k * signs, signs[:, None] * rotation
+    if np.linalg.det(rotation) < 0:  # P and -P are one projection
+        rotation = -rotation
+    return k / k[2, 2], rotation, -np.linalg.solve(projection[:, :3], projection[:, 3])
+
+
+def _box(scale: dict[int, Float[ndarray, "4 4"]]) -> Float[Tensor, "2 3"] | None:
+    """Return the corners of the box around the unit ball that holds the content; they are alike in all views."""
+    if not scale:
+        return None
+    first = torch.from_numpy(scale[min(scale)])
+    half, center = first[:3, :3].abs().amax(), first[:3, 3]
+    return torch.stack([center - half, center + half]) if bool(torch.isfinite(first).all() and half > 0) else None

@@ -1,0 +1,68 @@
+"""Sparse points in a PLY file, as COLMAP, nerfstudio and splat trainers write them: positions alone are taken."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from nerf_lightning.data.readers.colmap_files import ColmapPoints
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.regular import open_regular
+from nerf_lightning.messages.errors import InputError
+
+MOST_BYTES = 1 << 34
+MOST_HEADER = 1 << 16
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float32": "f4", "float64": "f8"},
+}
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+CURE = "Export the points again."
+
+
+def read_ply_points(path: Path) -> ColmapPoints:
+    """Return the vertices' positions; nothing is known of where they were seen.
+
+    Raises:
+        InputError: no PLY file, one that is cut short, or more points than a person has agreed to.
+    """
+    try:
+        with open_regular(path, MOST_BYTES, CURE) as file:
+            head = file.read(MOST_HEADER)
+            end = head.find(b"end_header")
+            body = head.find(b"\n", end) + 1
+            if not head.startswith(b"ply") or end < 0 or body == 0:
+                raise InputError(f"{path} is not a PLY file. {CURE}")
+            order, count, kind = _header(head[:end].decode("ascii", "replace"), path)
+            require_within("points", count, str(path), "points")
+            file.seek(body)
+            if order == "ascii":
+                rows = np.loadtxt(file, max_rows=count, ndmin=2, comments=None) if count else np.zeros((0, 3))
+                columns = [rows[:, list(kind.names or ()).index(axis)] for axis in "xyz"]
+            else:
+                if os.fstat(file.fileno()).st_size - body < count * kind.itemsize:
+                    raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
+                table = np.frombuffer(file.read(count * kind.itemsize), kind, count)
+                columns = [table[axis] for axis in "xyz"]
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{path} cannot be read as PLY: {error}. {CURE}") from error
+    positions = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    return ColmapPoints(positions, np.full(len(positions), np.nan), np.zeros((0, 2), np.int64))
+
+
+def _header(text: str, path: Path) -> tuple[str, int, np.dtype]:
+    """Return the order of bytes, the number of vertices, and what a vertex holds; these come first in a file."""
+    lines = [line.split() for line in text.splitlines()]
+    order = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
+    elements = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
+    if order not in ORDERS or not elements or lines[elements[0]][1:2] != ["vertex"]:
+        raise InputError(f"{path} is a PLY file of an unknown kind, or does not begin with its vertices. {CURE}")
+    of_vertices = lines[elements[0] + 1 : elements[1] if len(elements) > 1 else len(lines)]
+    properties = [words for words in of_vertices if words[:1] == ["property"]]
+    if any(len(words) != 3 or words[1] not in TYPES for words in properties):
+        raise InputError(f"{path} has vertices with lists or unknown types. {CURE}")
+    kind = np.dtype([(words[2], ORDERS[order] + TYPES[words[1]]) for words in properties])
+    if not {"x", "y", "z"} <= set(kind.names or ()):
+        raise InputError(f"{path} has vertices without x, y and z. {CURE}")
+    return order, int(lines[elements[0]][2]), kind

@@ -1,0 +1,78 @@
+"""Polycam's raw data: `keyframes/` with a json of pose and intrinsics for each photograph, and LiDAR's depth maps."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.readers.frames import number_of
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.json_files import read_json
+from nerf_lightning.messages.errors import InputError
+
+FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+"""Of poses and photographs: those that the app has refined, then those that it recorded."""
+
+
+@dataclass
+class PolycamReader(CaptureReader):
+    """Read the raw data that Polycam exports in its developer mode. Units are metres; y is up.
+
+    Args:
+        depth_unit: length of a level of the 16-bit depth maps, in metres.
+    """
+
+    name: str = "polycam"
+    depth_unit: float = 1e-3
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the folder by which this format is known, where a folder has it."""
+        return next((f"keyframes/{name}" for name, _ in FOLDERS if (folder / "keyframes" / name).is_dir()), None)
+
+    def capture(self) -> Capture:
+        """Return the photographs in order of their names."""
+        keyframes = self.folder() / "keyframes"
+        cameras, pictures = next(
+            (
+                (keyframes / of_cameras, keyframes / of_pictures)
+                for of_cameras, of_pictures in FOLDERS
+                if (keyframes / of_cameras).is_dir()
+            ),
+            (keyframes, keyframes),
+        )
+        files = {Path(name).stem: pictures / name for name in picture_files(pictures)}
+        poses = sorted(cameras.glob("*.json"))
+        require_within("views", len(poses), str(cameras), "views")
+        left_out, views = LeftOut(str(cameras)), []
+        for path in poses:
+            with left_out.unless_usable(path.stem):
+                if path.stem not in files:
+                    raise InputError(f"{pictures} holds no photograph of the pose {path.name}. Copy it there.")
+                views.append(_view(path, files[path.stem], keyframes / "depth" / f"{path.stem}.png"))
+        left_out.require_enough(len(views))
+        posed = {path.stem for path in poses}
+        left_out.without_pose = tuple(file.name for stem, file in files.items() if stem not in posed)
+        return Capture(tuple(views), cameras, left_out=left_out, depth_unit=self.depth_unit)
+
+
+def _view(path: Path, picture: Path, depth: Path) -> View:
+    said = read_json(path)
+    if not isinstance(said, dict):
+        raise InputError(f"{path} is no json object with a pose. Export the capture again.")
+    matrix = [[number_of(said, f"t_{row}{column}", str(path)) for column in range(4)] for row in range(3)]
+    fx, fy, cx, cy, width, height = (
+        number_of(said, key, str(path)) for key in ("fx", "fy", "cx", "cy", "width", "height")
+    )
+    return View(
+        name=picture.name,
+        photograph=Photograph(picture),
+        c2w=pose_from_matrix(matrix, str(path)),
+        focal=(fx, fy),
+        center=(cx, cy),
+        size=(width, height),
+        depth=depth if depth.is_file() else None,
+    )

@@ -1,0 +1,135 @@
+"""Captures with a text file of numbers for each pose: NSVF's `pose/`, and NeRF++'s `train/pose` and `test/pose`.
+
+Poses are camera to world, axes right, down, ahead.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.data.captures.capture import Capture, View
+from nerf_lightning.data.captures.checks import pose_from_matrix
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
+from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.pixels.decoding import Photograph
+from nerf_lightning.data.pixels.images import image_size
+from nerf_lightning.files.budgets import require_within
+from nerf_lightning.files.regular import read_text
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+
+MOST_BYTES = 1 << 16
+CURE = "Copy it again."
+NSVF_SPLITS = {"0": "train", "1": "val", "2": "test"}
+"""By the first character of a picture's name, as in 0_train_0001.png."""
+NERFPP_SPLITS = {"train": "train", "validation": "val", "test": "test"}
+
+
+@dataclass
+class NsvfReader(CaptureReader):
+    """Read an NSVF capture: `intrinsics.txt`, `bbox.txt`, `pose/` and `rgb/`; a name's first digit is its split."""
+
+    name: str = "nsvf"
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the file by which this format is known, where a folder has it."""
+        return "intrinsics.txt" if (folder / "intrinsics.txt").is_file() and (folder / "pose").is_dir() else None
+
+    def capture(self) -> Capture:
+        """Return the photographs in order of their names."""
+        root = self.folder()
+        left_out = LeftOut(str(root / "pose"))
+        views = list(_views(root, "", left_out))
+        left_out.require_enough(len(views))
+        splits = {
+            split: tuple(number for number, view in enumerate(views) if view.name.startswith(f"{digit}_"))
+            for digit, split in NSVF_SPLITS.items()
+        }
+        all_named = sum(map(len, splits.values())) == len(views) and splits["train"]
+        return Capture(
+            tuple(views), root / "pose", splits=splits if all_named else None, box=_box(root), left_out=left_out
+        )
+
+
+@dataclass
+class NerfPlusPlusReader(CaptureReader):
+    """Read a NeRF++ capture: `rgb/`, `pose/` and `intrinsics/` in each of `train`, `validation` and `test`."""
+
+    name: str = "nerfpp"
+
+    @classmethod
+    def found_in(cls, folder: Path) -> str | None:
+        """Return the folder by which this format is known, where a folder has it."""
+        there = all((folder / "train" / part).is_dir() for part in ("intrinsics", "pose"))
+        return "train/intrinsics" if there else None
+
+    def capture(self) -> Capture:
+        """Return the photographs of train, validation and test."""
+        root = self.folder()
+        left_out, views, splits = LeftOut(str(root)), list[View](), dict[str, tuple[int, ...]]()
+        for name, split in NERFPP_SPLITS.items():
+            start = len(views)
+            views += _views(root / name, f"{name}/", left_out)
+            splits[split] = tuple(range(start, len(views)))
+        left_out.require_enough(len(views))
+        return Capture(tuple(views), root, splits=splits, left_out=left_out)
+
+
+def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
+    """Return the views of a folder with `pose/`, photographs, and intrinsics for each or for all."""
+    places = [folder / name for name in PICTURE_FOLDERS if name and (folder / name).is_dir()]
+    if not places:
+        return
+    names = picture_files(places[0])
+    require_within("views", len(names), str(places[0]), "views")
+    for name in names:
+        stem = Path(name).stem
+        with left_out.unless_usable(prefix + name):
+            pose, own = folder / "pose" / f"{stem}.txt", folder / "intrinsics" / f"{stem}.txt"
+            if not pose.is_file():
+                raise InputError(f"{pose} does not exist, so {name} has no pose.")
+            intrinsics = _numbers(own if own.is_file() else folder / "intrinsics.txt")
+            width, height = image_size(places[0] / name)
+            # A 4 x 4 matrix, or f, cx, cy and what else programs put there.
+            of_matrix = len(intrinsics) >= 16 or len(intrinsics) == 9
+            across = 4 if len(intrinsics) >= 16 else 3
+            fx, fy, cx, cy = (
+                (intrinsics[0], intrinsics[across + 1], intrinsics[2], intrinsics[across + 2])
+                if of_matrix
+                else (intrinsics[0], *intrinsics[:3])
+            )
+            yield View(
+                name=prefix + name,
+                photograph=Photograph(places[0] / name),
+                c2w=from_opencv_axes(pose_from_matrix(_numbers(pose)[:16], str(pose))),
+                focal=(fx, fy),
+                center=(cx, cy),
+                size=(float(width), float(height)),
+            )
+
+
+def _numbers(path: Path) -> list[float]:
+    """Return the numbers at the beginning of a text file."""
+    found = list[float]()
+    for word in read_text(path, MOST_BYTES, CURE).split():
+        try:
+            found.append(float(word))
+        except ValueError:
+            break
+    if len(found) < 3:
+        raise InputError(f"{path} does not begin with the numbers of a camera. {CURE}")
+    return found
+
+
+def _box(root: Path) -> Float[Tensor, "2 3"] | None:
+    """Return the corners that `bbox.txt` names, where it is there."""
+    if not (root / "bbox.txt").is_file():
+        return None
+    numbers = torch.tensor(_numbers(root / "bbox.txt")[:6], dtype=torch.float64)
+    return numbers.reshape(2, 3) if len(numbers) == 6 and bool(torch.isfinite(numbers).all()) else None
