@@ -12,7 +12,6 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 from nerf_lightning.messages.errors import InputError
 
@@ -83,7 +82,7 @@ def read_text(path: Path, most_bytes: int, cure: str = CURE) -> str:
         raise InputError(f"{path} is not a text file{where}. {cure}") from error
 
 
-def encoding_of(file: IO[bytes]) -> str:
+def encoding_of(file: io.BufferedIOBase) -> str:
     """Return how the text of a file is encoded, by its byte order mark: UTF-16, which Windows writes, or UTF-8."""
     start = file.read(2)
     file.seek(0)

@@ -25,9 +25,9 @@ def test_the_rows_of_cups_poses_bounds_belong_to_names_sorted_as_text(cache):
     llff, colmap = read(LlffReader, root, cache), read(ColmapReader, root, cache)
     assert llff.view_names == colmap.view_names
     assert llff.view_names[:3] == ("1.jpg", "10.jpg", "11.jpg")
-    centers = [s.cameras.c2w[:, :, 3] @ s.to_user[:3, :3].T + s.to_user[:3, 3] for s in (llff, colmap)]
+    centers = [s.cameras.c2w[:, :, 3].double() @ s.to_user[:3, :3].T + s.to_user[:3, 3] for s in (llff, colmap)]
     torch.testing.assert_close(*centers, atol=1e-3, rtol=1e-3)
-    axes = [s.to_user[:3, :3] @ s.cameras.c2w[:, :, :3] for s in (llff, colmap)]
+    axes = [s.to_user[:3, :3] @ s.cameras.c2w[:, :, :3].double() for s in (llff, colmap)]
     turned = (axes[0] / axes[0].norm(dim=1, keepdim=True) * axes[1] / axes[1].norm(dim=1, keepdim=True)).sum(dim=1)
     assert float(turned.min()) > 0.9999
     # In numeric order they would belong to others.

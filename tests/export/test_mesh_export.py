@@ -146,7 +146,7 @@ def test_a_scene_in_another_frame_gives_the_same_mesh_in_the_new_place(tmp_path,
     for name, capture in (("one", known), ("other", known.moved(scale, rotation, shift))):
         scene = scene_record(read("colmap", write_colmap(tmp_path / name, capture), space=space))
         back = np.linalg.inv(np.block([[scale * rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
-        to_first = torch.tensor(back if name == "other" else np.eye(4)).float() @ scene.to_user
+        to_first = torch.tensor(back if name == "other" else np.eye(4)).double() @ scene.to_user
         unit = unit_of(to_first)
 
         def distance(positions, to_first=to_first, unit=unit):

@@ -194,6 +194,6 @@ def user_rays(scene: Scene, name: str, at: list[tuple[float, float]]) -> tuple[t
     size = torch.stack([cameras.width[view], cameras.height[view]])
     x, y = (torch.tensor(at) * size).floor().long().unbind(dim=-1)
     rays = rays_through_pixels(cameras, PixelIndex(torch.full_like(x, view), x, y), scene.near, scene.far)
-    rotation = scene.to_user[:3, :3]
-    origins = rays.origins @ rotation.T + scene.to_user[:3, 3]
+    rotation = scene.to_user[:3, :3].float()
+    origins = rays.origins @ rotation.T + scene.to_user[:3, 3].float()
     return origins, rays.directions @ rotation.T / unit_of(scene.to_user)

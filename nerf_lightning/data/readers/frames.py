@@ -109,7 +109,7 @@ def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, ever
 def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], picture: Path) -> FoundFrame:
     settings = file.content | {key: value for key, value in frame.items() if value is not None}
     lens_model, lens = lens_of(settings, where)
-    stored_width, stored_height = image_size(picture)
+    stored_width, stored_height = map(float, image_size(picture))
     # The intrinsics may be those of another size.
     width, height = number_of(settings, "w", where, stored_width), number_of(settings, "h", where, stored_height)
     focal = panorama_focal_of if lens_model == "equirectangular" else focal_of

@@ -17,7 +17,7 @@ from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.files.budgets import limits, require_within
-from nerf_lightning.files.regular import read_text
+from nerf_lightning.files.regular import open_regular, read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import from_opencv_axes
@@ -94,9 +94,9 @@ class MetashapeReader(CaptureReader):
 
 def _is_ours(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_regular(path, None) as file:
             start = file.read(HEAD)
-    except OSError:
+    except (OSError, InputError):
         return False
     return b"<document" in start and b"<chunk" in start
 

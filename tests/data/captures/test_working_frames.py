@@ -124,7 +124,7 @@ def test_instant_ngps_box_is_kept_where_it_is(tmp_path):
     content = json.loads((root / "transforms.json").read_text()) | {"aabb_scale": 2}
     (root / "transforms.json").write_text(json.dumps(content))
     scene = read("transforms", root, space="bounded")
-    middle = scene.to_user[:3, :3] @ scene.aabb.mean(dim=0) + scene.to_user[:3, 3]
+    middle = scene.to_user[:3, :3] @ scene.aabb.double().mean(dim=0) + scene.to_user[:3, 3]
     torch.testing.assert_close(middle, torch.zeros(3), atol=1e-4, rtol=0)
     least = 2 / 0.33 / unit_of(scene.to_user)
     assert bool((scene.aabb[1] - scene.aabb[0] > 0.999 * least).all())

@@ -328,7 +328,7 @@ def test_a_loop_of_links_beside_the_photographs_does_no_harm(tmp_path):
 def test_sparse_points_come_along_in_scene_units(tmp_path):
     known = Known()
     scene = read("colmap", write_colmap(tmp_path / "c", known))
-    back = scene.points @ scene.to_user[:3, :3].T + scene.to_user[:3, 3]
+    back = scene.points.double() @ scene.to_user[:3, :3].T + scene.to_user[:3, 3]
     np.testing.assert_allclose(back, known.points, atol=1e-5)
     # Near is half the first percentile of the depths, whatever the unit.
     depths = np.sort(-((known.points - known.c2w[0, :, 3]) @ known.c2w[0, :, :3])[:, 2])
