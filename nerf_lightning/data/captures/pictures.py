@@ -60,7 +60,7 @@ def find_pictures(
         InputError: two folders fit alike, and neither is called as a folder of photographs is.
     """
     inside = [Path(os.path.abspath(each)) for each in (root, folder)]
-    exact = {name: path for name in names if (path := _exact(folder, name, None if outside else inside))}
+    exact = {name: path for name in names if (path := named_picture(folder, name, None if outside else inside))}
     if len(exact) == len(names):
         return exact
     rules = _rules([name for name in names if name not in exact], root, folder)
@@ -95,8 +95,11 @@ def pictures_below(root: Path) -> list[Path]:
     return sorted(path for path in found if path.suffix.lower() in ENDINGS and not path.name.startswith("."))
 
 
-def _exact(folder: Path, name: str, inside: list[Path] | None) -> Path | None:
-    """Return the file that a name is of as it stands; instant-ngp and Blender leave endings out."""
+def named_picture(folder: Path, name: str, inside: list[Path] | None = None) -> Path | None:
+    """Return the file that a name is of as it stands, where it lies inside of one of some folders.
+
+    instant-ngp and Blender leave endings out.
+    """
     named = folder / name.replace("\\", "/")
     if inside is not None and not any(Path(os.path.abspath(named)).is_relative_to(each) for each in inside):
         return None

@@ -154,7 +154,7 @@ class CaptureReader(Reader):
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
             raise InputError(f"scene.root={self.root}: {error}. Give the folder without ~.") from error
-        if folder.is_file():
+        if os.path.isfile(folder):
             return folder.parent
         if not os.path.isdir(folder):
             where = "" if folder.is_absolute() else f" in {Path.cwd()}, where relative ones are looked for"
@@ -273,24 +273,34 @@ def as_calibrated(capture: Capture) -> Capture:
 
     Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which.
     """
-    views, turned = [], []
-    for view in capture.views:
-        orientation = orientation_of(view.photograph.path)
-        photograph = view.photograph
-        if orientation != 1:
-            turned.append(view.name)
-            width, height = image_size(photograph.path)
-            quarter = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
-            photograph = replace(photograph, upright=quarter)
-        views.append(replace(view, photograph=photograph))
+    views, kept, turned = list(capture.views), [], 0
+    for number, view in enumerate(views):
+        with capture.left_out.unless_usable(view.name):
+            orientation = orientation_of(view.photograph.path)
+            width, height = image_size(view.photograph.path)
+            turned += orientation != 1
+            if not _fits(view, width, height):
+                if orientation not in QUARTER_TURNS or not _fits(view, height, width):
+                    raise InputError(_of_another_shape(view, width, height))
+                views[number] = replace(view, photograph=replace(view.photograph, upright=True))
+            kept.append(number)
+    capture.left_out.require_enough(len(kept))
     if turned:
-        as_shown = sum(view.photograph.upright for view in views)
         log.info(
             "%s: %d of %d photographs are to be shown turned (EXIF orientation); by the cameras' sizes, %d are read "
             "turned and the others as they are stored",
-            *(capture.source, len(turned), len(views), as_shown),
+            *(capture.source, turned, len(views), sum(view.photograph.upright for view in views)),
         )
-    return replace(capture, views=tuple(views))
+    return replace(capture, views=tuple(views)).some(kept)
+
+
+def _of_another_shape(view: View, width: int, height: int) -> str:
+    x, y = width / view.size[0], height / view.size[1]
+    return (
+        f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for {view.size[0]:g} x "
+        f"{view.size[1]:g}: the sides differ by other factors ({x:.3f} and {y:.3f}). The picture was cropped, turned "
+        "or stretched after the poses were estimated; use the original one."
+    )
 
 
 def _fits(view: View, width: int, height: int) -> bool:
@@ -321,11 +331,7 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
     for view, (width, height) in zip(capture.views, files, strict=True):
         x, y = width / view.size[0], height / view.size[1]
         if not _fits(view, width, height):
-            raise InputError(
-                f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for "
-                f"{view.size[0]:g} x {view.size[1]:g}: the sides differ by other factors ({x:.3f} and {y:.3f}). The "
-                "picture was cropped, turned or stretched after the poses were estimated; use the original one."
-            )
+            raise InputError(_of_another_shape(view, width, height))
         scales.append((x / downscale, y / downscale))
     scale = torch.tensor(scales, dtype=torch.float64)
     focal = column("focal") * scale

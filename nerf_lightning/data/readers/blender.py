@@ -113,7 +113,7 @@ class BlenderReader(GivenFrameReader):
     def _capture(self) -> Capture:
         """Return the views of train, val and test; a split without a file, or without frames, has none."""
         root = Path(self.root).expanduser()
-        root = root.parent if root.is_file() else root
+        root = root.parent if os.path.isfile(root) else root
         if not os.path.isdir(root):
             raise InputError(f"The folder {root} does not exist. Set scene.root to the capture's folder.")
         files = {split: _file_of(root, split) for split in SPLITS}

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, named_picture, pictures_below
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.colmap_files import (
@@ -111,7 +111,7 @@ class ColmapReader(CaptureReader):
         for image in model.images:
             with left_out.unless_usable(image.name):
                 if image.name not in files:
-                    raise InputError(_absent(image.name, where, folder))
+                    raise InputError(_absent(image.name, pictures, folder))
                 camera = model.cameras[image.camera]
                 _require_known(camera, folder)
                 views.append(_view(image, camera, files[image.name]))
@@ -141,10 +141,10 @@ class ColmapReader(CaptureReader):
             return root / self.model
         found = models_in(root)
         if not found:
+            places = listed(filter(None, MODEL_FOLDERS), len(MODEL_FOLDERS))
             raise InputError(
-                f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in {listed(MODEL_FOLDERS, 9)}, "
-                "or in the folder itself. Point scene.root at the folder above sparse/, or make a model with "
-                "nerf poses images=DIR."
+                f"{root} holds no COLMAP model: there is no cameras.bin or cameras.txt in {places}, or in the folder "
+                "itself. Point scene.root at the folder above sparse/, or make a model with nerf poses images=DIR."
             )
         if len(found) > 1:
             log.info(
@@ -189,6 +189,11 @@ def _tracks(images: Sequence[ColmapImage], points: ColmapPoints) -> Int[ndarray,
 
 
 def _absent(name: str, pictures: Path, folder: Path) -> str:
+    if named_picture(pictures, name):
+        return (
+            f"The model in {folder} names {name}, which leads out of the capture's folder: it may be a stranger's. If "
+            "this capture is yours, add scene.allow_outside=true; else copy the photograph into the folder."
+        )
     if is_absolute(name):
         return (
             f"The model in {folder} names photographs by absolute paths of another machine: {name}. No picture below "

@@ -7,18 +7,18 @@ here is numbers; whether they make a camera is judged by `captures.checks`.
 import logging
 import math
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerf_lightning.data.captures.capture import View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import find_pictures
+from nerf_lightning.data.captures.pictures import find_pictures, named_picture
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS, image_size
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
-from nerf_lightning.files.links import is_absolute, is_there
+from nerf_lightning.files.links import is_absolute
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed, require_printable
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov
@@ -99,7 +99,7 @@ def views_of(file: FrameFile, root: Path, outside: bool, left_out: LeftOut, ever
     pictures = find_pictures([name for _, name, _ in named], file.path.parent, root, file.path, outside)
     found = []
     for where, name, frame in named:
-        with left_out.unless_usable(name):
+        with left_out.unless_usable(PurePosixPath(name.replace("\\", "/")).as_posix()):
             if name not in pictures:
                 raise InputError(_absent(file.path, root, where, name))
             found.append(_found(file, f"{where} ({name})", name, frame, pictures[name]))
@@ -128,7 +128,7 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
 
 def _absent(path: Path, root: Path, where: str, name: str) -> str:
     named = path.parent / name.replace("\\", "/")
-    if is_there(named):
+    if named_picture(path.parent, name):
         return (
             f"{where}: file_path is {name}, which leads out of the capture's folder {root}: it may be a stranger's. If "
             "this capture is yours, add scene.allow_outside=true; else copy the picture into the folder."

@@ -63,10 +63,11 @@ class LlffReader(CaptureReader):
         found = {root / name: _pictures_in(root / name) for name in asked}
         folder = next((folder for folder, names in found.items() if names), None)
         if folder is None:
-            raise InputError(f"{root} has no photographs in {listed(asked, 9)}. Set scene.images to their folder.")
+            places = listed((name or "the folder itself" for name in asked), 9)
+            raise InputError(f"{root} has no photographs in {places}. Set scene.images to their folder.")
         names, left_out = found[folder], LeftOut(str(path))
         registered = _registered(root, names)
-        if len(registered) == len(rows):
+        if registered and len(registered) == len(rows):
             left_out.without_pose = tuple(name for name in names if name not in registered)
             names = registered
         if len(names) != len(rows):

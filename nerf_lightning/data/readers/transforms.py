@@ -1,6 +1,7 @@
 """`transforms.json` in the flavours of nerfstudio and instant-ngp: poses, intrinsics, lenses, masks, splits."""
 
 import logging
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -81,7 +82,7 @@ class TransformsReader(CaptureReader):
 
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()
-        if self.file is not None or root.is_file():
+        if self.file is not None or os.path.isfile(root):
             path = self.folder() / self.file if self.file is not None else root
             if not is_there(path):
                 raise InputError(_absent(path))
@@ -109,19 +110,25 @@ class TransformsReader(CaptureReader):
 
     def _with_masks_and_depths(self, path: Path, found: list[FoundFrame]) -> list[View]:
         """Return the views with the files that frames name beside their pictures."""
-        files: dict[str, dict[str, Path]] = {}
-        for key in ("mask_path", "depth_file_path"):
-            names = [path_of(name, key, str(path)) for frame in found if (name := frame.settings.get(key))]
-            files[key] = find_pictures(names, path.parent, self.folder(), path, self.allow_outside, say=False)
-        masks, depths = files["mask_path"], files["depth_file_path"]
-        views = []
-        for frame in found:
-            view, mask, depth = frame.view, frame.settings.get("mask_path"), frame.settings.get("depth_file_path")
-            if mask in masks:
-                view = replace(view, photograph=replace(view.photograph, mask=masks[mask]))
-            # A depth map that is not there is left out, and named with others that cannot be used.
-            views.append(replace(view, depth=depths.get(depth, path.parent / depth)) if depth else view)
-        return views
+        masks, depths = (self._files_of(path, found, key) for key in ("mask_path", "depth_file_path"))
+        return [
+            replace(each.view, photograph=replace(each.view.photograph, mask=mask), depth=depth)
+            for each, mask, depth in zip(found, masks, depths, strict=True)
+        ]
+
+    def _files_of(self, path: Path, found: list[FoundFrame], key: str) -> list[Path | None]:
+        """Return the file that each frame names by a key; those that are not there are named, and their frames stay."""
+        names = [str(each.settings[key]) if each.settings.get(key) else None for each in found]
+        wanted = [name for name in names if name is not None]
+        photographs = {each.view.photograph.path for each in found}
+        files = find_pictures(wanted, path.parent, self.folder(), path, self.allow_outside, say=False)
+        files = {name: file for name, file in files.items() if file not in photographs}
+        absent = [name for name in wanted if name not in files]
+        if absent:
+            log.warning(
+                "%s: of %d files (%s) %d are not there: %s", path, len(wanted), key, len(absent), listed(absent, 3)
+            )
+        return [None if name is None else files.get(name) for name in names]
 
 
 def _files_in(folder: Path) -> list[Path]:

@@ -110,7 +110,7 @@ def test_equal_names_are_found_in_one_pass(tmp_path):
 
     (view,) = TransformsReader(str(write_transforms(tmp_path / "c", Known(c2w=ring(1))))).capture().views
     views = tuple(replace(view, name=Name("a.png")) for _ in range(1000))
-    refused(usable, Capture(views, tmp_path / "a.json"), parts=("a.json lists a.png more than",))
+    assert len(usable(Capture(views, tmp_path / "a.json")).views) == 1
     assert Name.compared < 5000
 
 

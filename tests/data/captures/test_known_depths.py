@@ -149,7 +149,7 @@ def test_depth_maps_that_cannot_be_used_are_left_out_and_named_once(tmp_path, ca
     assert scene.depths.pixels.view.unique().tolist() == [0]
     lines = [record.message for record in caplog.records if "depth maps" in record.message]
     assert len(lines) == 1
-    assert lines[0].startswith("3 depth maps are left out: 1.png has another shape than its photograph")
+    assert lines[0].startswith("2 depth maps are left out: 1.png has another shape than its photograph")
     assert "2.png is no grey picture of 16 bits" in lines[0]
 
 

@@ -125,7 +125,7 @@ def test_instant_ngps_box_is_kept_where_it_is(tmp_path):
     (root / "transforms.json").write_text(json.dumps(content))
     scene = read("transforms", root, space="bounded")
     middle = scene.to_user[:3, :3] @ scene.aabb.double().mean(dim=0) + scene.to_user[:3, 3]
-    torch.testing.assert_close(middle, torch.zeros(3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(middle, torch.zeros(3).double(), atol=1e-4, rtol=0)
     least = 2 / 0.33 / unit_of(scene.to_user)
     assert bool((scene.aabb[1] - scene.aabb[0] > 0.999 * least).all())
 

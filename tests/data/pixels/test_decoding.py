@@ -55,7 +55,7 @@ def cache(tmp_path):
 def decoded(monkeypatch):
     """The names of the files that have been decoded."""
     names = []
-    monkeypatch.setattr(module, "read_rgba", lambda path: names.append(path.name) or read_rgba(path))
+    monkeypatch.setattr(module, "read_rgba", lambda path, upright: names.append(path.name) or read_rgba(path))
     return names
 
 
@@ -226,7 +226,7 @@ count = 0
 plain = module.read_rgba
 
 
-def counted(path):
+def counted(path, upright):
     global count
     count += 1
     time.sleep(0.1)

@@ -14,6 +14,7 @@ from nerf_lightning.data.pixels.images import (
     crop_to_multiple,
     downscaled_size,
     image_size,
+    orientation_of,
     read_mask,
     read_rgba,
     whole_blocks,
@@ -174,9 +175,15 @@ def test_a_mask_keeps_what_is_brighter_than_127(tmp_path):
     assert read_mask(tmp_path / "one_bit.png").tolist() == [[True, False]]
 
 
-@pytest.mark.parametrize("pixel", [(255, 255, 254, 255), (255, 0, 255, 255), (9, 9, 9, 0)])
-def test_a_mask_with_colour_or_alpha_is_refused(tmp_path, pixel):
-    Image.new("RGBA", (2, 2), pixel).save(tmp_path / "m.png")
+@pytest.mark.parametrize("on", [(0, 0, 0, 255), (255, 0, 0, 0), (255, 255, 255, 0), (255, 255, 255, 255)])
+def test_a_mask_may_be_in_alpha_or_red_alone(tmp_path, on):
+    off = (0, 0, 0, 0)
+    Image.fromarray(np.array([[on, off]], np.uint8)).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png").tolist() == [[True, False]]
+
+
+def test_a_mask_whose_channels_say_different_things_is_refused(tmp_path):
+    Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]]], np.uint8)).save(tmp_path / "m.png")
     with pytest.raises(InputError, match=r"mask .*m.png has colours or transparent pixels.* white is kept"):
         read_mask(tmp_path / "m.png")
 
@@ -196,15 +203,18 @@ def test_a_block_is_kept_if_all_of_it_is():
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg", "webp"])
-def test_refuses_pictures_that_are_stored_turned(tmp_path, ending):
-    path = tmp_path / f"a.{ending}"
-    exif = Image.Exif()
+def test_a_picture_is_read_as_it_is_stored_or_upright(tmp_path, ending):
+    path, rgb = tmp_path / f"a.{ending}", picture(0, 6, 4)[..., :3]
+    for tag, orientation in ((6, 6), (0, 1), (9, 1)):
+        exif = Image.Exif()
+        exif[0x0112] = tag
+        Image.fromarray(rgb).save(path, exif=exif)
+        assert orientation_of(path) == orientation
     exif[0x0112] = 6
-    Image.fromarray(picture(0)[..., :3]).save(path, exif=exif)
-    with pytest.raises(
-        InputError, match=rf"a.{ending} carries the EXIF orientation 6.* remove the tag alone .* turn the pixels"
-    ):
-        read_rgba(path)
+    Image.fromarray(rgb).save(path, exif=exif)
+    stored = read_rgba(path)
+    assert stored.shape == (4, 6, 4)
+    assert np.array_equal(read_rgba(path, upright=True), np.rot90(stored, -1))
 
 
 def test_refuses_decompression_bombs(tmp_path):

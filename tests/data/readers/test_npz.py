@@ -99,7 +99,7 @@ ONE_NAN[2, 0, 0, 0] = np.nan
         ({"poses": np.array(1.0)}, r"has 10 images but 1 poses"),
         ({"poses": np.zeros((10, 4, 4))}, r"toy.npz: poses\[0\] does not end in the row 0 0 0 1"),
         ({"poses": np.zeros((10, 3, 4))}, r"toy.npz: the view 0 has a pose that is not a rotation"),
-        ({"poses": np.full((10, 3, 4), np.nan)}, r"the view 0 has a pose or intrinsics with NaN"),
+        ({"poses": np.full((10, 3, 4), np.nan)}, r"poses\[0\] holds NaN or infinity.* 10 of the 10 views"),
         ({"poses": np.full((10, 4, 4), "a")}, r"poses\[0\] is not a 4 x 4 matrix of numbers"),
         ({"images": np.zeros((10, 4, 6, 4))}, r"images has the shape \(10, 4, 6, 4\). It needs"),
         ({"images": np.zeros((10, 4, 6, 3), dtype=np.int64)}, r"images has the type int64, but it must be"),

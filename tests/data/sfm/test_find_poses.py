@@ -39,7 +39,7 @@ def capture(tmp_path, monkeypatch):
 def found(folder, source=None):
     source = source or folder / "images"
     require_new_capture(folder, source, is_video=False)
-    from_photographs(source, folder, SfmSettings(), allow_outside=False)
+    from_photographs(source, folder, SfmSettings())
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 

@@ -30,7 +30,7 @@ def found(tmp_path, monkeypatch):
 
     model = SparseModel(("a", "b", "c"), ("d", "e"), ("d",), num_points=9, num_cameras=1, reprojection_error=0.5)
 
-    def from_photographs(source, folder, settings, allow_outside):
+    def from_photographs(source, folder, settings):
         calls.append(source)
         shutil.copytree(tmp_path / "known" / "sparse", folder / "sparse")
         shutil.copytree(source, folder / "images")
