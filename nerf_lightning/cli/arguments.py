@@ -1,4 +1,4 @@
-"""The words of a command line: Hydra's own options, by Hydra's own parser, and paths, quoted or made overrides."""
+"""The words of a command line: Hydra's own options, by Hydra's own parser, settings, and paths made overrides."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,6 +41,25 @@ def _refuse(message: str) -> NoReturn:
     raise InputError(f"{message}.{hint} nerf COMMAND --hydra-help lists the options; settings are given as key=value.")
 
 
+def require_settings(words: Sequence[str], or_paths: bool) -> None:
+    """Refuse words that are no setting, as spaces around a `=` leave them.
+
+    Args:
+        words: as typed.
+        or_paths: a word without a `=` is a path.
+
+    Raises:
+        InputError: with the first of them.
+    """
+    bare = ["=" not in word and not word.startswith(("-", "~")) for word in words]
+    for word, is_bare, before_bare in zip(words, bare, [*bare, False][1:], strict=True):
+        if word.startswith("=") or (is_bare and not or_paths) or (word.endswith("=") and before_bare):
+            raise InputError(
+                f"'{word}' is no setting: settings are key=value without spaces: scene.root=data/x. A value that has "
+                'spaces needs quotes for the shell: "scene.root=data/my x".'
+            )
+
+
 def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
     """Return the arguments with those that are paths gathered into `key=...`.
 
@@ -60,18 +79,3 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
         raise InputError(f"{key}: one folder is wanted, and {len(paths)} were given: {', '.join(paths)}.")
     value = f"[{','.join(map(quoted, paths))}]" if several else quoted(paths[0])
     return [*(word for word in arguments if word not in paths), f"{key}={value}"]
-
-
-def quoted_paths(arguments: list[str]) -> list[str]:
-    """Return the arguments, the values quoted that are paths with a `=` in them, which Hydra would not read.
-
-    The folders of a sweep's jobs have one: `ckpt=outputs/sweeps/SWEEP/0_seed=0`.
-    """
-    return [_with_quotes(word) if word.count("=") > 1 and not word.startswith("-") else word for word in arguments]
-
-
-def _with_quotes(word: str) -> str:
-    from nerf_lightning.config.overrides import quoted
-
-    key, _, value = word.partition("=")
-    return f"{key}={quoted(value)}" if "=" in value and Path(value).exists() else word

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from nerf_lightning.cli.arguments import quoted_paths
 from nerf_lightning.cli.loading import announce_start, quick_imports
-from nerf_lightning.cli.prepare import prepared
+from nerf_lightning.cli.prepare import PATHS_ALONE, prepared
 from nerf_lightning.cli.process import ends_quietly
+from nerf_lightning.cli.quoting import quoted_paths
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
 from nerf_lightning.cli.working_directory import require_no_settings_here
 from nerf_lightning.config.manual.suggestions import did_you_mean
@@ -43,7 +43,8 @@ MOST_LETTERS = 5000
 def main() -> None:
     """Run the command line."""
     with explained("COMMAND"):
-        _answer(sys.argv[1:])
+        # A script that was edited on Windows ends its lines, and with them arguments, with a CR.
+        _answer([word.rstrip("\r") for word in sys.argv[1:] if word != "\r"])
 
 
 def _answer(arguments: list[str]) -> None:
@@ -149,13 +150,15 @@ def _run(command: str, arguments: list[str]) -> None:
             return module.run(config)
 
     with explained(command):
-        from nerf_lightning.cli.arguments import options_first
+        from nerf_lightning.cli.arguments import options_first, require_settings
         from nerf_lightning.cli.loading import compose_once
         from nerf_lightning.config.search_path import search_extensions
 
         arguments = options_first([DETAILS if word in VERBOSE else word for word in arguments])
+        require_settings(arguments, or_paths=command in PATHS_ALONE)
         allow_as_typed(arguments)
-        sys.argv = [f"nerf {command}", *options_first(quoted_paths(prepared(command, sweep_arguments(arguments))))]
+        arguments = quoted_paths(arguments, is_sweep(arguments))
+        sys.argv = [f"nerf {command}", *options_first(prepared(command, sweep_arguments(arguments)))]
         compose_once()
         search_extensions()
         run = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=command)(task)

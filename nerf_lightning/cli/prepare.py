@@ -9,6 +9,7 @@ from pathlib import Path
 
 from nerf_lightning.cli.arguments import named_paths
 from nerf_lightning.cli.loading import quick_imports
+from nerf_lightning.cli.quoting import unquoted
 from nerf_lightning.compute.slurm import was_requeued
 from nerf_lightning.messages.errors import InputError
 
@@ -34,7 +35,7 @@ def _train(arguments: list[str]) -> list[str]:
     arguments = open_sections(arguments)
     if not resumed or resumed[-1] in ("auto", "null"):
         return arguments
-    path = Path(resumed[-1].strip("'\""))
+    path = Path(unquoted(resumed[-1]))
     folder = path.parent.parent if path.suffix == ".ckpt" else path
     from nerf_lightning.runs.saved_overrides import former_overrides
 
@@ -43,7 +44,7 @@ def _train(arguments: list[str]) -> list[str]:
 
 def _refuse_second_sweep(arguments: list[str]) -> None:
     values = dict(argument.partition("=")[::2] for argument in arguments)
-    folder = Path(values.get("hydra.sweep.dir", "").strip("'\""))
+    folder = Path(unquoted(values.get("hydra.sweep.dir", "")))
     goes_on = values.get("sweep.resume", "").lower() == "true" or was_requeued()
     if "hydra.sweep.dir" in values and not goes_on and next(folder.glob("*/run.json"), None) is not None:
         raise InputError(
@@ -62,12 +63,13 @@ def _eval(arguments: list[str]) -> list[str]:
     checkpoints = [value for key, _, value in given if key == "ckpt"]
     if not checkpoints or any(key in ("scene", "--help") for key, _, _ in given):
         return arguments
-    if "," in checkpoints[-1]:
+    checkpoint = unquoted(checkpoints[-1])
+    if "," in checkpoint and checkpoint == checkpoints[-1]:
         raise InputError("A sweep over checkpoints needs the scene by name: add scene=... and its settings.")
     with quick_imports():
         from nerf_lightning.config.scene_overrides import scene_overrides
 
-    return [*scene_overrides(checkpoints[-1]), *arguments]
+    return [*scene_overrides(checkpoint), *arguments]
 
 
 def _view(arguments: list[str]) -> list[str]:
@@ -122,7 +124,7 @@ def _report(arguments: list[str]) -> list[str]:
     from nerf_lightning.config.scene_overrides import scene_overrides
 
     try:
-        recorded = scene_overrides(str(Path(given["run"].strip("'\"")) / "checkpoints" / "last.ckpt"))
+        recorded = scene_overrides(str(Path(unquoted(given["run"])) / "checkpoints" / "last.ckpt"))
     except InputError:
         return arguments  # the page says so
     return [*recorded, *arguments]
@@ -136,3 +138,6 @@ PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
     "table": _table,
     "report": _report,
 }
+
+PATHS_ALONE = ("table", "report")
+"""Commands that take paths without a key."""

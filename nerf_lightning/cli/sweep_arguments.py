@@ -5,6 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nerf_lightning.cli.quoting import unquoted
 from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
 
@@ -105,14 +106,16 @@ def _sweeps(arguments: list[str]) -> Iterator[tuple[Path, "SweepRecord"]]:
 
 def _value(arguments: list[str], *keys: str) -> str | None:
     pairs = [argument.partition("=") for argument in arguments]
-    values = [value.strip("'\"") for key, _, value in pairs if key in keys]
+    values = [unquoted(value) for key, _, value in pairs if key in keys]
     return values[-1] if values else None
 
 
 def _swept(arguments: list[str]) -> list[str]:
     pairs = [argument.partition("=") for argument in arguments]
     return [
-        key for key, _, values in pairs if ("," in values or "(" in values) and not set("/[{@~+") & set(key + values)
+        key
+        for key, _, values in pairs
+        if ("," in values or "(" in values) and not set("/[{@~+") & set(key + values) and unquoted(values) == values
     ]
 
 

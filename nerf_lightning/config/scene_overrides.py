@@ -34,7 +34,7 @@ def scene_overrides(path: str) -> list[str]:
         UnknownScene: it was trained on a scene that our conf/ lacks.
         InputError: the checkpoint cannot be read.
     """
-    checkpoint = read_checkpoint(path.strip("'\""))
+    checkpoint = read_checkpoint(path)
     name = checkpoint.choices.get("scene", "")
     known = option_names("scene")
     if name not in known:

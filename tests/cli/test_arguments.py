@@ -1,19 +1,23 @@
-"""Paths as they are typed, or pasted from what a sweep has said."""
+"""Words of a command line that are no settings."""
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
+import pytest
+from support.running import refused
 
-from nerf_lightning.cli.arguments import quoted_paths
-
-
-def test_the_folder_of_a_sweeps_job_is_read_as_it_was_printed(tmp_path):
-    folder = tmp_path / "0_optimizer.lr=0.03"
-    folder.mkdir()
-    words = quoted_paths([f"ckpt={folder}", "seed=1", "--cfg=job", f"paths.output_dir={tmp_path}/a=b"])
-    assert words[1:] == ["seed=1", "--cfg=job", f"paths.output_dir={tmp_path}/a=b"]
-    assert OverridesParser.create().parse_overrides(words[:1])[0].value() == str(folder)
+from nerf_lightning.cli.arguments import require_settings
 
 
-def test_what_is_quoted_already_stays(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a=b").mkdir()
-    assert quoted_paths(["ckpt='a=b'", "ckpt=a\\=b"]) == ["ckpt='a=b'", "ckpt=a\\=b"]
+@pytest.mark.parametrize("typed", ["scene.root= data/x", "scene = bricks", "scene.root data/x", "scene =bricks"])
+def test_spaces_around_the_equals_sign_are_told_in_one_paragraph(typed):
+    told = "settings are key=value without spaces: scene.root=data/x"
+    refused(require_settings, ["seed=1", *typed.split()], False, parts=(told,))
+
+
+@pytest.mark.parametrize("typed", ["runs = out", "runs= out", "runs =out"])
+def test_so_are_they_where_a_path_may_stand_alone(typed):
+    refused(require_settings, typed.split(), True, parts=("without spaces",))
+
+
+@pytest.mark.parametrize("or_paths", [False, True])
+def test_options_removals_and_empty_values_pass(or_paths):
+    require_settings([], or_paths)
+    require_settings(["--multirun", "~callbacks.film", "logger.name=", "a=b=c", *["out"] * or_paths], or_paths)

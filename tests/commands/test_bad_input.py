@@ -106,12 +106,12 @@ def test_batch_norm_with_tiles(nerf, capture, tmp_path):
         ("init_from=nowhere.ckpt", "There is no checkpoint at nowhere.ckpt"),
         ("trainer.max_epochs=0", "trainer.max_epochs=0"),
         ("trainer.max_epochs=inf", "trainer.max_epochs=inf: give a positive number up to"),
-        ("resume=5", "resume=5 does not fit: it must be a path"),
+        ("resume=[5]", "resume=[5] does not fit: it must be a path"),
         ("scene._target_=5", "See nerf train --help"),
         ("trainer.num_threads=0", "trainer.num_threads=0: give a number from 1 to 4096"),
         ("trainer.num_threads=1000000000", "trainer.num_threads=1000000000: give a number from 1 to 4096"),
         ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
-        ("init_from=5", "init_from=5 does not fit: it must be a path"),
+        ("init_from=true", "init_from=True does not fit: it must be a path"),
         ("init_from=[1]", "init_from=[1] does not fit: it must be a path"),
         ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 does not fit: it must be a Field, chosen by"),
         ("model.levels.coarse.field=[1]", "model.levels.coarse.field=[1] does not fit: it must be a Field"),
@@ -218,7 +218,7 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["render", "export what=cameras"])
-@pytest.mark.parametrize("ckpt", ["5", "[1]"])
+@pytest.mark.parametrize("ckpt", ["true", "[1]"])
 def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command, ckpt):
     said(nerf(*command.split(), f"ckpt={ckpt}", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
 
