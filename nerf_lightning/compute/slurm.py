@@ -15,6 +15,12 @@ def slurm_job() -> str | None:
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
 
 
+def num_tasks() -> int:
+    """Return how many tasks Slurm has given this job or step, 1 outside of Slurm."""
+    tasks = os.environ.get("SLURM_NTASKS", "")
+    return int(tasks) if tasks.isdecimal() else 1
+
+
 def was_requeued() -> bool:
     """Tell whether Slurm has started this job before."""
     return slurm_job() is not None and os.environ.get("SLURM_RESTART_COUNT", "0") not in ("", "0")

@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST, FAST_PATH, start, start_cold
+from support.running import FAST, FAST_PATH, said, start, start_cold
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import processes
@@ -160,6 +160,26 @@ def test_processes_that_would_train_alone_are_refused(nerf, capture, monkeypatch
     result = nerf(*arguments(capture))
     assert result.code == 2
     assert "Add trainer=torchrun" in result.err
+
+
+SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
+
+
+@pytest.mark.parametrize(
+    ("trainer", "more", "words"),
+    [
+        ("cpu", {}, ("4 tasks (SLURM_NTASKS=4)", "srun nerf train", "--ntasks-per-node=1")),
+        ("slurm", {}, ("not started by Slurm's srun",)),
+        ("slurm", {"STEP_ID": "0"}, ("4 tasks (SLURM_NTASKS=4)", "--ntasks-per-node=N")),
+    ],
+)
+def test_a_slurm_job_whose_tasks_would_not_train_together_is_refused(
+    nerf, capture, monkeypatch, tmp_path, trainer, more, words
+):
+    for name, value in (SLURM | more).items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    said(nerf(*arguments(capture, f"trainer={trainer}", f"paths.output_dir={tmp_path}/run")), *words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):

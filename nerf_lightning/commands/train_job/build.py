@@ -25,6 +25,7 @@ from nerf_lightning.training.callbacks.folder_guard import FolderGuard
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
 from nerf_lightning.training.callbacks.time_budget import TimeBudget
 from nerf_lightning.training.callbacks.training_time import TrainingTime
+from nerf_lightning.training.launch.processes import require_one_task
 from nerf_lightning.training.launch.trainer import TrainerSettings
 from nerf_lightning.training.loggers import WeightsAndBiases
 
@@ -74,6 +75,8 @@ def assemble_job(
         InputError: anything in the config or in the capture that makes no run.
     """
     settings: TrainerSettings = build(asked.trainer)
+    if settings.launched_by == "nerf":
+        require_one_task()
     settings.prepare_machine()
     post_training, loggers = PostTraining.from_config(asked), build(asked.logger)
     for each in loggers.values() if ranks.is_first() else ():

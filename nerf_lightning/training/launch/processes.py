@@ -22,12 +22,14 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.pytorch.plugins.environments import SLURMEnvironment
 from omegaconf import DictConfig, OmegaConf
 from torch import distributed
 
 from nerf_lightning.compute import ranks
 from nerf_lightning.compute.devices import choose_device
 from nerf_lightning.compute.settings import Launcher, cluster_environment
+from nerf_lightning.compute.slurm import num_tasks
 from nerf_lightning.config.instantiate import require_fitting_values
 from nerf_lightning.messages.errors import InputError
 
@@ -80,6 +82,21 @@ def num_processes(devices: int | str, device_type: str) -> int:
     if device_type != "cpu" and count > there:
         raise InputError(f"trainer.devices={devices}: there are {there} devices here. Give at most so many, or auto.")
     return count
+
+
+def require_one_task() -> None:
+    """Refuse to train alone in a Slurm job of several tasks: Lightning takes the process for one of them.
+
+    Raises:
+        InputError: with how many there are.
+    """
+    tasks = num_tasks()
+    if tasks > 1 and not distributed.is_initialized() and SLURMEnvironment.detect():
+        raise InputError(
+            f"This Slurm job has {tasks} tasks (SLURM_NTASKS={tasks}), and this process would train alone, on "
+            "one device. Ask for one task (sbatch or salloc --ntasks-per-node=1); or ask for --ntasks-per-node=N and "
+            "start one process for each by srun nerf train trainer=slurm ..."
+        )
 
 
 @contextmanager
@@ -178,7 +195,8 @@ def _share_of_cores(count: int) -> Iterator[None]:
 
 def _require_launcher(launcher: Launcher) -> None:
     by_torchrun = distributed.is_torchelastic_launched()
-    by_srun = int(os.environ.get("SLURM_NTASKS", "1")) > 1 and "SLURM_STEP_ID" in os.environ
+    tasks, in_step = num_tasks(), "SLURM_STEP_ID" in os.environ
+    by_srun = tasks > 1 and in_step
     if launcher == "torchrun" and not by_torchrun:
         raise InputError(
             "trainer=torchrun: this process was not started by torchrun. Start it with torchrun --standalone "
@@ -191,10 +209,15 @@ def _require_launcher(launcher: Launcher) -> None:
             "the others for ever. Start nerf train -m once, with trainer=ddp for jobs of several devices, or with "
             "hydra/launcher=submitit_slurm for jobs of a cluster."
         )
-    if launcher == "slurm" and "SLURM_PROCID" not in os.environ:
+    if launcher == "slurm" and ("SLURM_PROCID" not in os.environ or (tasks > 1 and not in_step)):
         raise InputError(
             "trainer=slurm: this process was not started by Slurm's srun. Put srun before nerf in the batch script, "
             "or use trainer=ddp, which starts the processes of one machine by itself."
+        )
+    if launcher == "slurm" and tasks > 1 and "SLURM_NTASKS_PER_NODE" not in os.environ:
+        raise InputError(
+            f"trainer=slurm: this job has {tasks} tasks (SLURM_NTASKS={tasks}) and does not say how many of them each "
+            "machine has. Give sbatch, salloc or srun --ntasks-per-node=N in the place of --ntasks."
         )
     if launcher == "nerf" and (by_torchrun or by_srun):
         name = "torchrun" if by_torchrun else "slurm"
