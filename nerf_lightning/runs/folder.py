@@ -50,6 +50,8 @@ class ResumePoint:
     step: int
     precision: str
     tile_points: int | None
+    num_steps: int
+    """Where the run was to end; of one that did not note it, its steps so far."""
 
 
 @dataclass
@@ -78,7 +80,16 @@ class RunFolder:
             with contextlib.suppress(FileNotFoundError):
                 os.replace(folder / LAST, folder / DAMAGED)
             path = path.replace(folder / LAST)
-        return ResumePoint(path, found.step, found.precision, found.tile_points)
+        planned = int(number(read_note(self.path).get("num_steps")) or 0)
+        return ResumePoint(path, found.step, found.precision, found.tile_points, max(found.step, planned))
+
+    def plan(self, num_steps: int) -> None:
+        """Note how long the run is to be.
+
+        Raises:
+            InputError: the folder is gone.
+        """
+        self._note(num_steps=num_steps)
 
     def trained(self, seconds: float) -> None:
         """Note how long this start has trained, from its first step to its last, and how long all else took before now.
@@ -156,7 +167,9 @@ def open_run(
         ) from error
     note = read_note(folder)
     kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
-        key: note[key] for key in ("started", "seconds", "training_seconds", "setup_seconds") if key in note
+        key: note[key]
+        for key in ("started", "seconds", "training_seconds", "setup_seconds", "num_steps")
+        if key in note
     }
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
     write_json(

@@ -1,6 +1,8 @@
 """A run stopped anywhere and resumed ends with the weights, bit for bit, of one that was never stopped."""
 
+import json
 import random
+import shutil
 import signal
 import time
 
@@ -126,6 +128,20 @@ def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped_s
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     assert_same_to_the_bit(state(folder), never_stopped_soon_over)
+
+
+@pytest.mark.parametrize(("planned", "asked", "end"), [(20, 8, 20), (24, 22, 24), (20, 22, 22)])
+def test_a_run_is_not_made_shorter_than_it_was_to_be(nerf, finished_run, tmp_path, planned, asked, end):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    note = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(note | {"num_steps": planned}))
+    quick = ("final.evaluate=false", "final.video=false")
+    result = nerf("train", f"resume={run}", f"trainer.max_steps={asked}", *quick)
+    assert result.code == 0, result.err
+    assert (f"goes on to step {planned}, not to {asked}" in result.err) == (asked < planned)
+    note = json.loads((run / "run.json").read_text())
+    assert (note["num_steps"], note["finished_at_step"], state(run)[0]) == (end, end, end)
 
 
 @pytest.mark.slow

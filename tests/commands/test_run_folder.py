@@ -166,11 +166,11 @@ def test_a_run_goes_on_as_its_newest_whole_checkpoint_says(tmp_path):
     folder = tmp_path / "here/checkpoints"
     for name, step in (("last", 8), ("previous", 7), ("best", 5)):
         save(folder / f"{name}.ckpt", step)
-    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 8, "bf16-mixed", 108)
-    assert resume_point(tmp_path, folder / "best.ckpt") == ResumePoint(folder / "best.ckpt", 5, "bf16-mixed", 105)
+    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 8, "bf16-mixed", 108, num_steps=8)
+    assert resume_point(tmp_path, folder / "best.ckpt") == ResumePoint(folder / "best.ckpt", 5, "bf16-mixed", 105, 5)
     assert resume_point(tmp_path, folder / "previous.ckpt").checkpoint == folder / "previous.ckpt"
     (folder / "last.ckpt").write_bytes(b"damaged")
-    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 7, "bf16-mixed", 107)
+    assert resume_point(tmp_path) == ResumePoint(folder / "last.ckpt", 7, "bf16-mixed", 107, 7)
     assert {path.name for path in folder.iterdir()} == {"last.ckpt", "damaged.ckpt", "best.ckpt"}
 
 

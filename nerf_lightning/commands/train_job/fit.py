@@ -29,6 +29,7 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         SystemExit: a signal stopped the training, which was saved (128 + signal).
     """
     former = folder.former
+    _keep_end(job, folder)
     _prepare(job, folder)
     trainer = job.settings.build(folder.path, job.num_steps, job.callbacks, folder.loggers)
     _announce(job, folder)
@@ -43,6 +44,21 @@ def fit(job: TrainJob, folder: HeldFolder) -> Trainer:
         log.info("stopped at step %d; go on with: %s", trainer.global_step, resume_command(folder.path))
         raise SystemExit(128 + job.signals.received)
     return trainer
+
+
+def _keep_end(job: TrainJob, folder: HeldFolder) -> None:
+    """Let a run that is gone on with be no shorter than it was to be: its learning rate has followed that length."""
+    former = folder.former
+    if former is not None and job.num_steps < former.num_steps:
+        log.warning(
+            "This run was to take %d steps, and its learning rate follows that length: it goes on to step %d, not to "
+            "%d. For a shorter run begin a new one.",
+            former.num_steps,
+            former.num_steps,
+            job.num_steps,
+        )
+        job.num_steps = former.num_steps
+    folder.plan(job.num_steps)
 
 
 def _prepare(job: TrainJob, folder: HeldFolder) -> None:

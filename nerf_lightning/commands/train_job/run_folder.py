@@ -32,6 +32,11 @@ class HeldFolder:
     held: RunFolder | None
     loggers: list[Logger]
 
+    def plan(self, num_steps: int) -> None:
+        """Note how long the run is to be."""
+        if self.held is not None:
+            self.held.plan(num_steps)
+
     def trained(self, seconds: float) -> None:
         """Note how long this start has trained."""
         if self.held is not None:
