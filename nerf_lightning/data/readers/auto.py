@@ -120,9 +120,9 @@ class AutoReader(CaptureReader):
         if found:
             captures = listed((f"scene.root={known.folder}" for known in found), 4)
             raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {captures}.")
-        known = listed((Known(folder, "", reader).scene for reader in READERS), len(READERS))
+        formats = listed((Known(folder, "", reader).scene for reader in READERS), len(READERS))
         raise InputError(
-            f"{self.root} holds no capture of a format that is known here ({known}): it holds {contents(folder)}."
+            f"{self.root} holds no capture of a format that is known here ({formats}): it holds {contents(folder)}."
             f"{self._hint()} If these are photographs whose cameras nobody knows yet, use scene=photos."
         )
 

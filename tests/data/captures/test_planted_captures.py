@@ -25,7 +25,7 @@ from nerf_lightning.data.sfm.video_frames import count_frames
 from nerf_lightning.messages.errors import InputError
 
 MEGABYTE = 2**20
-OUT = r"leads out of the capture's folder .*scene.allow_outside=true"
+OUT = r"leads out of the capture's folder.*scene.allow_outside=true"
 NAMES = {"llff": "llff", "colmap": "colmap", "text": "colmap", "transforms": "transforms"}
 
 
