@@ -16,8 +16,7 @@ except ImportError:  # Windows: what killed processes leave there stays
     fcntl = None  # type: ignore[assignment]
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-NO_ROOM = (*FULL, errno.EFBIG)
-"""A file may also be larger than is allowed."""
+NO_ROOM = (*FULL, errno.EFBIG)  # A file may also be larger than is allowed
 _PART = re.compile(r"\..*\.\d+\.part(\.\w+)?")
 
 
@@ -47,12 +46,9 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk_named(place: Path) -> Iterator[None]:
-    """Say of a full disk, a spent quota, or a file that may not grow, where it is.
+    """Say of a full disk, a spent quota, or a file that may not grow, where it is: `place`, if nothing nearer is known.
 
     The system says it of no file; a copy says it of the file that it reads.
-
-    Args:
-        place: the file or folder that is written, where nothing nearer is known.
     """
     try:
         yield

@@ -76,11 +76,7 @@ def set_limits(budgets: Budgets) -> None:
 
 
 def allow_as_typed(arguments: Iterable[str]) -> None:
-    """Let the defaults hold, but for what the command line says: files are read before Hydra has composed a config.
-
-    Raises:
-        InputError: a value that is no whole number above 0.
-    """
+    """Let the defaults hold, but for what the command line says: files are read before Hydra has composed a config."""
     known, typed = {field.name for field in fields(Budgets)}, dict[str, int]()
     for argument in arguments:
         key, _, value = argument.lstrip("+").partition("=")
@@ -93,17 +89,7 @@ def allow_as_typed(arguments: Iterable[str]) -> None:
 
 
 def require_within(name: str, found: int, where: str, what: str) -> None:
-    """Refuse what costs more than a person has agreed to.
-
-    Args:
-        name: of the budget.
-        found: how much there is, or is announced.
-        where: the file, for the message.
-        what: is counted, for the message.
-
-    Raises:
-        InputError: it is more than the budget, which the message names.
-    """
+    """Refuse what costs more than a person has agreed to: `found` of a `what`, where the budget `name` allows fewer."""
     most = getattr(limits(), name)
     if found > most:
         raise InputError(

@@ -37,17 +37,19 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
         target: where the file shall lie; its folder is made.
         num_bytes: its exact size.
         sha256: its checksum in hexadecimal; None checks the size only.
-
-    Raises:
-        InputError: whatever went wrong, and where to put the file by hand.
     """
     try:
-        _check_address(url, sha256)
+        parts = urlsplit(url)
+        # Nobody else's answer is believed.
+        if parts.scheme != "https" and not (parts.scheme == "http" and (sha256 or parts.hostname in LOCAL)):
+            raise _Failure(f"{url} is not an https address, and without a checksum nothing else is trusted")
         make_folder(target.parent)
         with FileLock(f"{target}.lock"):
             if not target.exists():
                 part = Path(f"{target}.part")
-                _check_room(part, num_bytes)
+                needed, free = num_bytes - _size(part), shutil.disk_usage(part.parent).free
+                if free < needed:
+                    raise _Failure(f"{part.parent} has {free} bytes free, but {needed} more are needed")
                 _receive(url, part, num_bytes)
                 _check_content(part, num_bytes, sha256)
                 os.replace(part, target)
@@ -61,22 +63,6 @@ def fetch(url: str, target: Path, num_bytes: int, sha256: str | None) -> None:
 
 class _Failure(Exception):
     """A reason, without the cure that `fetch` adds."""
-
-
-def _check_address(url: str, sha256: str | None) -> None:
-    """Refuse addresses whose answer could be anybody's."""
-    parts = urlsplit(url)
-    trusted = parts.scheme == "https" or (parts.scheme == "http" and (sha256 or parts.hostname in LOCAL))
-    if not trusted:
-        raise _Failure(f"{url} is not an https address, and without a checksum nothing else is trusted")
-
-
-def _check_room(part: Path, num_bytes: int) -> None:
-    """Refuse to start what the disk cannot hold."""
-    needed = num_bytes - _size(part)
-    free = shutil.disk_usage(part.parent).free
-    if free < needed:
-        raise _Failure(f"{part.parent} has {free} bytes free, but {needed} more are needed")
 
 
 def _size(part: Path) -> int:
@@ -97,7 +83,8 @@ def _receive(url: str, part: Path, num_bytes: int) -> None:
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
             # A server without ranges answers 200 with the whole file: start over.
-            resumes = response.status == 206 and _range_start(response) == have
+            first = response.headers.get("Content-Range", "").removeprefix("bytes ").partition("-")[0]
+            resumes = response.status == 206 and first == str(have)
             _copy(response, part, have if resumes else 0, num_bytes)
     except urllib.error.HTTPError as error:
         with error:
@@ -106,12 +93,6 @@ def _receive(url: str, part: Path, num_bytes: int) -> None:
         raise _Failure(f"no connection ({error.reason})") from error
     if _size(part) < num_bytes:
         raise _Failure(f"the connection broke off after {_size(part)} of {num_bytes} bytes, which are kept in {part}")
-
-
-def _range_start(response: http.client.HTTPResponse) -> int:
-    """Return the first byte of a partial answer, -1 where it does not say."""
-    first = response.headers.get("Content-Range", "").removeprefix("bytes ").partition("-")[0]
-    return int(first) if first.isdecimal() else -1
 
 
 def _refused(error: urllib.error.HTTPError, part: Path) -> NoReturn:
@@ -123,13 +104,7 @@ def _refused(error: urllib.error.HTTPError, part: Path) -> NoReturn:
 
 def _copy(response: http.client.HTTPResponse, part: Path, start: int, num_bytes: int) -> None:
     """Write the answer's body from byte `start` on, no more than one chunk beyond the file's size."""
-    columns = (
-        "{task.description}",
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = ("{task.description}", BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     if not start:
         part.unlink(missing_ok=True)
     with open_to_append(part) as file, progress_bar(*columns) as bar:

@@ -8,6 +8,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_html
 
 
@@ -17,6 +18,16 @@ def rendered(template: Path, **values: Any) -> str:
         loader=FileSystemLoader(template.parent), autoescape=True, undefined=StrictUndefined, finalize=_escaped
     )
     return environment.get_template(template.name).render(**values)
+
+
+def write_page(template: Path, target: Path, **values: Any) -> None:
+    """Write a page as one file, with the script and the style of its name beside the template."""
+    script, style = (template.with_suffix(ending).read_text(encoding="utf-8") for ending in (".js", ".css"))
+    policy = own_policy(script, style)
+    # Ours alone are put in as they are.
+    page = rendered(template, **values, policy=policy, script=Markup(script), style=Markup(style))
+    with whole_file(target) as part:
+        part.write_text(page, encoding="utf-8")
 
 
 def own_policy(script: str, style: str) -> str:

@@ -3,7 +3,6 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,7 @@ CURE = "Export it again, or mend it with a json checker."
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a json file.
-
-    Raises:
-        InputError: it cannot be read, is not json, or is larger or nested deeper than captures are.
-    """
+    """Return the content of a json file."""
     try:
         text = read_text(path, limits().json_bytes, CURE)
         require_within("json_lists", text.count("[") + text.count("{"), str(path), "lists and objects")
@@ -47,9 +42,11 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _require_flat(content: object, path: Path) -> None:
     # What follows walks through the content, and prints parts of it, by recursion.
-    level, most = [content], limits().json_depth
+    level, most = list[Any]([content]), limits().json_depth
     for _ in range(most):
-        level = [child for node in level if isinstance(node, (list, dict)) for child in _children(node)]
+        objects = [node.values() for node in level if isinstance(node, dict)]
+        lists = [node for node in level if isinstance(node, list)]
+        level = [child for node in (*objects, *lists) for child in node]
         if not level:
             return
     raise InputError(
@@ -57,22 +54,8 @@ def _require_flat(content: object, path: Path) -> None:
     )
 
 
-def _children(node: list[Any] | dict[str, Any]) -> Iterable[Any]:
-    return node.values() if isinstance(node, dict) else node
-
-
 def keys_of(content: object, keys: tuple[str, ...], where: str, wanted_by: str) -> list[Any]:
-    """Return the values of keys, all of which must be there.
-
-    Args:
-        content: what the file holds.
-        keys: which.
-        where: file and place, for messages.
-        wanted_by: the format, for messages.
-
-    Raises:
-        InputError: it is no json object, or a key is missing.
-    """
+    """Return the values of keys, all of which must be there; `where` and the format (`wanted_by`) are for messages."""
     if not isinstance(content, dict):
         raise InputError(
             f"{where} must be a json object with the keys {listed(keys)}, but it is {type(content).__name__}."
@@ -91,10 +74,14 @@ LARGEST = 1e30
 def read_json_object(path: Path) -> dict[str, Any]:
     """Return the content of a json file, empty where it is missing, damaged or something else than an object."""
     try:
-        content = read_json(path)
+        return mapping(read_json(path))
     except InputError:
         return {}
-    return content if isinstance(content, dict) else {}
+
+
+def mapping(value: object) -> dict[str, Any]:
+    """Return an object from a file, an empty one where it is anything else."""
+    return value if isinstance(value, dict) else {}
 
 
 def number(value: Any) -> float | None:

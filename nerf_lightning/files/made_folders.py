@@ -14,23 +14,14 @@ from filelock import FileLock, Timeout
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
-MARK = ".made_by_nerf_lightning"
-"""An empty file in each folder that may be emptied."""
+MARK = ".made_by_nerf_lightning"  # An empty file in each folder that may be emptied
 LOCK = "lock"
 
 _new: set[Path] = set()
 
 
 def below(root: Path, *names: str) -> Path:
-    """Return a place in a folder that the user named, which is reached through no link.
-
-    Args:
-        root: the folder; it may be a link.
-        *names: of the folders in it, from the outermost.
-
-    Raises:
-        InputError: with the link.
-    """
+    """Return a place in a folder that the user named (it may be a link), which is reached through no link."""
     place = root
     for name in names:
         place = place / name
@@ -55,12 +46,7 @@ def make_folder(root: Path, *names: str) -> Path:
 
 
 def make_new_folder(folder: Path) -> None:
-    """Make a folder of a name that nothing has, and those around it that are missing.
-
-    Raises:
-        FileExistsError: something has the name.
-        OSError: it cannot be made.
-    """
+    """Make a folder of a name that nothing has, and those around it that are missing."""
     folder.mkdir(parents=True)
     _new.add(folder)
 
@@ -79,12 +65,7 @@ def remove_empty(*folders: Path) -> None:
 
 
 def make_ours(root: Path, *names: str, files: str = "*") -> Path:
-    """Make a folder whose files will be removed again, and mark it as ours.
-
-    Args:
-        root: as for `below`.
-        *names: as for `below`.
-        files: the pattern of the names that will be removed.
+    """Make a folder as `below` returns it, whose `files` (a pattern) will be removed again, and mark it as ours.
 
     Raises:
         InputError: a link leads there, or it has such files and no mark.
@@ -109,6 +90,15 @@ def empty_ours(folder: Path, files: str = "*") -> None:
                 shutil.rmtree(path)
             elif path.name not in (MARK, LOCK):
                 path.unlink()
+
+
+def require_run(folder: Path) -> None:
+    """Refuse to write to the folder of a run that is gone."""
+    if not (folder / "run.json").is_file():
+        raise InputError(
+            f"The run folder {folder} was deleted, moved or renamed while the run was going on, so it stops here. If "
+            "the folder has another name now, go on with resume=NEW_NAME."
+        )
 
 
 class ScratchFolder:

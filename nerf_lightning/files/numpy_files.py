@@ -14,8 +14,7 @@ from numpy import ndarray
 
 from nerf_lightning.messages.errors import InputError
 
-HEADER_BYTES = 1 << 14
-"""numpy itself reads no header longer than 10,000 characters."""
+HEADER_BYTES = 1 << 14  # numpy itself reads no header longer than 10,000 characters
 
 
 @dataclass(frozen=True)
@@ -29,11 +28,7 @@ class ArrayHeader:
 
 
 def array_header(start: bytes, size: int) -> ArrayHeader:
-    """Return what the first bytes of a .npy file say.
-
-    Args:
-        start: its first `HEADER_BYTES`, or all of it.
-        size: bytes of the whole file.
+    """Return what the first `HEADER_BYTES` of a .npy file say, or all of it; `size` is that of the whole file.
 
     Raises:
         ValueError: no such file, one with Python objects, or a file of another size than its array.
@@ -52,11 +47,7 @@ def array_header(start: bytes, size: int) -> ArrayHeader:
 
 
 def archive_headers(archive: zipfile.ZipFile, keys: Sequence[str]) -> dict[str, ArrayHeader]:
-    """Return the headers of the arrays in an .npz archive that bear these names; absent ones are left out.
-
-    Raises:
-        ValueError: what `array_header` refuses.
-    """
+    """Return the headers of the arrays in an .npz archive that bear these names; absent ones are left out."""
     entries = {entry.filename: entry for entry in archive.infolist()}
     headers = {}
     for key in keys:
@@ -80,11 +71,7 @@ def read_member(archive: zipfile.ZipFile, key: str) -> Shaped[ndarray, "..."]:
 
 
 def check_unpacked(path: Path, num_bytes: int, most: float, cure: str) -> None:
-    """Refuse what would unpack to more than is allowed.
-
-    Raises:
-        InputError: with both sizes.
-    """
+    """Refuse what would unpack to more than is allowed."""
     if num_bytes > most:
         raise InputError(
             f"{path} ({path.stat().st_size:,} bytes) unpacks to {num_bytes / 1e9:,.2f} GB, and {most / 1e9:g} GB are "

@@ -15,12 +15,8 @@ OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 def make_own_folder(folder: Path, setting: str = SETTING) -> None:
     """Make a folder, and those above it that are missing, for the user alone (mode 0700).
 
-    Args:
-        folder: which.
-        setting: what names another one, for the message.
-
     Raises:
-        InputError: it is there already, and belongs to somebody else or can be written by others.
+        InputError: it belongs to somebody else or can be written by others; `setting` names another one.
         OSError: it cannot be made.
     """
     missing = [folder]

@@ -56,11 +56,7 @@ def open_to_append(path: Path, cure: str = CURE) -> io.BufferedWriter:
 
 
 def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
-    """Return the content of a regular file.
-
-    Raises:
-        InputError: it cannot be read, is no regular file, or is larger.
-    """
+    """Return the content of a regular file."""
     with explained(path, cure), open_regular(path, most_bytes, cure) as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:  # it has grown
@@ -69,11 +65,7 @@ def read_bytes(path: Path, most_bytes: int, cure: str = CURE) -> bytes:
 
 
 def read_text(path: Path, most_bytes: int, cure: str = CURE) -> str:
-    """Return the content of a text file in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n.
-
-    Raises:
-        InputError: what `read_bytes` refuses, or it is no text in this encoding.
-    """
+    """Return the content of a text file in UTF-8, or in UTF-16 with a byte order mark; ends of lines become \\n."""
     content = io.BytesIO(read_bytes(path, most_bytes, cure))
     try:
         return io.TextIOWrapper(content, encoding_of(content)).read()
@@ -91,11 +83,7 @@ def encoding_of(file: io.BufferedIOBase) -> str:
 
 @contextmanager
 def explained(path: Path, cure: str = CURE) -> Iterator[None]:
-    """Say of a file that cannot be opened or read what to do about it.
-
-    Raises:
-        InputError: in place of an `OSError`, or of a name that no file can have.
-    """
+    """Say of a file that cannot be opened or read what to do about it."""
     try:
         yield
     except OSError as error:

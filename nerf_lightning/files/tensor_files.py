@@ -97,13 +97,7 @@ def _names_a_type(argument: str) -> bool:
 def _made_anew(node: Any, path: Path, made: dict[int, Any]) -> Any:
     """Return tensors and containers of Python's own types; a pickle can hide an OrderedDict's methods by attributes.
 
-    Args:
-        node: of what was loaded.
-        path: of the file, for the message.
-        made: from what was met before, by its `id`, to what it became.
-
-    Raises:
-        InputError: a tensor has fewer numbers in the file than in its shape.
+    `made` has what was met before, by its `id`, and what it became.
     """
     if isinstance(node, Tensor):
         if node.numel() * node.element_size() > node.untyped_storage().nbytes():

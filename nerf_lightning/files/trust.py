@@ -27,10 +27,8 @@ from torch import Tensor
 
 from nerf_lightning.messages.errors import InputError
 
-MOST = 1 << 53
-"""Whole numbers beyond are no counts: a double cannot tell them apart."""
-RECORDED = (torch.float32, torch.int64, torch.uint8)
-"""Types of tensors with annotated shapes."""
+MOST = 1 << 53  # Whole numbers beyond are no counts: a double cannot tell them apart
+RECORDED = (torch.float32, torch.int64, torch.uint8)  # Types of tensors with annotated shapes
 CURE = "It was damaged or made by somebody else: use another one."
 
 
@@ -43,11 +41,7 @@ class Mismatch(ValueError):
 
 @contextmanager
 def reading(path: Path | str, cure: str = CURE) -> Iterator[None]:
-    """Turn whatever a broken file raises while it is read into one paragraph that names the file.
-
-    Raises:
-        InputError: in the place of any other exception.
-    """
+    """Turn whatever a broken file raises while it is read into one paragraph that names the file."""
     try:
         yield
     except InputError:
@@ -152,7 +146,9 @@ def _require_value(value: object, kind: Any, place: str) -> None:
         assert isinstance(value, Tensor)
         recorded = (*RECORDED, torch.float64) if getattr(kind, "dtypes", ()) == ("float64",) else RECORDED
         if kind is not Tensor and not (value.dtype in recorded and isinstance(value, kind)):
-            raise Mismatch(place, f"holds {value.dtype} in the shape {tuple(value.shape)}, not {_annotated(kind)}")
+            shape: Any = kind
+            ours = f"{kind.__name__.partition('[')[0].lower()} in the shape ({shape.dim_str})"
+            raise Mismatch(place, f"holds {value.dtype} in the shape {tuple(value.shape)}, not {ours}")
     elif kind is float:
         if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:  # type: ignore[arg-type]
             raise Mismatch(place, f"is {shown(value)}, not a finite number")
@@ -182,10 +178,6 @@ def _dict(value: object, place: str) -> dict[Any, Any]:
 
 def _name(key: object) -> str:
     return ascii(str(key)[:200])[1:-1]
-
-
-def _annotated(kind: Any) -> str:
-    return f"{kind.__name__.partition('[')[0].lower()} in the shape ({kind.dim_str})"
 
 
 def shown(value: object) -> str:

@@ -35,16 +35,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
-    """Return what a yaml text holds.
-
-    Args:
-        text: from a file that anybody may have written.
-        where: file and place, for the message.
-        cure: what to do about a bad one, for the message.
-
-    Raises:
-        InputError: it is no yaml, too long, or holds references.
-    """
+    """Return what a yaml text from anybody holds; `where` it stands, and the cure of a bad one, are for the message."""
     if len(text) > limits().yaml_characters:
         raise InputError(f"{where} has {len(text):,} characters of yaml, more than any file of this program. {cure}")
     try:
@@ -58,11 +49,7 @@ def plain_yaml(text: str, where: str, cure: str = CURE) -> Any:
 
 
 def read_plain_yaml(path: Path, cure: str = CURE) -> Any:
-    """Return what a yaml file holds.
-
-    Raises:
-        InputError: it cannot be read, or `plain_yaml` refuses it.
-    """
+    """Return what a yaml file holds."""
     return plain_yaml(read_text(path, 4 * limits().yaml_characters, cure), str(path), cure)
 
 

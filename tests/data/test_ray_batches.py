@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from support.scenes import ball_scene
@@ -47,7 +49,7 @@ def test_seeds_attempts_and_zero_differ():
     assert torch.equal(orders[0], flat(scene, batches(scene, seed=0).pixels_at(0, 0)))
 
 
-def test_the_crop_shows_centres_only_and_counts_no_epoch():
+def test_the_crop_shows_centres_only_counts_no_epoch_and_comes_again_with_a_restart():
     scene = ball_scene()
     loader = batches(scene, batch_rays=48, crop_steps=3)
     for step in range(3):
@@ -58,10 +60,6 @@ def test_the_crop_shows_centres_only_and_counts_no_epoch():
         assert int(pixels.y.max()) < 9
     after = torch.cat([flat(scene, loader.pixels_at(0, 48 * (3 + step))) for step in range(9)])
     assert torch.equal(after.sort().values, torch.arange(432))
-
-
-def test_a_restarted_run_goes_through_a_crop_even_where_the_first_had_none():
-    scene = ball_scene()
     loader = batches(scene)
     assert int(loader.pixels_at(0, 0).x.min()) < 3
     for step in range(5):
@@ -69,7 +67,7 @@ def test_a_restarted_run_goes_through_a_crop_even_where_the_first_had_none():
     assert int(loader.pixels_at(1, 32 * 5).x.min()) < 3
 
 
-def test_a_gathered_batch_is_the_pixels_own_colour():
+def test_a_gathered_batch_is_the_pixels_own_colour_and_the_loader_follows_the_runs_progress():
     scene = ball_scene()
     pixels = batches(scene).pixels_at(0, 0)
     batch = gather_batch(scene, pixels)
@@ -78,10 +76,6 @@ def test_a_gathered_batch_is_the_pixels_own_colour():
     for row in range(5):
         view, x, y = int(pixels.view[row]), int(pixels.x[row]), int(pixels.y[row])
         assert torch.equal((batch.rgba[row] * 255).round().to(torch.uint8), scene.pixels.view(view)[y, x])
-
-
-def test_the_loader_follows_the_runs_progress():
-    scene = ball_scene()
     loader = batches(scene)
     stream = iter(loader)
     first = next(stream)
@@ -112,8 +106,6 @@ def test_views_of_different_sizes_share_one_domain():
 
 
 def test_random_backgrounds_behind_pictures_without_alpha_are_questioned(caplog):
-    from dataclasses import replace
-
     scene = ball_scene(background="random")
     RayDataModule(scene, Progress(), seed=0)
     assert caplog.text == ""
@@ -156,16 +148,13 @@ def test_squares_follow_from_the_place_alone_and_their_grid_moves_from_epoch_to_
     assert len(set(map(frozenset, corners))) > 1
 
 
-def test_the_crop_holds_whole_squares():
+def test_squares_that_fit_no_picture_or_no_batch_are_refused_with_a_cure_and_the_crop_holds_whole_ones():
     scene = ball_scene()
     loader = squares(scene)
     loader.crop_to(0.5, steps=3, restart_steps=3)
     pixels = loader.pixels_at(0, 0)
     assert int(pixels.x.min()) >= 3
     assert int(pixels.x.max()) < 9
-
-
-def test_squares_that_fit_no_picture_or_no_batch_are_refused_with_a_cure():
     with pytest.raises(InputError, match=r"loss\.patch=16 .* ball_0 of ball has 12 x 12"):
         RayDataModule(ball_scene(), Progress(), 0, batch_rays=256, patch=16)
     with pytest.raises(InputError, match=r"data\.batch_rays=100 is no multiple .* data\.batch_rays=96"):

@@ -97,13 +97,10 @@ def test_a_full_disk_is_said_of_what_is_written(tmp_path, number):
         assert (caught.value.filename, caught.value.filename2) == (str(said), None)
 
 
-def test_whatever_befalls_a_file_is_said_of_it(tmp_path):
+def test_whatever_befalls_a_file_is_said_of_it_and_of_no_other(tmp_path):
     with pytest.raises(OSError, match="broken") as caught, whole_file(tmp_path / "a.txt"):
         raise OSError(errno.EIO, "broken")
     assert caught.value.filename == str(tmp_path / "a.txt")
-
-
-def test_another_error_is_said_of_no_other_file(tmp_path):
     with pytest.raises(ConnectionRefusedError) as caught:
         fail_in(tmp_path, ConnectionRefusedError(errno.ECONNREFUSED, "refused"))
     assert caught.value.filename is None

@@ -26,20 +26,17 @@ def test_every_command_has_it(command):
     assert composed(command).budgets == asdict(Budgets())
 
 
-def test_a_limit_is_raised_by_what_is_typed_and_by_nothing_else():
+def test_a_limit_is_raised_by_what_is_typed_alone_and_what_is_too_much_is_said_with_its_setting():
     allow_as_typed(["scene=npz", "budgets.views=7", "xbudgets.json_depth=3", "budgets.nothing=4"])
     assert limits() == Budgets(views=7)
     allow_as_typed([])
     assert limits() == Budgets()
+    require_within("views", 200_000, "FILE", "views")
+    with pytest.raises(InputError, match=r"FILE has 200,001 views, .* add budgets\.views=200001"):
+        require_within("views", 200_001, "FILE", "views")
 
 
 @pytest.mark.parametrize("value", ["0", "-3", "many", "1.5", ""])
 def test_a_limit_is_a_whole_number(value):
     with pytest.raises(InputError, match=r"budgets\.views=.*give a whole number above 0"):
         allow_as_typed([f"budgets.views={value}"])
-
-
-def test_what_is_too_much_is_said_with_the_setting_that_takes_it():
-    require_within("views", 200_000, "FILE", "views")
-    with pytest.raises(InputError, match=r"FILE has 200,001 views, .* add budgets\.views=200001"):
-        require_within("views", 200_001, "FILE", "views")

@@ -89,42 +89,29 @@ def refused(url, target, reason, num_bytes=NUM_BYTES, sha256=SHA256):
     assert not target.exists()
 
 
-def test_brings_the_file_and_leaves_no_part(server, target):
+def test_brings_the_file_and_leaves_no_part_nor_fetches_it_again(server, target):
     fetch(server.url, target, NUM_BYTES, SHA256)
     assert target.read_bytes() == CONTENT
     assert not target.with_name("file.bin.part").exists()
-
-
-def test_a_file_that_is_there_is_not_fetched(server, target, part):
     target.write_bytes(b"mine")
     fetch(server.url, target, NUM_BYTES, SHA256)
-    assert (target.read_bytes(), server.asked) == (b"mine", [])
+    assert (target.read_bytes(), server.asked) == (b"mine", [None])
 
 
-def test_goes_on_from_the_part(server, target, part):
-    part.write_bytes(CONTENT[:1000])
+@pytest.mark.parametrize(
+    ("there", "takes_ranges", "asked"),
+    [
+        (CONTENT[:1000], True, ["bytes=1000-"]),
+        (CONTENT[:1000], False, ["bytes=1000-"]),  # starts over
+        (CONTENT, True, []),  # checked without the network
+        (CONTENT + b"more", True, [None]),  # dropped
+    ],
+)
+def test_goes_on_from_the_part_or_starts_over(server, target, part, there, takes_ranges, asked):
+    server.takes_ranges = takes_ranges
+    part.write_bytes(there)
     fetch(server.url, target, NUM_BYTES, SHA256)
-    assert target.read_bytes() == CONTENT
-    assert server.asked == ["bytes=1000-"]
-
-
-def test_starts_over_where_the_server_knows_no_ranges(server, target, part):
-    server.takes_ranges = False
-    part.write_bytes(CONTENT[:1000])
-    fetch(server.url, target, NUM_BYTES, SHA256)
-    assert target.read_bytes() == CONTENT
-
-
-def test_a_whole_part_is_checked_without_the_network(server, target, part):
-    part.write_bytes(CONTENT)
-    fetch(server.url, target, NUM_BYTES, SHA256)
-    assert (target.read_bytes(), server.asked) == (CONTENT, [])
-
-
-def test_a_part_that_is_too_long_is_dropped(server, target, part):
-    part.write_bytes(CONTENT + b"more")
-    fetch(server.url, target, NUM_BYTES, SHA256)
-    assert (target.read_bytes(), server.asked) == (CONTENT, [None])
+    assert (target.read_bytes(), server.asked) == (CONTENT, asked)
 
 
 def test_a_broken_connection_keeps_what_came_and_goes_on_later(server, target):
@@ -142,27 +129,19 @@ def test_two_at_a_time_fetch_once(server, target):
     assert (target.read_bytes(), server.asked) == (CONTENT, [None])
 
 
-def test_wrong_checksum(server, target):
+def test_a_wrong_checksum_a_longer_file_and_one_that_is_absent_are_told(server, target):
     refused(server.url, target, rf"its checksum is {SHA256}, not abc; what arrived was removed", sha256="abc")
     assert not target.with_name("file.bin.part").exists()
-
-
-def test_file_that_is_longer_than_promised(server, target):
-    refused(
-        server.url, target, r"the server's file has not 99 bytes: 65536 had arrived when it was stopped", num_bytes=99
-    )
+    refused(server.url, target, r"file has not 99 bytes: 65536 had arrived when it was stopped", num_bytes=99)
     assert not target.with_name("file.bin.part").exists()
+    server.status_for_all = 404
+    refused(server.url, target, "the server answered 404 Not Found")
 
 
 def test_file_that_is_shorter_than_the_part(server, target, part):
     part.write_bytes(CONTENT + b"beyond")
     refused(server.url, target, "the server answered 416", num_bytes=NUM_BYTES * 2)
     assert not part.exists()
-
-
-def test_absent_on_the_server(server, target):
-    server.status_for_all = 404
-    refused(server.url, target, "the server answered 404 Not Found")
 
 
 def test_unreachable_port(monkeypatch, target):
@@ -174,21 +153,16 @@ def test_unreachable_port(monkeypatch, target):
 
 
 @pytest.mark.parametrize("url", ["http://example.invalid/a", "ftp://example.invalid/a", "file:///etc/hosts", "a"])
-def test_only_https_is_trusted_without_a_checksum(target, url):
+def test_only_https_is_trusted_without_a_checksum_and_http_with_one(target, url):
     refused(url, target, "is not an https address, and without a checksum nothing else is trusted", sha256=None)
+    if not url.startswith("http"):
+        refused(url, target, "is not an https address")
 
 
-@pytest.mark.parametrize("url", ["ftp://example.invalid/a", "file:///etc/hosts"])
-def test_a_checksum_does_not_open_other_schemes(target, url):
-    refused(url, target, "is not an https address")
-
-
-def test_no_room_on_the_disk(monkeypatch, target):
+def test_no_room_on_the_disk_and_a_folder_that_cannot_be_made_are_told(monkeypatch, target, tmp_path):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10, 5, 5))
     refused("https://example.invalid/a", target, r"has 5 bytes free, but 307200 more are needed")
-
-
-def test_folder_that_cannot_be_made(tmp_path):
+    monkeypatch.undo()
     (tmp_path / "file").touch()
     refused("https://example.invalid/a", tmp_path / "file" / "a", "exists")
 

@@ -124,9 +124,8 @@ def test_photographs_are_not_kept_in_a_folder_of_others(tmp_path):
     root, cache = WRITERS["llff"](tmp_path / "capture"), tmp_path / "cache"
     read("llff", root)
     cache.chmod(0o777)
-    with pytest.raises(
-        InputError, match=r"cache can be written by others \(mode 0777\).*NERF_LIGHTNING_CACHE or scene"
-    ):
+    told = r"cache can be written by others \(mode 0777\).*NERF_LIGHTNING_CACHE or scene"
+    with pytest.raises(InputError, match=told):
         read("llff", root)
 
 

@@ -10,12 +10,12 @@ READS = {"read_text", "read_bytes", "open", "imread", "imiter", "fromfile", "mem
 LOADERS = {"np", "torch", "OmegaConf"}
 # The program's own text, its own process's, the system's, or what it has written a moment ago.
 OURS = {
-    "config/compose.py": ["load"],
+    "config/instantiate.py": ["load"],
     "commands/train_job/live_view.py": ["print"],  # the address, which is ours
-    "cli/main.py": ["load", "read_text", "print", "print", "print", "print", "print", "print"],
+    "cli/main.py": ["read_text", "print", "print", "print", "print", "print", "print"],
     "cli/loading.py": ["print"],
     "cli/process.py": ["print", "open"],
-    "cli/completion.py": ["read_text"],
+    "cli/help.py": ["read_text"],
     "config/manual/docstrings.py": ["read_text"],
     "config/manual/yaml_comments.py": ["read_text"],
     "export/page_file.py": ["read_text"],
@@ -30,13 +30,12 @@ OURS = {
     "viewer/page.py": ["open"],
     "export/images.py": ["load"],
     "evaluation/kept_views.py": ["load"],  # files without a name, which it wrote itself
-    "report/page.py": ["read_text"],
-    "report/table_page.py": ["read_text"],
+    "files/html.py": ["read_text"],
     "runs/published.py": ["read_text"],
     "selftest/command_line.py": ["read_text"],
     "compute/machine.py": ["read_text", "read_text", "read_text"],
     "nerf/kernels/backends.py": ["read_bytes", "read_text"],
-    "selftest/machine.py": ["read_text"],
+    "commands/selftest.py": ["read_text"],
     "cli/worker.py": ["load", "load"],
 }
 # For writing, in a folder of its own, or of what was opened by us.
@@ -49,6 +48,7 @@ OTHERWISE = {
     "data/bricks/parts.py": ["read_text"],
     "data/pixels/images.py": ["open"],
     "files/numpy_files.py": ["open", "open"],
+    "data/sfm/gps.py": ["open"],
     "data/sfm/photograph_folder.py": ["open", "open"],
     "data/pixels/decoding.py": ["open"],
     "data/pixels/plain_background.py": ["open"],

@@ -62,6 +62,13 @@ def nerf(monkeypatch, capfd):
     return call
 
 
+@pytest.fixture
+def train(nerf, capture, tmp_path):
+    """Call `nerf train` on the ball, as small as a test wants it, into tmp_path/run."""
+    place = ("scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run")
+    return lambda *settings: nerf("train", *place, *settings)
+
+
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory, capture):
     """A run of 20 steps, evaluated and filmed."""

@@ -119,4 +119,4 @@ def plant(evidence: Evidence, fault: str, seed: int) -> Found:
     total = accused.count(",") + accused.count(" and ") + 1 if accused else 0
     innocent = max(0, total - sum(name in accused for name in names)) if bad or accused else 0
     text = "; ".join(f"{check.name}: {check.message}" for check in wrong)
-    return Found(fault, bool(wrong), any(check.verdict != "ok" for check in checks), named, innocent, text)
+    return Found(fault, bool(wrong), any(check.verdict in ("look", "wrong") for check in checks), named, innocent, text)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from support.fork_server import Forked, fits_a_fork
 
 from nerf_lightning.messages.errors import InputError
@@ -75,6 +76,18 @@ def start_cold(module: str, *arguments: str, **options) -> subprocess.Popen:
         text=True,
         **({"cwd": REPOSITORY, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options),
     )
+
+
+def finished(process: subprocess.Popen | Forked) -> tuple[int | None, str]:
+    """Wait for the end of a process; return its exit code and what it said."""
+    output, _ = process.communicate(timeout=300)
+    return process.returncode, output or ""
+
+
+def saved(folder: Path) -> dict:
+    """Return a run's newest checkpoint; one of step 0 where there is none yet."""
+    last = folder / "checkpoints" / "last.ckpt"
+    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
 
 
 def said(result, *parts: str) -> None:

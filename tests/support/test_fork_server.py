@@ -37,11 +37,14 @@ def test_warnings_are_filtered_as_in_a_process_of_its_own(tmp_path_factory):
     assert told(code) == (0, "".join(f"{line}\n" for line in alone))
 
 
-def test_it_has_its_own_folder_environment_and_arguments(tmp_path, monkeypatch):
+def test_it_has_its_own_folder_environment_arguments_and_session(tmp_path, monkeypatch):
     monkeypatch.setenv("THIS_IS_HERE", "now")
     code = "import os, sys; print(os.getcwd(), os.environ.get('THIS_IS_HERE'), os.environ.get('HOME'), sys.argv)"
     assert told(code, 1, "two", cwd=tmp_path) == (0, f"{tmp_path} now {os.environ.get('HOME')} ['-c', '1', 'two']\n")
     assert told(code, cwd=tmp_path, env={}) == (0, f"{tmp_path} None None ['-c']\n")
+    code = "import os; print(os.getsid(0) == os.getpid() == os.getpgid(0))"
+    assert told(code, start_new_session=True) == (0, "True\n")
+    assert told(code) == (0, "False\n")
 
 
 @pytest.mark.parametrize(
@@ -76,20 +79,11 @@ def test_signals_reach_it():
         process.kill()
 
 
-def test_it_may_have_a_session_of_its_own():
-    code = "import os; print(os.getsid(0) == os.getpid() == os.getpgid(0))"
-    assert told(code, start_new_session=True) == (0, "True\n")
-    assert told(code) == (0, "False\n")
-
-
-def test_each_stream_can_be_a_pipe():
+def test_each_stream_can_be_a_pipe_and_a_reader_that_left_breaks_it():
     code = "import sys; print(sys.stdin.read()); print('wrong', file=sys.stderr)"
     process = Forked("-c", code, stdin=PIPE, stderr=PIPE)
     process.stdin.write("hello")
     assert process.communicate(timeout=60) == ("hello\n", "wrong\n")
-
-
-def test_a_reader_that_left_breaks_the_pipe():
     process = Forked("-c", "import time; time.sleep(0.3); print('x', flush=True)", stderr=PIPE)
     process.stdout.close()
     with process.stderr:
@@ -97,22 +91,13 @@ def test_a_reader_that_left_breaks_the_pipe():
     assert process.wait(60) in (1, 120), "120 is what Python says where it still holds what it could not write"
 
 
-def test_random_numbers_differ_from_fork_to_fork():
-    code = "import random, numpy, torch; print(random.random(), numpy.random.rand(), torch.rand(()).item())"
-    one, other = told(code)[1].split(), told(code)[1].split()
-    assert all(mine != theirs for mine, theirs in zip(one, other, strict=True))
-
-
-def test_what_is_read_at_import_needs_a_process_of_its_own():
+def test_what_is_read_at_import_needs_a_process_of_its_own_and_a_call_of_nerf_in_this_one_changes_nothing(monkeypatch):
     assert fits_a_fork(os.environ)
     assert fits_a_fork(os.environ | {"PATH": "/elsewhere"})
     assert not fits_a_fork(os.environ | {"OMP_NUM_THREADS": "13"})
     assert not fits_a_fork(os.environ | {"PYTHONHASHSEED": "13"})
     assert not fits_a_fork(os.environ | {"SLURM_CPUS_PER_TASK": "1"})
     assert not fits_a_fork(os.environ | {"GOMP_SPINCOUNT": "13"})
-
-
-def test_a_call_of_nerf_in_this_process_changes_nothing_of_that(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     assert fits_a_fork(os.environ)
@@ -121,8 +106,11 @@ def test_a_call_of_nerf_in_this_process_changes_nothing_of_that(monkeypatch):
     assert told("import sys; print(sys.stdout.write_through)") == (0, "False\n")
 
 
-def test_it_runs_the_command_line():
+def test_it_runs_the_command_line_and_random_numbers_differ_from_fork_to_fork():
     process = Forked("-m", "nerf_lightning", "trian")
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 2
     assert output.startswith("nerf: There is no command 'trian'.")
+    code = "import random, numpy, torch; print(random.random(), numpy.random.rand(), torch.rand(()).item())"
+    one, other = told(code)[1].split(), told(code)[1].split()
+    assert all(mine != theirs for mine, theirs in zip(one, other, strict=True))

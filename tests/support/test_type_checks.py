@@ -25,23 +25,17 @@ def summed(
     return (points * weights[..., None]).sum(-2) if weights.shape[-1] > 1 else points
 
 
-def test_our_functions_are_checked_so():
-    with pytest.raises(TypeCheckError, match="deltas"):
-        weights_from_density(torch.ones(4, 3), torch.ones(4, 2))
-
-
-def test_axes_of_one_name_have_one_size_within_a_call_and_any_in_the_next():
+def test_axes_of_one_name_have_one_size_within_a_call_also_in_what_is_returned_and_any_in_the_next():
     assert summed(torch.ones(2, 5, 3), torch.ones(2, 5)).shape == (2, 3)
     assert summed(torch.ones(7, 4, 6, 3), torch.ones(7, 4, 6)).shape == (7, 4, 3)
     with pytest.raises(TypeCheckError, match="weights"):
         summed(torch.ones(2, 5, 3), torch.ones(2, 4))
     with pytest.raises(TypeCheckError, match="points"):
         summed(torch.ones(2, 5, 3, dtype=torch.int64), torch.ones(2, 5))
-
-
-def test_what_is_returned_is_checked_with_the_axes_of_what_was_given():
     with pytest.raises(TypeCheckError, match="return"):
         summed(torch.ones(2, 1, 3), torch.ones(2, 1))
+    with pytest.raises(TypeCheckError, match="deltas"):
+        weights_from_density(torch.ones(4, 3), torch.ones(4, 2))
 
 
 def test_a_function_made_anew_with_each_call_is_checked_each_time():
@@ -81,6 +75,16 @@ def test_axes_can_be_named_by_arguments():
     assert drawn(2).shape == (2,)
     with pytest.raises(TypeCheckError):
         drawn(3)
+
+
+def test_values_that_decide_are_looked_at_each_time():
+    @decorated
+    def named(values: Float[Tensor, " n"], way: Literal["up", "down"]) -> list[Float[Tensor, " n"]]:
+        return [values]
+
+    named(torch.ones(3), "up")
+    with pytest.raises(TypeCheckError, match="way"):
+        named(torch.ones(3), "left")
 
 
 def test_a_generator_is_checked_when_it_is_made_and_its_axes_are_its_own():
@@ -129,16 +133,6 @@ def test_what_passed_once_passes_again_and_nothing_else_does():
         with pytest.raises(TypeCheckError, match="more"):
             parts(torch.ones(3), "right", torch.ones(2))
     assert calls == 2 * ["right", "wrong"]
-
-
-def test_values_that_decide_are_looked_at_each_time():
-    @decorated
-    def named(values: Float[Tensor, " n"], way: Literal["up", "down"]) -> list[Float[Tensor, " n"]]:
-        return [values]
-
-    named(torch.ones(3), "up")
-    with pytest.raises(TypeCheckError, match="way"):
-        named(torch.ones(3), "left")
 
 
 def test_what_has_a_shape_need_not_be_an_array():

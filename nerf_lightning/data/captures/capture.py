@@ -42,7 +42,7 @@ class Capture:
     lens_model: LensModel = "pinhole"
     points: Float[Tensor, "points 3"] = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
     """Sparse points of the reconstruction."""
-    point_errors: Float[Tensor, "points"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    point_errors: Float[Tensor, "known"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     """Mean distance in pixels between where a point was seen and where it projects to; empty without `tracks`."""
     tracks: Int[Tensor, "seen 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.int64))
     """Which point was seen in which view, where the format says so."""

@@ -22,8 +22,10 @@ from nerf_lightning.nerf.types.scene import Background, Cameras, LensModel, Scen
 LEAST_FOCAL, FARTHEST = 1e-3, 1e9
 """What a camera can have: a focal length in pixels, and coordinates (in the capture's units, and in the scene's) that
 have not lost every digit that a picture could show."""
-LEAST_SCALE, ALMOST_ONE = 1e-6, 1e-3
+LEAST_SCALE, ALMOST_ONE = 1e-6, 4e-4
 """Of a rotation's scale: less is none, and so near to 1 it is rounding."""
+SMALL = 16
+"""Pixels of a side, up to which a principal point may be as near to the corner as 1."""
 WIDEST = 170.0
 """Degrees across a picture, beyond which nothing was photographed through a perspective lens."""
 
@@ -50,7 +52,8 @@ def usable(capture: Capture) -> Capture:
             " stay",
             *(capture.source, len(scaled), len(views), scaled[0]),
         )
-    first: dict[str, View] = {}
+    first: dict[str, int] = {}
+    same: dict[int, int] = {}
     kept = []
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
@@ -60,13 +63,19 @@ def usable(capture: Capture) -> Capture:
             if fault := _fault_of(view, capture.lens_model):
                 raise InputError(f"{capture.source}: the view {view.name} {fault}")
             if view.name not in first:
-                first[view.name] = view
+                first[view.name] = number
                 kept.append(number)
-            elif not torch.allclose(view.c2w, first[view.name].c2w):  # files and tables are written by name
-                kept = [other for other in kept if views[other] is not first[view.name]]
+            elif torch.allclose(view.c2w, views[first[view.name]].c2w):
+                same[number] = first[view.name]
+            else:  # files and tables are written by name
+                kept = [other for other in kept if other != first[view.name]]
                 raise InputError(f"{capture.source} lists {view.name} more than once, with different poses.")
     capture.left_out.require_enough(len(kept))
-    return _with_known_depths(replace(capture, views=views).some(kept))
+    splits = capture.splits and {
+        split: tuple(dict.fromkeys(same.get(number, number) for number in numbers))
+        for split, numbers in capture.splits.items()
+    }
+    return _with_known_depths(replace(capture, views=views, splits=splits).some(kept))
 
 
 def _without_scale(view: View) -> tuple[View, float | None]:
@@ -116,6 +125,11 @@ def _fault_of(view: View, lens_model: LensModel) -> str | None:
             f"has its principal point at {center[0]:g}, {center[1]:g}, outside of its {width:g} x {height:g} pixels. "
             "The intrinsics belong to pictures of another size, or are in other units; they must be in pixels of the "
             "width and height beside them."
+        )
+    if max(center) <= 1 and min(width, height) > SMALL:
+        return (
+            f"has its principal point at {center[0]:g}, {center[1]:g} of {width:g} x {height:g} pixels, which looks "
+            "like a share of the picture: it must be in pixels. Export the intrinsics again."
         )
     if not bool(is_rigid(view.c2w)):
         return (

@@ -114,8 +114,9 @@ def depths_of_points(
     errors = torch.where(errors >= 0.0, errors, UNKNOWN_ERROR).clamp(min=LEAST_ERROR)
     relative = errors[point] * pixel / angle.clamp(min=1e-9)
     certainty = 1.0 / (1.0 + (relative / CERTAIN).square())
-    for number in view.unique().tolist():
-        own = ((view == number) & (certainty >= LEAST_CERTAINTY)).nonzero()[:, 0]
+    seen_by, count = view.sort(stable=True).values.unique_consecutive(return_counts=True)
+    for number, rows in zip(seen_by.tolist(), view.argsort(stable=True).split(count.tolist()), strict=True):
+        own = rows[certainty[rows] >= LEAST_CERTAINTY]
         inside, x, y = seen_at(cameras, number, points[point[own]])
         kept = own[inside]
         pixels = PixelIndex(torch.full_like(kept, number), x[inside], y[inside])

@@ -10,24 +10,30 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
+from urllib.parse import unquote
 
+from nerf_lightning.data.pixels.formats import HEIC_ENDINGS, UNREAD, decoders
 from nerf_lightning.data.pixels.images import ENDINGS
-from nerf_lightning.files.links import is_there
+from nerf_lightning.files.links import is_absolute, is_there
 from nerf_lightning.files.walk import walk
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
 
 PICTURE_FOLDERS = ("images", "image", "rgb", "input", "", "images_2", "images_4", "images_8")
 """Where photographs lie below a capture's folder, the likeliest first."""
-KNOWN_ENDINGS = (*ENDINGS, ".heic", ".heif", ".hif", ".dng", ".bmp", ".exr")
+JPEG = (".jpg", ".jpeg")
+KNOWN_ENDINGS = (*ENDINGS, *UNREAD, ".bmp")
 SPLIT_FOLDERS = ("train", "val", "test", "eval")
-"""Names that tell pictures apart which are called alike: they are never dropped."""
+"""Names that tell pictures apart which are called alike: they are never dropped, nor taken for each other."""
 BESIDE_PHOTOGRAPHS = re.compile(r"(masks?|depths?|normals?|segmentations?|semantics?|confidence)(_.*)?")
 """Folders of pictures that are no photographs."""
+MASK_ENDING = re.compile(r"[._-]masks?$")
+"""What a mask's name may have and its photograph's has not."""
 DRIVE = re.compile(r"^[a-zA-Z]:")
+NUMBERS = re.compile(r"(\D*)(\d*)", re.ASCII)
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +47,12 @@ class Rule(NamedTuple):
 
 
 def find_pictures(
-    names: Sequence[str], folder: Path, root: Path, source: Path, outside: bool = False, say: bool = True
+    names: Sequence[str],
+    folder: Path,
+    root: Path,
+    source: Path,
+    outside: bool = False,
+    beside: Collection[Path] | None = None,
 ) -> dict[str, Path]:
     """Return the file of each name; names that none fits are absent.
 
@@ -54,19 +65,27 @@ def find_pictures(
         root: the capture's folder.
         source: the file that has the names, for messages.
         outside: whether names may lead out of `root` and `folder`.
-        say: whether to name a file that is found by another name.
+        beside: the photographs, where what lies beside them is wanted: masks, which may be called with _mask, or depth
+            maps. None: photographs are wanted, and one that is found by another name is named.
 
     Raises:
         InputError: two folders fit alike, and neither is called as a folder of photographs is.
     """
     inside = [Path(os.path.abspath(each)) for each in (root, folder)]
-    exact = {name: path for name in names if (path := named_picture(folder, name, None if outside else inside))}
+    exact = {
+        name: path for name in names if (path := named_picture(folder, name, None if outside else inside, beside or ()))
+    }
     if len(exact) == len(names):
         return exact
-    rules = _rules([name for name in names if name not in exact], root, folder)
-    if len(exact) and not any(len(found) + len(exact) >= len(names) for found in rules.values()):
-        # Names are right as they are, and some files are missing; but their case or ending may differ.
-        rules = {rule: found for rule, found in rules.items() if rule == Rule(folder, 0)}
+    others = [name for name in names if name not in exact]
+    rules = _rules(others, root, folder, beside, taken={*exact.values(), *(beside or ())})
+    if exact:
+        # Names are right as they are, and some files are missing; but their case or ending may differ, or the machine.
+        rules = {
+            rule: found
+            for rule, found in rules.items()
+            if rule.folder == folder and (rule.dropped == 0 or all(map(is_absolute, found)))
+        }
     if not rules:
         return exact
     most = max(map(len, rules.values()))
@@ -77,12 +96,15 @@ def find_pictures(
     if len(same) > 1:
         raise InputError(
             f"{source} names pictures such as {names[0]}, which fit files of {listed(rule.folder for rule in same)} "
-            "alike. Say which are meant with scene.images=FOLDER, or move the others away."
+            f"alike. Move all but one of these folders out of {root} (or say which is meant with scene.images=FOLDER, "
+            "which scene=colmap takes)."
         )
     found = rules[best]
     name, path = next(iter(found.items()))
-    if say:
-        log.info(
+    if beside is None:
+        usual = _rank(best, folder, root)[2] < len(PICTURE_FOLDERS)
+        log.log(
+            logging.INFO if usual else logging.WARNING,
             "%s: %d of %d pictures are found by another name, such as %s for %s",
             *(source, len(found), len(names), path.relative_to(root) if path.is_relative_to(root) else path, name),
         )
@@ -90,58 +112,124 @@ def find_pictures(
 
 
 def pictures_below(root: Path) -> list[Path]:
-    """Return the picture files in a folder and its subfolders, through links too, in order of their names."""
-    found = [base / name for base, _, names in walk(root, through_links=True) for name in names]
-    return sorted(path for path in found if path.suffix.lower() in ENDINGS and not path.name.startswith("."))
+    """Return the picture files in a folder and its subfolders, hidden ones apart, in order of their names.
+
+    Links are followed.
+    """
+    pictures = list[Path]()
+    for base, folders, names in walk(root, through_links=True):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        pictures += [base / name for name in names if name.lower().endswith(ENDINGS) and not name.startswith(".")]
+    # A HEIC beside a JPEG of its name is the original of it.
+    others = {path.with_suffix("") for path in pictures if path.suffix.lower() not in HEIC_ENDINGS}
+    return sorted(p for p in pictures if p.suffix.lower() not in HEIC_ENDINGS or p.with_suffix("") not in others)
 
 
-def named_picture(folder: Path, name: str, inside: list[Path] | None = None) -> Path | None:
-    """Return the file that a name is of as it stands, where it lies inside of one of some folders.
+def first_with_pictures(root: Path, folders: Sequence[str] = PICTURE_FOLDERS) -> Path | None:
+    """Return the first of some folders below `root` that has pictures."""
+    return next((root / name for name in folders if (root / name).is_dir() and pictures_below(root / name)), None)
+
+
+def pictures_by_stem(folder: Path) -> dict[str, Path]:
+    """Return the pictures of a folder by their names without ending, in order of these.
+
+    Of several the one that lies highest counts, then the JPEG, which cameras write; others are named once.
+    """
+    found, twins = dict[str, Path](), list[str]()
+    likeliest = sorted(pictures_below(folder), key=lambda path: (len(path.parts), path.suffix.lower() not in JPEG))
+    for path in likeliest:
+        if found.setdefault(path.stem, path) is not path:
+            twins.append(path.relative_to(folder).as_posix())
+    if twins:
+        log.warning("%s: %d pictures are passed over, twins of others: %s", folder, len(twins), listed(twins, 3))
+    return dict(sorted(found.items()))
+
+
+def named_picture(
+    folder: Path, name: str, inside: list[Path] | None = None, taken: Collection[Path] = ()
+) -> Path | None:
+    """Return the file that a name is of as it stands, where it lies inside of one of some folders and is not taken.
 
     instant-ngp and Blender leave endings out.
     """
     named = folder / name.replace("\\", "/")
-    if inside is not None and not any(Path(os.path.abspath(named)).is_relative_to(each) for each in inside):
-        return None
     candidates = [named] if named.suffix.lower() in KNOWN_ENDINGS else []
+    if named.suffix.lower() in HEIC_ENDINGS and "HEIF" not in decoders():  # a phone's JPEG beside it is read
+        candidates = [*(named.with_suffix(ending) for ending in ENDINGS if ending not in HEIC_ENDINGS), *candidates]
     candidates += [named.with_name(named.name + ending) for ending in ENDINGS] if named.name else []
-    return next(filter(is_there, candidates), None)
+    allowed = [
+        path
+        for path in candidates
+        if inside is None or any(Path(os.path.abspath(path)).is_relative_to(each) for each in inside)
+    ]
+    return next((path for path in allowed if path not in taken and is_there(path)), None)
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    plain = DRIVE.sub("", name.replace("\\", "/")).lstrip("/")
+    plain = DRIVE.sub("", name.strip().replace("\\", "/")).lstrip("/")
     return tuple(part for part in PurePosixPath(plain).parts if part not in (".", ".."))
 
 
 def _plain(parts: tuple[str, ...]) -> tuple[str, ...]:
-    """Return parts of a path as they are compared: without ending and case, and with one form of each letter."""
-    *folders, last = (unicodedata.normalize("NFC", part).casefold() for part in parts)
+    """Return parts of a path as they are compared: without ending and case, %20 or a space, and one form of letters."""
+    *folders, last = (unicodedata.normalize("NFC", unquote(part)).casefold() for part in parts)
     while (stem := Path(last)).suffix in KNOWN_ENDINGS and stem.stem:  # masks are called 0001.jpg.png
         last = stem.stem
     return (*folders, last)
 
 
-def _rules(names: Sequence[str], root: Path, folder: Path) -> dict[Rule, dict[str, Path]]:
-    """Return the files that each rule finds, where it finds another for every name."""
-    below: dict[str, list[tuple[Path, tuple[str, ...], set[str]]]] = defaultdict(list)
-    for place in dict.fromkeys((root, folder)):
-        for path in pictures_below(place):
-            plain = _plain(path.parts)
-            beside = {part for part in path.relative_to(place).parts[:-1] if BESIDE_PHOTOGRAPHS.fullmatch(part.lower())}
-            below[plain[-1]].append((path, plain, beside))
+def _rules(
+    names: Sequence[str], root: Path, folder: Path, beside: Collection[Path] | None, taken: Collection[Path]
+) -> dict[Rule, dict[str, Path]]:
+    """Return the files that each rule finds, where it finds another for every name, and none that is taken."""
+    below = _by_plain_name(dict.fromkeys((root, folder)), beside is not None, taken)
     fits: dict[Rule, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     for name in names:
         if not (parts := _parts(name)):
             continue
         wanted = _plain(parts)
-        for path, plain, beside in below[wanted[-1]]:
+        for path, plain, folders in below[wanted[-1]]:
+            if not _of_one_kind(set(wanted[:-1]), folders):
+                continue
             for kept in range(1, 1 + _common_end(wanted, plain)):
                 dropped = len(wanted) - kept
                 files = fits[Rule(path.parents[kept - 1], dropped)][name]
-                if beside <= set(parts) and not set(wanted[:dropped][-1:]) & set(SPLIT_FOLDERS) and path not in files:
+                if not set(wanted[:dropped][-1:]) & set(SPLIT_FOLDERS) and path not in files:
                     files.append(path)
     rules = {rule: _one_each(found) for rule, found in fits.items()}
     return {rule: found for rule, found in rules.items() if found and len(set(found.values())) == len(found)}
+
+
+def _by_plain_name(
+    places: Iterable[Path], masks: bool, taken: Collection[Path]
+) -> dict[str, list[tuple[Path, tuple[str, ...], set[str]]]]:
+    """Return the pictures below some folders, with their path as it is compared and the folders that they are in."""
+    below = defaultdict(list)
+    for place in places:
+        for path in pictures_below(place):
+            if path in taken:
+                continue
+            plain, folders = _plain(path.parts), {part.lower() for part in path.relative_to(place).parts[:-1]}
+            if masks:
+                plain = (*plain[:-1], MASK_ENDING.sub("", plain[-1]))
+            below[plain[-1]].append((path, plain, folders))
+    return below
+
+
+def _of_one_kind(wanted: set[str], folders: set[str]) -> bool:
+    """Tell whether a file in these folders can be what a name with those means, and not of another split or kind."""
+    beside = {folder for folder in folders - wanted if BESIDE_PHOTOGRAPHS.fullmatch(folder)}
+    splits = wanted & set(SPLIT_FOLDERS)
+    return not beside and not (splits and folders & set(SPLIT_FOLDERS) - splits)
+
+
+def numeric_order(names: Sequence[str]) -> list[str]:
+    """Return names in order of the numbers in them.
+
+    >>> numeric_order(["picture_10", "picture_2"])
+    ['picture_2', 'picture_10']
+    """
+    return sorted(names, key=lambda name: [(text, int(digits or 0)) for text, digits in NUMBERS.findall(name)])
 
 
 def _one_each(found: dict[str, list[Path]]) -> dict[str, Path]:

@@ -4,10 +4,11 @@ import logging
 import math
 import os
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -16,13 +17,13 @@ from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import FARTHEST, LEAST_FOCAL, check_metres, check_step, contents, usable
 from nerf_lightning.data.captures.extent import choose_space, extent_of, require_possible
 from nerf_lightning.data.captures.known_depths import known_depths
-from nerf_lightning.data.captures.pictures import find_pictures, pictures_below
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, find_pictures, pictures_below
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.decoding import UndecodableError, read_photographs, upright_size
+from nerf_lightning.data.pixels.decoding import read_photographs, upright_size
 from nerf_lightning.data.pixels.images import QUARTER_TURNS, MaskColor, downscaled_size, image_size, orientation_of
 from nerf_lightning.data.pixels.plain_background import background_for, cut_out, protocol_of
+from nerf_lightning.data.pixels.store import UndecodableError
 from nerf_lightning.data.readers.base import Reader
-from nerf_lightning.files.links import require_inside
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
@@ -33,6 +34,14 @@ from nerf_lightning.nerf.types.scene import Cameras, PixelStore, Scene
 Spaces = Literal["auto", "bounded", "ndc", "contracted"]
 MOST_PIXELS = 640
 """Of the longer side of photographs whose size the user leaves open."""
+MOST_AROUND = 2048
+"""The same of panoramas, whose pixels cover all directions."""
+PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0", "keyframes", "train")
+"""Folders within a capture, whose parent is meant where one of them is given."""
+DEEPEST, MOST_FOLDERS = 3, 1000
+"""How far below a folder, and in how many folders of a level, captures are looked for."""
+
+Found = TypeVar("Found")
 LARGEST_STRETCH = 0.01
 """Of width and height: how far a picture's scale may differ from one axis to the other."""
 
@@ -83,6 +92,7 @@ class CaptureReader(Reader):
     allow_outside: bool = False
     verify: bool = False
     name: str = "capture"
+    _is_said = False
 
     @abstractmethod
     def capture(self) -> Capture:
@@ -101,7 +111,14 @@ class CaptureReader(Reader):
         self._check_settings()
         with reading(self.root):
             capture = self.capture()
-        capture = self._with_masks(as_calibrated(usable(self._wanted(capture))))
+        capture = self._wanted(capture)
+        if capture.splits is None:  # before views are left out, so that the others keep their splits
+            train, held = (
+                every_kth(range(len(capture.views)), self.hold_every) if len(capture.views) > 1 else ((0,), ())
+            )
+            capture = replace(capture, splits={"train": train, "val": held, "test": held})
+        capture = as_calibrated(usable(capture))
+        capture = self._with_masks(capture)
         downscale = self._factor(capture)
         capture, pixels = self._decoded(capture, downscale)
         capture.left_out.say(len(capture.views))
@@ -149,7 +166,23 @@ class CaptureReader(Reader):
         )
 
     def folder(self) -> Path:
-        """Return the capture's folder, which must exist."""
+        """Return the capture's folder: `root`, the one folder just below it that is one, or the one above it.
+
+        Raises:
+            InputError: there is no such folder, or several are such captures.
+        """
+        folder = self.named_folder()
+        found = located(folder, lambda path: path if self.found_in(path) else None)
+        if len(found) > 1:
+            choice = listed((f"scene.root={path}" for path in found), 4)
+            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
+        if found and found[0] != folder and not self._is_said:
+            log.info("%s holds no capture of scene=%s; %s, which does, is read", self.root, self.name, found[0])
+            self._is_said = True
+        return found[0] if found else folder
+
+    def named_folder(self) -> Path:
+        """Return the folder that the user named, or the one of the file; `InputError` says that there is none."""
         try:
             folder = Path(self.root).expanduser()
         except RuntimeError as error:
@@ -161,23 +194,19 @@ class CaptureReader(Reader):
             raise InputError(f"The folder {folder} does not exist{where}. Set scene.root to the capture's folder.")
         return folder
 
-    def require_inside(self, path: Path, setting: str | None = None) -> None:
-        """Refuse a name that leads out of the capture's folder and of the one that a setting names, unless allowed."""
-        if not self.allow_outside:
-            require_inside(path, self.folder(), setting)
-
     def _with_masks(self, capture: Capture) -> Capture:
         """Return the views with the masks of the folder `masks`; photographs that have none there are kept whole."""
         masks: dict[str, Path] = {}
         if self.masks is not None:
             folder = self.folder() / self.masks
             names = [view.name for view in capture.views]
-            masks = find_pictures(names, folder, folder, capture.source, say=False)
+            photographs = {view.photograph.path for view in capture.views}
+            masks = find_pictures(names, folder, folder, capture.source, beside=photographs)
             if not masks:
                 raise InputError(
                     f"scene.masks={self.masks} holds no mask for any photograph of {capture.source}: {folder} holds "
                     f"{contents(folder)}. A mask is called like its photograph ({names[0]}, with .png added, or with "
-                    ".png for its ending)."
+                    ".png or _mask.png for its ending)."
                 )
         views = tuple(
             replace(view, photograph=replace(view.photograph, mask=masks.get(view.name, view.photograph.mask)))
@@ -197,24 +226,20 @@ class CaptureReader(Reader):
 
     def _decoded(self, capture: Capture, downscale: int) -> tuple[Capture, PixelStore]:
         """Return the pixels, and the capture without the views whose photograph or mask cannot be decoded."""
-        while True:
-            photographs = [replace(view.photograph, mask_keeps=self.masks_keep) for view in capture.views]
-            cache, label = Path(self.cache_dir) if self.cache_dir else None, f"Reading {Path(self.root).name}"
-            try:
-                return capture, read_photographs(photographs, downscale, cache, self.verify, label)
-            except UndecodableError as error:
-                names = [view.name for view in capture.views]
-                capture.left_out.faults |= {names[number]: fault for number, fault in error.faults.items()}
-                kept = [number for number in range(len(names)) if number not in error.faults]
-                capture.left_out.require_enough(len(kept))
-                capture = capture.some(kept)
+        cache, label = Path(self.cache_dir) if self.cache_dir else None, f"Reading {Path(self.root).name}"
+
+        def read(views: Sequence[View]) -> PixelStore:
+            photographs = [replace(view.photograph, mask_keeps=self.masks_keep) for view in views]
+            return read_photographs(photographs, downscale, cache, self.verify, label)
+
+        return decoded(capture, read)
 
     def _factor(self, capture: Capture) -> int:
         """Return by what the photographs shrink."""
         if self.downscale != "auto":
             return self.downscale
         longest = max(max(image_size(view.photograph.path)) for view in capture.views)
-        factor = -(-longest // MOST_PIXELS)
+        factor = -(-longest // (MOST_AROUND if capture.lens_model == "equirectangular" else MOST_PIXELS))
         log.info("downscale: %d, of photographs of up to %d pixels (scene.downscale=N)", factor, longest)
         return factor
 
@@ -238,6 +263,8 @@ class CaptureReader(Reader):
         """Return the views whose names fit the pattern `frames`."""
         if self.frames is None:
             return capture
+        faults = capture.left_out.faults
+        capture.left_out.faults = {name: fault for name, fault in faults.items() if fnmatch(name, self.frames)}
         names = [view.name for view in capture.views]
         kept = [number for number, name in enumerate(names) if fnmatch(name, self.frames)]
         if not kept:
@@ -247,9 +274,7 @@ class CaptureReader(Reader):
         return capture.some(kept)
 
     def _splits(self, capture: Capture) -> dict[str, tuple[int, ...]]:
-        if capture.splits is None:
-            train, held = every_kth(range(len(capture.views)), self.hold_every)
-            return {"train": train, "val": held, "test": held}
+        assert capture.splits is not None
         splits = {split: tuple(capture.splits.get(split, ())) for split in ("train", "val", "test")}
         names = [view.name for view in capture.views]
         splits["train"] = apart(splits["train"], splits["val"], splits["test"], names.__getitem__, str(capture.source))
@@ -268,44 +293,95 @@ class CaptureReader(Reader):
         return {"train": splits["train"], "val": held, "test": splits["test"] or held}
 
 
+def located(folder: Path, capture_in: Callable[[Path], Found | None]) -> list[Found]:
+    """Return what a folder holds, as a list of one; or the capture that it is a part of, or those that lie below it.
+
+    Args:
+        folder: as the user named it.
+        capture_in: returns what a folder itself holds, None where it holds no capture.
+    """
+
+    def near(path: Path) -> Found | None:
+        try:
+            return capture_in(path)
+        except (OSError, InputError):  # it is not the user's
+            return None
+
+    known, part = capture_in(folder), folder.resolve()
+    if known and (part.name not in PARTS or pictures_below(folder)):
+        return [known]
+    while part.name in PARTS:
+        part = part.parent
+        if whole := near(part):
+            return [whole]
+    found, below = [known] if known else [], [folder]
+    for _ in range(0 if found else DEEPEST):
+        below = [path for each in below for path in _folders_in(each)][:MOST_FOLDERS]
+        found = found or [known for path in below if (known := near(path))]
+    return found
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith(".") and path.is_dir())
+    except OSError:  # may not be listed
+        return []
+
+
+def decoded(capture: Capture, read: Callable[[Sequence[View]], PixelStore]) -> tuple[Capture, PixelStore]:
+    """Return what `read` makes of the views, and the capture without those that it cannot decode."""
+    while True:
+        try:
+            return capture, read(capture.views)
+        except UndecodableError as error:
+            names = [view.name for view in capture.views]
+            capture.left_out.faults |= {names[number]: fault for number, fault in error.faults.items()}
+            kept = [number for number in range(len(names)) if number not in error.faults]
+            capture.left_out.require_enough(len(kept))
+            capture = capture.some(kept)
+
+
 def as_calibrated(capture: Capture) -> Capture:
     """Return the capture with photographs turned where their EXIF tag says so and the camera's size fits that alone.
 
-    Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which.
+    Programs that find cameras read the pixels as they are stored, or turned upright; the sizes tell which. Those whose
+    photograph is unreadable, or fits its camera in neither way, are left out.
     """
-    views, kept, turned = list(capture.views), [], 0
+    views, kept, turned = list(capture.views), [], []
     for number, view in enumerate(views):
         with capture.left_out.unless_usable(view.name):
-            orientation = orientation_of(view.photograph.path)
-            width, height = image_size(view.photograph.path)
-            turned += orientation != 1
-            if not _fits(view, width, height):
-                if orientation not in QUARTER_TURNS or not _fits(view, height, width):
-                    raise InputError(_of_another_shape(view, width, height))
-                views[number] = replace(view, photograph=replace(view.photograph, upright=True))
+            orientation, (width, height) = orientation_of(view.photograph.path), image_size(view.photograph.path)
+            upright = orientation in QUARTER_TURNS and not _fits(view, width, height) and _fits(view, height, width)
+            views[number] = replace(view, photograph=replace(view.photograph, upright=upright))
+            require_fit(view, *((height, width) if upright else (width, height)))
             kept.append(number)
+            if orientation != 1:
+                turned.append(number)
     capture.left_out.require_enough(len(kept))
     if turned:
+        as_shown = sum(views[number].photograph.upright for number in turned)
         log.info(
-            "%s: %d of %d photographs are to be shown turned (EXIF orientation); by the cameras' sizes, %d are read "
-            "turned and the others as they are stored",
-            *(capture.source, turned, len(views), sum(view.photograph.upright for view in views)),
+            "%s: %d of %d photographs are to be shown turned (EXIF orientation); %d are read so, since only then their "
+            "sizes fit their cameras, and the others as they are stored",
+            *(capture.source, len(turned), len(kept), as_shown),
         )
     return replace(capture, views=tuple(views)).some(kept)
-
-
-def _of_another_shape(view: View, width: int, height: int) -> str:
-    x, y = width / view.size[0], height / view.size[1]
-    return (
-        f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for {view.size[0]:g} x "
-        f"{view.size[1]:g}: the sides differ by other factors ({x:.3f} and {y:.3f}). The picture was cropped, turned "
-        "or stretched after the poses were estimated; use the original one."
-    )
 
 
 def _fits(view: View, width: int, height: int) -> bool:
     # A shrunk picture's size is rounded: allow a pixel on either side.
     return abs(width / view.size[0] * view.size[1] / height - 1.0) <= LARGEST_STRETCH + 1.0 / min(width, height)
+
+
+def require_fit(view: View, width: int, height: int) -> None:
+    """Refuse a picture that is no shrunk copy of what its camera describes."""
+    if not _fits(view, width, height):
+        raise InputError(
+            f"{view.photograph.path} has {width} x {height} pixels, but its camera was calibrated for "
+            f"{view.size[0]:g} x {view.size[1]:g}: the sides differ by other factors ({width / view.size[0]:.3f} and "
+            f"{height / view.size[1]:.3f}). The picture was cropped, turned or stretched after the poses were "
+            "estimated; use the original one."
+        )
 
 
 def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStore, downscale: int) -> Cameras:
@@ -329,10 +405,8 @@ def cameras_of(capture: Capture, files: list[tuple[int, int]], pixels: PixelStor
 
     scales = []
     for view, (width, height) in zip(capture.views, files, strict=True):
-        x, y = width / view.size[0], height / view.size[1]
-        if not _fits(view, width, height):
-            raise InputError(_of_another_shape(view, width, height))
-        scales.append((x / downscale, y / downscale))
+        require_fit(view, width, height)
+        scales.append((width / view.size[0] / downscale, height / view.size[1] / downscale))
     scale = torch.tensor(scales, dtype=torch.float64)
     focal = column("focal") * scale
     possible = ((focal >= LEAST_FOCAL) & (focal <= FARTHEST)).all(dim=-1)

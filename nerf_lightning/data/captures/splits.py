@@ -38,7 +38,8 @@ def every_kth(views: Sequence[int], k: int) -> tuple[tuple[int, ...], tuple[int,
         InputError: one of the two would be empty.
     """
     held = tuple(views[::k])
-    return _both(tuple(view for view in views if view not in set(held)), held)
+    out = set(held)
+    return _both(tuple(view for view in views if view not in out), held)
 
 
 def apart(

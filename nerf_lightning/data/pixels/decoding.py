@@ -18,13 +18,14 @@ from nerf_lightning.data.pixels.images import (
     crop_to_multiple,
     downscaled_size,
     image_size,
+    orientation_of,
     read_mask,
     read_rgba,
     whole_blocks,
 )
 from nerf_lightning.data.pixels.mapped_store import CHECKED_WHOLE, FORMAT, Header, check_room, stored
 from nerf_lightning.data.pixels.placement import num_bytes
-from nerf_lightning.data.pixels.store import Result, in_threads
+from nerf_lightning.data.pixels.store import each_or_faults, in_threads
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
@@ -33,6 +34,13 @@ from nerf_lightning.nerf.types.scene import PixelStore
 # Megapixels that take a few seconds: from here on there is a progress bar.
 NOTICEABLE_PIXELS = 50_000_000
 NOTICEABLE_FILES = 1000
+TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    5: lambda stored: stored.T,
+    6: lambda stored: np.rot90(stored, -1),
+    7: lambda stored: np.rot90(stored, 2).T,
+    8: np.rot90,
+}
+"""What shows pixels by their EXIF orientation, of those that swap width and height."""
 THINNED = 1 << 28
 """Bytes that are hashed of pixels that are more than memory may hold (`CHECKED_WHOLE`): they come from the disk."""
 NOTICEABLE_BYTES = 1 << 31
@@ -48,14 +56,6 @@ class Photograph:
     mask_keeps: MaskColor = "white"
     upright: bool = False
     """Whether the pixels are turned as an EXIF tag says; else they are read as they are stored."""
-
-
-class UndecodableError(InputError):
-    """Photographs that cannot be decoded, or masks that do not fit them: by number, what is wrong with each."""
-
-    def __init__(self, faults: dict[int, str]):
-        super().__init__(next(iter(faults.values())))
-        self.faults = faults
 
 
 def upright_size(photograph: Photograph) -> tuple[int, int]:
@@ -162,10 +162,10 @@ def _write(photographs: list[Photograph], downscale: int, contents: str | None, 
             file.write(np.ascontiguousarray(rgba).data)
             if masked:
                 file.seek(4 * num_pixels + start)
-                file.write(_mask(photograph, size, downscale).data)
+                file.write(np.ascontiguousarray(_mask(photograph, size, downscale)).data)
         return bool((rgba[..., 3] < 255).any())
 
-    transparent = _each(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
+    transparent = each_or_faults(decode, len(photographs), label, shown=num_pixels * downscale**2 > NOTICEABLE_PIXELS)
     return Header(FORMAT, [list(size) for size in sizes], any(transparent), masked, contents, spots=0, checksum=0)
 
 
@@ -183,24 +183,7 @@ def _sizes(photographs: list[Photograph], downscale: int, label: str) -> list[tu
             )
         return downscaled_size(width, height, downscale)
 
-    return _each(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
-
-
-def _each(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
-    """Return what `in_threads` does, and name all that are refused, not the first alone."""
-    faults: dict[int, str] = {}
-
-    def tried(index: int) -> Result | None:
-        try:
-            return work(index)
-        except InputError as error:
-            faults[index] = str(error)
-            return None
-
-    results = in_threads(tried, count, label, shown)
-    if faults:
-        raise UndecodableError(dict(sorted(faults.items())))
-    return [result for result in results if result is not None]
+    return each_or_faults(size, len(photographs), f"{label}: sizes", shown=len(photographs) > NOTICEABLE_FILES)
 
 
 def _mask(
@@ -209,7 +192,10 @@ def _mask(
     if photograph.mask is None:
         return np.ones(size[::-1], dtype=np.bool_)
     as_shown = photograph.upright and image_size(photograph.mask) != upright_size(photograph)
-    kept = whole_blocks(read_mask(photograph.mask, photograph.mask_keeps, as_shown), downscale)
+    kept = read_mask(photograph.mask, photograph.mask_keeps, as_shown)
+    if as_shown and orientation_of(photograph.mask) == 1:  # programs that make masks may drop the tag
+        kept = TURNED[orientation_of(photograph.path)](kept)
+    kept = whole_blocks(kept, downscale)
     _check_unchanged(kept, size, photograph.mask)
     if not kept.any():
         shrunk = f" (shrunk by {downscale}, a pixel needs its whole block)" if downscale > 1 else ""

@@ -1,5 +1,6 @@
 """Picture files to 8-bit RGBA with straight alpha, and the area filter that shrinks them."""
 
+import logging
 import mmap
 import os
 import re
@@ -9,6 +10,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from functools import cache
 from io import BufferedReader
 from pathlib import Path
 from typing import Literal
@@ -17,14 +19,13 @@ import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, HEIC_KINDS, UNREAD, decoders
 from nerf_lightning.files.budgets import limits
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.bands import bands
 
-# A closed list: some of PIL's other decoders start outside programs.
-FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", *HEIC_ENDINGS)
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 GREY_16 = ("I;16", "I;16B")
 ORIENTATION = 0x0112
@@ -43,26 +44,25 @@ JPEG_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd9-\xfe]")
 (0x01), and what is no marker at all."""
 JPEGS = ("JPEG", "MPO")
 """Pillow's names: the latter carries other pictures behind its own."""
+ONE_PICTURE = (*JPEGS, "HEIF")
+"""Formats of which the main picture alone counts."""
 JPEG_SCAN, JPEG_END = 0xDA, 0xD9
 SOUND_SCANS, MOST_SCANS = 20, 100
 """Times that a progressive file goes over its pixels; each can be a few bytes, and costs a pass over all of them."""
 BYTES_PER_PIXEL = 16
 """Of a file: two for each of four channels without compression, and as much again for what goes beside them."""
-HEIC_KINDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-HEIC_CURE = (
-    "HEIC, as phones save it, is not read here. Convert all of them to JPEG (`magick mogrify -format jpg *.heic`, or a "
-    "phone's own export as JPEG, its setting 'most compatible'), and give the folder of these."
-)
-CURE = "Copy or render it again; PNG, JPEG, TIFF and WebP are read."
+CURE = "Copy or render it again; PNG, JPEG, TIFF, WebP and AVIF are read."
 DECODER_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error),
     *(TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, AssertionError),
 )
 """What PIL lets through of damaged files, the latter ones by mistake."""
 
+log = logging.getLogger(__name__)
 
 # Python's list of warning filters belongs to all threads at once.
 _filters = threading.Lock()
+_saying = threading.Lock()
 # Small files can announce large pictures, each of which takes gigabytes while it is decoded.
 LARGE = 40_000_000
 _one_large_picture = threading.RLock()
@@ -106,7 +106,8 @@ def orientation_of(path: Path) -> int:
 def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height width 4"]:
     """Return a picture as RGBA with straight alpha; 255 where the file has none.
 
-    Palettes and grey levels are expanded. Of 16 bits the upper byte is kept (less than one level off).
+    Palettes and grey levels are expanded. Of 16 bits the upper byte is kept (less than one level off), which is said
+    once for each folder.
 
     Args:
         path: the file.
@@ -116,6 +117,9 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
         InputError: what `image_size` refuses, or damaged or truncated.
     """
     with _opened(path) as image:
+        if _is_deep(image):
+            with _saying:
+                _say_reduced(path.parent)
         try:
             image.load()
             if upright:
@@ -129,6 +133,16 @@ def read_rgba(path: Path, upright: bool = False) -> UInt8[np.ndarray, "height wi
                 part = Image.fromarray((np.asarray(part) >> 8).astype(np.uint8))
             rgba[rows] = np.asarray(part if part.mode == "RGBA" else part.convert("RGBA"))
         return rgba
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Tell whether a picture that is not decoded yet has more than 8 bits per channel."""
+    return ";16" in str(getattr(image, "tile", "")) or image.info.get("bit_depth", 8) > 8
+
+
+@cache
+def _say_reduced(folder: Path) -> None:
+    log.info("%s: pictures of 16 bits per channel are read with 8, the upper ones", folder)
 
 
 def read_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
@@ -253,6 +267,8 @@ def open_picture(path: Path) -> BufferedReader:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Open the file, read its header, and refuse what has no one plain reading."""
+    if cure := UNREAD.get(path.suffix.lower()):
+        raise InputError(f"{path} cannot be read. {cure}")
     most = limits().megapixels
     with ExitStack() as opened:
         try:
@@ -261,7 +277,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
                 # PIL warns at a number of pixels and fails at twice that; one limit is easier to explain than two.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
                 Image.MAX_IMAGE_PIXELS = most * 500_000
-                image = opened.enter_context(Image.open(file, formats=FORMATS))
+                image = opened.enter_context(Image.open(file, formats=decoders()))
         except Image.DecompressionBombError as error:
             raise InputError(
                 f"{path} announces more than {most} megapixels; more is not safe to decode, for a small file can "
@@ -328,8 +344,8 @@ def _check_plain(image: Image.Image, path: Path) -> None:
 
 
 def _num_frames(image: Image.Image, path: Path) -> int:
-    """Return how many pictures the file shows; what a JPEG carries beside its own (previews, depth) is none."""
-    if image.format in JPEGS:
+    """Return how many pictures the file shows; what a JPEG or HEIC carries beside its own (previews, depth) is none."""
+    if image.format in ONE_PICTURE:
         return 1
     try:
         return getattr(image, "n_frames", 1)
@@ -342,7 +358,8 @@ def _unreadable(path: Path, error: Exception) -> str:
     if path.is_file() and path.stat().st_size == 0:
         return f"{path} is empty (0 bytes). {CURE}"
     if is_heic(path):
-        return f"{path} is a photograph in the format HEIC. {HEIC_CURE}"
+        cure = HEIC_CURE if "HEIF" not in decoders() else f"It cannot be decoded: {error}. {CURE}"
+        return f"{path} is a photograph in the format HEIC. {cure}"
     if isinstance(error, UnidentifiedImageError):
         return f"{path} is not an image that can be read. {CURE}"
     return f"{path} cannot be read: {error}. It is damaged or was cut short. {CURE}"

@@ -56,6 +56,31 @@ def in_threads(work: Callable[[int], Result], count: int, label: str, shown: boo
         return list(bar.track(pool.map(work, range(count)), total=count, description=escape(for_terminal(label))))
 
 
+class UndecodableError(InputError):
+    """Photographs that cannot be decoded, or masks that do not fit them: by number, what is wrong with each."""
+
+    def __init__(self, faults: dict[int, str]):
+        super().__init__(next(iter(faults.values())))
+        self.faults = faults
+
+
+def each_or_faults(work: Callable[[int], Result], count: int, label: str, shown: bool) -> list[Result]:
+    """Return what `in_threads` does, and name all that are refused, not the first alone."""
+    faults: dict[int, str] = {}
+
+    def tried(index: int) -> Result | None:
+        try:
+            return work(index)
+        except InputError as error:
+            faults[index] = str(error)
+            return None
+
+    results = in_threads(tried, count, label, shown)
+    if faults:
+        raise UndecodableError(dict(sorted(faults.items())))
+    return [result for result in results if result is not None]
+
+
 def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downscale: int, label: str) -> PixelStore:
     """Return the pictures, in memory, each shrunk by `downscale`, which divides all `sizes` (width, height)."""
     store = empty_store([(width // downscale, height // downscale) for width, height in sizes])
@@ -65,5 +90,5 @@ def read_pixels(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], downsca
         store.view(index).numpy()[...] = picture
         return bool((picture[..., 3] < 255).any())
 
-    transparent = in_threads(decode, len(paths), label, shown=len(paths) > NOTICEABLE)
+    transparent = each_or_faults(decode, len(paths), label, shown=len(paths) > NOTICEABLE)
     return replace(store, has_transparency=any(transparent))

@@ -2,14 +2,14 @@
 
 import inspect
 import logging
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from nerf_lightning.data.captures.capture import Capture
 from nerf_lightning.data.captures.checks import contents
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
-from nerf_lightning.data.captures.reader import CaptureReader
+from nerf_lightning.data.captures.reader import CaptureReader, located
 from nerf_lightning.data.readers.base import Reader
 from nerf_lightning.data.readers.blender import BlenderReader
 from nerf_lightning.data.readers.colmap import ColmapReader
@@ -29,9 +29,6 @@ READERS: tuple[type[Reader], ...] = (
 )
 """Where a folder has the files of several, the first says more: a COLMAP model has lenses and points, which
 poses_bounds.npy beside it lacks."""
-PARTS = (*filter(None, PICTURE_FOLDERS), "sparse", "colmap", "0")
-"""Folders within a capture, whose parent is meant where one of them is given."""
-MOST_FOLDERS = 200
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +69,10 @@ class AutoReader(CaptureReader):
         """
         return self.reader().read()
 
+    def folder(self) -> Path:
+        """Return the folder that the user named."""
+        return self.named_folder()
+
     def capture(self) -> Capture:
         """Return what the format says, where it is one of photographs with their poses."""
         reader = self.reader()
@@ -107,24 +108,31 @@ class AutoReader(CaptureReader):
         return None
 
     def _search(self) -> Known:
-        """Return what the folder is, or the one capture just below it, or the one that it is a part of."""
+        """Return what the folder is, or the one capture below it, or the one that it is a part of."""
         folder = self.folder()
-        if known := self.known_format(folder):
-            return known
-        below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-        found = [known for path in below[:MOST_FOLDERS] if (known := self.known_format(path))]
-        if not found and folder.name in PARTS and (known := self.known_format(folder.resolve().parent)):
-            found = [known]
+        if (named := self._named_file()) is not None:
+            return named
+        found = located(folder, self.known_format)
         if len(found) == 1:
             return found[0]
         if found:
-            captures = listed((f"scene.root={known.folder}" for known in found), 4)
-            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {captures}.")
+            choice = listed((f"scene.root={known.folder}" for known in found), 4)
+            raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
         formats = listed((Known(folder, "", reader).scene for reader in READERS), len(READERS))
         raise InputError(
             f"{self.root} holds no capture of a format that is known here ({formats}): it holds {contents(folder)}."
             f"{self._hint()} If these are photographs whose cameras nobody knows yet, use scene=photos."
         )
+
+    def _named_file(self) -> Known | None:
+        """Return the reader of the very file that the user has named, where that is one of a capture."""
+        path = Path(self.root).expanduser()
+        if not os.path.isfile(path) or path.suffix.lower() not in (".json", ".xml"):
+            return None
+        reader: type[Reader] = MetashapeReader if path.suffix.lower() == ".xml" else TransformsReader
+        if BlenderReader.found_in(path.parent) == path.name:
+            reader = BlenderReader
+        return Known(self.folder(), path.name, reader)
 
     def _hint(self) -> str:
         """Say what program has written the folder, where that is clear, and how its captures are read."""
@@ -155,6 +163,11 @@ OF_OTHERS: tuple[tuple[tuple[str, ...], str], ...] = (
     (
         ("ARWorldMap*",),
         "It looks like a recording of ARKit: convert it to a transforms.json (nerfstudio reads several such apps).",
+    ),
+    (("*.json",), "A transforms.json by another name is read with scene=transforms scene.file=NAME."),
+    (
+        ("*.psx",),
+        "A .psx is a project of Metashape: export its cameras as Agisoft XML (File > Export > Export Cameras).",
     ),
     (("*.glb", "*.zip"), "Kiri Engine's export for developers holds a transforms.json: unpack that one."),
 )

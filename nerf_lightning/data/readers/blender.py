@@ -13,13 +13,14 @@ import numpy as np
 from nerf_lightning.data.captures.capture import Capture, View, common_lens_model
 from nerf_lightning.data.captures.checks import check_step, contents, usable
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.reader import cameras_of
+from nerf_lightning.data.captures.pictures import find_pictures
+from nerf_lightning.data.captures.reader import cameras_of, decoded, require_fit
 from nerf_lightning.data.captures.splits import MEMORISED, apart, every_kth
-from nerf_lightning.data.pixels.images import ENDINGS, read_rgba
+from nerf_lightning.data.pixels.images import ENDINGS, image_size, read_rgba
 from nerf_lightning.data.pixels.plain_background import TOLERANCE
 from nerf_lightning.data.pixels.store import read_pixels
 from nerf_lightning.data.readers.base import GivenFrameReader
-from nerf_lightning.data.readers.frames import FrameFile, views_of
+from nerf_lightning.data.readers.frames import FrameFile, say_of_files, views_of
 from nerf_lightning.files.trust import reading
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
@@ -75,10 +76,20 @@ class BlenderReader(GivenFrameReader):
         with reading(self.root):
             capture = self._capture()
         capture = usable(capture)
+        capture, (width, height) = _of_one_size(capture)
+        self.check_divisible(width, height)
+        capture, pixels = decoded(
+            capture,
+            lambda views: read_pixels(
+                [view.photograph.path for view in views],
+                [(width, height)] * len(views),
+                self.downscale,
+                f"Reading {Path(self.root).name}",
+            ),
+        )
+        capture.left_out.say(len(capture.views))
         assert capture.splits is not None
         paths = [view.photograph.path for view in capture.views]
-        width, height = _one_size(capture)
-        self.check_divisible(width, height)
         splits = dict(capture.splits)
         if not splits["train"]:
             raise InputError(f"{self.root} has no views to learn from. Export transforms_train.json again.")
@@ -89,8 +100,6 @@ class BlenderReader(GivenFrameReader):
         if not splits["test"]:
             splits["test"] = splits["val"]
             log.info("%s has no test split: the %d val views serve as test.", self.root, len(splits["val"]))
-        pixels = read_pixels(paths, [(width, height)] * len(paths), self.downscale, f"Reading {Path(self.root).name}")
-        capture.left_out.say(len(capture.views))
         files = [(width, height)] * len(paths)
         cameras = cameras_of(capture, files, pixels, self.downscale)
         learnt = {paths[view] for view in splits["train"]}
@@ -122,14 +131,14 @@ class BlenderReader(GivenFrameReader):
                 f"{root / 'transforms_train.json'} does not exist; the folder holds {contents(root)}. "
                 "Set scene.root to the folder that holds transforms_train.json."
             )
+        read = {split: FrameFile.read(path, FORMAT) for split, path in files.items() if path is not None}
+        say_of_files(list(read.values()))
         left_out = LeftOut(str(files["train"]))
         views: dict[str, list[View]] = {split: [] for split in SPLITS}
         lenses = set[LensModel]()
-        for split, path in files.items():
-            if path is None:
-                continue
+        for split, file in read.items():
             skip = (self.skip or {}).get(split, 1)
-            for found in views_of(FrameFile.read(path, FORMAT), root, self.allow_outside, left_out, skip):
+            for found in views_of(file, root, self.allow_outside, left_out, skip):
                 name = found.name.replace("\\", "/")
                 name = (
                     Path(name).with_suffix("").as_posix() if name.lower().endswith(ENDINGS) else Path(name).as_posix()
@@ -165,27 +174,34 @@ def _is_photographed(path: Path) -> bool:
     first = file.frames[0] if file.frames and isinstance(file.frames[0], dict) else {}
     if any(key in {**file.content, **first} for key in OF_PHOTOGRAPHS):
         return True
-    seen = views_of(file, path.parent, False, LeftOut(str(path)), max(1, len(file.frames)))
-    if not seen:
+    name = first.get("file_path")
+    pictures = find_pictures([name], path.parent, path.parent, path, beside=()) if isinstance(name, str) else {}
+    if not pictures:
         return False
     try:
-        picture = read_rgba(seen[0].view.photograph.path)
+        picture = read_rgba(pictures[str(name)])
     except InputError:
         return False
     corners = picture[:: picture.shape[0] - 1 or 1, :: picture.shape[1] - 1 or 1].reshape(-1, 4).astype(int)
     return bool((picture[..., 3] == 255).all() and np.ptp(corners, axis=0).max() > 2 * TOLERANCE)
 
 
-def _one_size(capture: Capture) -> tuple[int, int]:
-    """Return the (width, height) that all images share, or refuse those that differ from the most frequent one."""
-    usual = Counter(view.size for view in capture.views).most_common(1)[0][0]
-    odd = [f"{v.photograph.path} ({v.size[0]:g} x {v.size[1]:g})" for v in capture.views if v.size != usual]
-    if odd:
-        raise InputError(
-            f"The images of this format must all have one size. Most are {usual[0]:g} x {usual[1]:g}, but not "
-            f"{listed(odd)}. Render or resize these again, or remove their frames."
-        )
-    return int(usual[0]), int(usual[1])
+def _of_one_size(capture: Capture) -> tuple[Capture, tuple[int, int]]:
+    """Return the views whose images have the most frequent (width, height), and that size."""
+    sizes = [image_size(view.photograph.path) for view in capture.views]
+    usual = Counter(sizes).most_common(1)[0][0]
+    kept = []
+    for number, (view, size) in enumerate(zip(capture.views, sizes, strict=True)):
+        with capture.left_out.unless_usable(view.name):
+            if size != usual:
+                raise InputError(
+                    f"The images of this format must all have one size. Most are {usual[0]} x {usual[1]}, but "
+                    f"{view.photograph.path} is {size[0]} x {size[1]}. Render or resize it again."
+                )
+            require_fit(view, *size)
+            kept.append(number)
+    capture.left_out.require_enough(len(kept))
+    return capture.some(kept), usual
 
 
 def _shortest(views: list[tuple[str, str]]) -> list[str]:

@@ -112,15 +112,17 @@ class ColmapReader(CaptureReader):
             with left_out.unless_usable(image.name):
                 if image.name not in files:
                     raise InputError(_absent(image.name, pictures, folder))
-                camera = model.cameras[image.camera]
+                camera = model.cameras.get(image.camera)
+                if camera is None:
+                    raise InputError(f"{folder}: {image.name} names a camera that is not there: {image.camera}. {CURE}")
                 _require_known(camera, folder)
                 views.append(_view(image, camera, files[image.name]))
                 kept.append(image)
         left_out.require_enough(len(views))
         lens_model = _lens_model({model.cameras[image.camera].model for image in kept}, folder)
-        taken = {view.photograph.path for view in views}
+        taken = set(files.values())
         base = os.path.commonpath([path.parent for path in taken])
-        others = [path for path in pictures_below(Path(base)) if path not in taken and path.stem not in left_out.faults]
+        others = [path for path in pictures_below(Path(base)) if path not in taken]
         left_out.without_pose = tuple(path.relative_to(base).as_posix() for path in others) if self._own(base) else ()
         return Capture(
             views=tuple(views),
@@ -148,7 +150,7 @@ class ColmapReader(CaptureReader):
             )
         if len(found) > 1:
             log.info(
-                "%s: of %d models the one with most photographs is read; scene.model=FOLDER reads another (%s)",
+                "%s is read, of %d models; scene.model=FOLDER reads another (%s)",
                 *(found[0], len(found), listed((path.relative_to(root) for path in found[1:]), 3)),
             )
         return found[0]
@@ -237,20 +239,27 @@ def _lens_model(used: set[str], folder: Path) -> LensModel:
 
 
 def models_in(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture, of the first place that has any, that with most images first."""
+    """Return the folders of the models of a capture: the likeliest place first, in it that with most images."""
+    models = list[Path]()
     for place in MODEL_FOLDERS:
         folder = root / place
         below = sorted(path for path in folder.iterdir() if path.is_dir()) if place and folder.is_dir() else []
         found = [path for path in (*below, folder) if any((path / f"cameras{e}").is_file() for e in KINDS)]
-        if found:
-            return sorted(found, key=_number_of_images, reverse=True)
-    return []
+        found = [path for path in found if path not in models]
+        models += sorted(found, key=_number_of_images, reverse=True) if len(found) > 1 else found
+    return models
 
 
 def _number_of_images(folder: Path) -> int:
-    """Return about how many photographs a model has, from the size of its list; 0 where there is none."""
-    sizes = [path.stat().st_size for ending in KINDS if (path := folder / f"images{ending}").is_file()]
-    return max(sizes, default=0)
+    """Return how many photographs a model has; 0 where its list is absent or damaged, which is said if it is read."""
+    try:
+        return max(
+            kind.number_of_images(path)
+            for ending, kind in KINDS.items()
+            if (path := folder / f"images{ending}").is_file()
+        )
+    except (InputError, ValueError):
+        return 0
 
 
 def read_model(folder: Path) -> ColmapModel:
@@ -264,9 +273,6 @@ def read_model(folder: Path) -> ColmapModel:
     model = models[0]
     if not model.images:
         raise InputError(f"The model in {folder} has no registered photograph, so nothing can be learnt. {CURE}")
-    lost = sorted({image.camera for image in model.images} - set(model.cameras))
-    if lost:
-        raise InputError(f"The images of {folder} name cameras that its cameras file lacks: {listed(lost)}. {CURE}")
     return model
 
 

@@ -117,6 +117,10 @@ class BinaryFiles:
             yield ColmapImage(values[0], name, values[8], values[1:5], values[5:8])
         data.end()
 
+    def number_of_images(self, path: Path) -> int:
+        """Return how many photographs a file announces."""
+        return _Bytes(path).count(73, "views")
+
     def points(self, path: Path) -> ColmapPoints:
         """Return the sparse points."""
         data, found, tracks = _Bytes(path), array("d"), [np.zeros(0, "<u4")]
@@ -201,9 +205,10 @@ class TextFiles:
     def cameras(self, path: Path) -> Iterator[ColmapCamera]:
         """Return the cameras."""
         for where, line in _within(_lines(path), "views", path):
-            number, model, *values = [*line.split(), "", ""]
+            number, word, *values = [*line.split(), "", ""]
+            model = word.upper()
             if model not in COUNTS:
-                raise InputError(f"{where} holds a camera of the unknown model {model!r}. {CURE_MODEL}")
+                raise InputError(f"{where} holds a camera of the unknown model {word!r}. {CURE_MODEL}")
             width, height, *params = _numbers(values[:-2], where, 2 + COUNTS[model])
             sides = _whole(width, where), _whole(height, where)
             yield ColmapCamera(_whole(_numbers([number], where, 1)[0], where), model, *sides, tuple(params))
@@ -220,6 +225,10 @@ class TextFiles:
             _check_features(next(lines, ("", ""))[1].split(), where)
             number = _whole(_numbers(words[:1], where, 1)[0], where)
             yield ColmapImage(number, words[9], _whole(camera, where), (qw, qx, qy, qz), (x, y, z))
+
+    def number_of_images(self, path: Path) -> int:
+        """Return how many photographs a file holds."""
+        return sum(1 for _ in self.images(path))
 
     def points(self, path: Path) -> ColmapPoints:
         """Return the sparse points."""

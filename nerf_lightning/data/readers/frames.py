@@ -6,6 +6,7 @@ here is numbers; whether they make a camera is judged by `captures.checks`.
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +16,7 @@ from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures, named_picture
 from nerf_lightning.data.pixels.decoding import Photograph
-from nerf_lightning.data.pixels.images import ENDINGS, image_size
+from nerf_lightning.data.pixels.images import image_size
 from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.json_files import keys_of, read_json
 from nerf_lightning.files.links import is_absolute
@@ -63,10 +64,28 @@ class FrameFile:
         if not isinstance(frames, list):
             raise InputError(f"{path}: frames must be a list of views, but it is {type(frames).__name__}.")
         require_within("views", len(frames), str(path), "views")
-        times = {repr(frame["time"]) for frame in frames if isinstance(frame, dict) and "time" in frame}
-        if len(times) > 1:
-            log.warning("%s: time differs between frames, and the scene is taken as static: what moves blurs", path)
+        if content.get("from_mitsuba"):
+            raise InputError(
+                f"{path} says from_mitsuba, and Mitsuba's cameras look along other axes than those of Blender and "
+                "nerfstudio. Turn the sign of the first and the third column of each transform_matrix, and remove it."
+            )
         return cls(path, {key: value for key, value in content.items() if value is not None}, frames)
+
+
+def say_of_files(files: Sequence[FrameFile]) -> None:
+    """Say what of the files of one capture is not used, or not modelled."""
+    first, read = files[0].path, {file.path for file in files}
+    beside = sorted(path.name for path in first.parent.glob("transform*_*.json") if path not in read)
+    if beside:
+        log.warning(
+            "Frames are read from %s, and not from %s (scene=transforms scene.file=NAME reads another file)",
+            *(listed((file.path for file in files), 3), listed(beside)),
+        )
+    times = {
+        repr(frame["time"]) for file in files for frame in file.frames if isinstance(frame, dict) and "time" in frame
+    }
+    if len(times) > 1:
+        log.warning("%s: time differs between frames, and the scene is taken as static: what moves blurs", first)
 
 
 @dataclass(frozen=True)
@@ -115,9 +134,9 @@ def _found(file: FrameFile, where: str, name: str, frame: dict[str, Any], pictur
     focal = panorama_focal_of if lens_model == "equirectangular" else focal_of
     folder = file.path.parent
     view = View(
-        name=picture.relative_to(folder).as_posix() if picture.is_relative_to(folder) else picture.name,
+        name=picture.relative_to(folder if picture.is_relative_to(folder) else picture.anchor).as_posix(),
         photograph=Photograph(picture),
-        c2w=pose_from_matrix(settings["transform_matrix"], f"{where}: transform_matrix"),
+        c2w=pose_from_matrix(frame["transform_matrix"], f"{where}: transform_matrix"),
         focal=focal(settings, width, height, where),
         center=(number_of(settings, "cx", where, width / 2), number_of(settings, "cy", where, height / 2)),
         size=(width, height),
@@ -139,15 +158,15 @@ def _absent(path: Path, root: Path, where: str, name: str) -> str:
             "end. Copy the pictures there."
         )
     return (
-        f"{where}: the image {named} does not exist (with none of the endings {', '.join(ENDINGS)} either). Copy it "
-        "there, or remove its frame from the file."
+        f"{where}: the image {named} does not exist, with another ending neither. Copy it there, or remove its frame "
+        "from the file."
     )
 
 
 def path_of(name: object, key: str, where: str) -> str:
     """Return a path as the file has it; refuse what is no text, or cannot be shown."""
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}: {key} is {name!r}, but it must be the picture's path as text.")
+        raise InputError(f"{where}: {key} is {name!r}, but it must be a path as text.")
     require_printable(name, where)
     return name
 

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,7 +14,7 @@ from numpy import ndarray
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import contents
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, numeric_order, pictures_by_stem
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import ENDINGS
@@ -26,7 +25,6 @@ from nerf_lightning.messages.errors import InputError, require_one_of
 from nerf_lightning.messages.escaping import listed
 
 FILE = "poses_bounds.npy"
-JPEG = (".jpg", ".jpeg")
 COLUMNS = 17
 MOST_BYTES = 1 << 28
 """A hundred thousand views take a twentieth."""
@@ -60,12 +58,12 @@ class LlffReader(CaptureReader):
         path = root / FILE
         rows = _rows(path)
         asked = [self.images] if self.images else PICTURE_FOLDERS
-        found = {root / name: _pictures_in(root / name) for name in asked}
-        folder = next((folder for folder, names in found.items() if names), None)
+        folder = next((root / name for name in asked if _pictures_in(root / name)), None)
         if folder is None:
             places = listed((name or "the folder itself" for name in asked), 9)
             raise InputError(f"{root} has no photographs in {places}. Set scene.images to their folder.")
-        names, left_out = found[folder], LeftOut(str(path))
+        by_stem = pictures_by_stem(folder)
+        names, left_out = [path.name for path in by_stem.values() if path.parent == folder], LeftOut(str(path))
         registered = _registered(root, names)
         if registered and len(registered) == len(rows):
             left_out.without_pose = tuple(name for name in names if name not in registered)
@@ -97,7 +95,7 @@ class LlffReader(CaptureReader):
     def _sorted(self, names: list[str], path: Path) -> list[str]:
         """Return the names in the order of the poses; say so where text and numbers differ."""
         require_one_of(("text", "numbers"), **{"scene.order": self.order})
-        by_text, by_numbers = sorted(names), sorted(names, key=_numbers_in)
+        by_text, by_numbers = sorted(names), numeric_order(names)
         if by_text != by_numbers:
             log.warning(
                 "%s: the names of the photographs in text order (%s) and in numeric order (%s) differ, and the poses do"
@@ -109,12 +107,10 @@ class LlffReader(CaptureReader):
 
 
 def _pictures_in(folder: Path) -> list[str]:
-    """Return the pictures in a folder, one for each name: of twins in two formats the JPEG, which cameras write."""
+    """Return the pictures in a folder itself."""
     if not os.path.isdir(folder):
         return []
-    names = [path.name for path in folder.iterdir() if path.suffix.lower() in ENDINGS and not path.name.startswith(".")]
-    by_stem = {Path(name).stem: name for name in sorted(names, key=lambda name: Path(name).suffix.lower() in JPEG)}
-    return sorted(by_stem.values())
+    return [path.name for path in folder.iterdir() if path.name.lower().endswith(ENDINGS) and path.name[0] != "."]
 
 
 def _registered(root: Path, names: list[str]) -> list[str]:
@@ -122,13 +118,8 @@ def _registered(root: Path, names: list[str]) -> list[str]:
     path = root / "view_imgs.txt"
     if not path.is_file():
         return []
-    wanted = {Path(word).stem for word in read_text(path, MOST_BYTES, CURE).split()}
+    wanted = {Path(line.strip()).stem for line in read_text(path, MOST_BYTES, CURE).splitlines()}
     return [name for name in names if Path(name).stem in wanted]
-
-
-def _numbers_in(name: str) -> list[tuple[int, str]]:
-    """Return what sorts picture_2 before picture_10."""
-    return [(int(digits or 0), text) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
 def _rows(path: Path) -> Float[ndarray, "views 17"]:

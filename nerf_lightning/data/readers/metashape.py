@@ -1,6 +1,8 @@
 """Agisoft Metashape's cameras (File > Export > Export Cameras, Agisoft XML) beside the photographs."""
 
+import logging
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,13 +22,19 @@ from nerf_lightning.files.budgets import limits, require_within
 from nerf_lightning.files.regular import open_regular, read_text
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import listed
-from nerf_lightning.nerf.geometry.poses import from_opencv_axes
+from nerf_lightning.nerf.geometry.poses import from_opencv_axes, is_rigid
 from nerf_lightning.nerf.types.scene import LensModel
 
 HEAD = 4096
 LENSES: dict[str, LensModel] = {"frame": "radial_tangential", "fisheye": "fisheye", "spherical": "equirectangular"}
 """By a sensor's type."""
+OFF = ("0", "false")
+"""What `enabled` is of cameras that are switched off."""
+OF_ITS_OWN = ("b2", "p3", "p4")
+"""Skew, and the higher tangential terms."""
 CURE = "Export the cameras again (Agisoft XML)."
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,7 +50,7 @@ class Sensor:
 
 @dataclass
 class MetashapeReader(CaptureReader):
-    """Read the cameras of the first chunk, in groups too; those that are not aligned have no pose.
+    """Read the cameras of the first chunk that has any, in groups too; those that are not aligned have no pose.
 
     Args:
         file: the xml below root; null: the only one there.
@@ -59,37 +67,48 @@ class MetashapeReader(CaptureReader):
     def capture(self) -> Capture:
         """Return the aligned photographs, in the file's order."""
         root = self.folder()
-        name = self.file or self.found_in(root)
-        if name is None:
-            raise InputError(f"{root} holds no xml of Metashape's cameras. Export them there, or set scene.file=NAME.")
-        path = root / name
+        path = self._path(root)
         text = read_text(path, limits().json_bytes, CURE)
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
             raise InputError(f"{path} declares entities of its own, which no file of Metashape's does. {CURE}")
-        chunk = ElementTree.fromstring(text).find("chunk")
-        if chunk is None:
-            raise InputError(f"{path} holds no chunk of cameras. {CURE}")
+        chunk = _chunk(text, path)
         left_out = LeftOut(str(path))
         cameras = [camera for camera in chunk.iterfind("cameras//camera") if camera.get("label")]
         require_within("views", len(cameras), str(path), "views")
-        aligned = [camera for camera in cameras if camera.findtext("transform") and camera.get("enabled") != "0"]
+        aligned = [camera for camera in cameras if camera.findtext("transform") and camera.get("enabled") not in OFF]
         labels = [str(camera.get("label")) for camera in cameras]
         pictures = find_pictures(labels, root / "images", root, path, self.allow_outside)
+        sensors = {each.get("id", ""): each for each in chunk.iterfind("sensors//sensor")}
         views, lenses = [], set[LensModel]()
         for camera, label in ((camera, str(camera.get("label"))) for camera in aligned):
             with left_out.unless_usable(label):
                 if label not in pictures:
                     raise InputError(f"{path}: no picture below {root} is called {label}. Copy it there.")
-                sensor = _sensor(chunk, camera.get("sensor_id", ""), path)
+                sensor = _sensor(sensors.get(camera.get("sensor_id", "")), camera.get("sensor_id", ""), path)
                 views.append(_view(camera, label, sensor, pictures[label], path))
                 lenses.add(sensor.lens_model)
         left_out.require_enough(len(views))
+        if terms := sorted({each.tag for each in chunk.iter() if each.tag in OF_ITS_OWN and _number(each.text, path)}):
+            log.warning("%s: the lens has %s, which is not known here and is left out", path, " and ".join(terms))
         posed = {view.name for view in views} | left_out.faults.keys()
         left_out.without_pose = tuple(label for label in labels if label not in posed)
         lens_model = common_lens_model(lenses or {"pinhole"})
         if lens_model is None:
             raise InputError(f"{path} mixes lenses of several kinds ({listed(sorted(lenses))}). Export each alone.")
         return Capture(tuple(views), path, lens_model, undo=_chunk_to_world(chunk, path), left_out=left_out)
+
+    def _path(self, root: Path) -> Path:
+        """Return the file that the user has named, or the only one."""
+        named = Path(self.root).expanduser()
+        if self.file is not None or os.path.isfile(named):
+            return named if self.file is None else root / self.file
+        found = [path for path in sorted(root.glob("*.xml")) if _is_ours(path)]
+        if len(found) == 1:
+            return found[0]
+        if not found:
+            raise InputError(f"{root} holds no xml of Metashape's cameras. Export them there, or set scene.file=NAME.")
+        names = listed((path.name for path in found), 4)
+        raise InputError(f"{root} holds {len(found)} files of Metashape's cameras ({names}). Give scene.root=FILE.")
 
 
 def _is_ours(path: Path) -> bool:
@@ -98,11 +117,29 @@ def _is_ours(path: Path) -> bool:
             start = file.read(HEAD)
     except (OSError, InputError):
         return False
+    start = start.replace(b"\0", b"")  # of UTF-16
     return b"<document" in start and b"<chunk" in start
 
 
-def _sensor(chunk: Element, number: str, path: Path) -> Sensor:
-    sensor = next((each for each in chunk.iterfind("sensors//sensor") if each.get("id") == number), None)
+def _chunk(text: str, path: Path) -> Element:
+    """Return the first chunk that has aligned cameras, or else the first with cameras."""
+    try:
+        document = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path} is not valid xml: {error}. {CURE}") from error
+    chunks = [chunk for chunk in document.iterfind("chunk") if chunk.find("cameras//camera") is not None]
+    if not chunks:
+        raise InputError(f"{path} holds no chunk of cameras. {CURE}")
+    aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None] or chunks
+    if len(chunks) > 1:
+        log.warning(
+            "%s: of %d chunks the first with aligned cameras is read. Export each alone to read another",
+            *(path, len(chunks)),
+        )
+    return aligned[0]
+
+
+def _sensor(sensor: Element | None, number: str, path: Path) -> Sensor:
     kind = "" if sensor is None else sensor.get("type", "frame")
     resolution = None if sensor is None else sensor.find("resolution")
     if sensor is None or resolution is None or kind not in LENSES:
@@ -110,7 +147,7 @@ def _sensor(chunk: Element, number: str, path: Path) -> Sensor:
             f"{path}: the sensor {number} is absent, has no resolution, or is of another type than "
             f"{listed(LENSES)} ({kind}). {CURE}"
         )
-    width, height = (float(resolution.get(side, "nan")) for side in ("width", "height"))
+    width, height = (_number(resolution.get(side), path) for side in ("width", "height"))
     if kind == "spherical":
         panorama = (width / (2 * math.pi), height / math.pi), (width / 2, height / 2)
         return Sensor("equirectangular", (width, height), *panorama, (0.0,) * 6)
@@ -120,7 +157,7 @@ def _sensor(chunk: Element, number: str, path: Path) -> Sensor:
         raise InputError(f"{path}: the sensor {number} has no calibration. Align the photographs, and export again.")
 
     def number_of(key: str) -> float:
-        return float(adjusted.findtext(key, "0"))
+        return _number(adjusted.findtext(key, "0"), path)
 
     f, b1 = number_of("f"), number_of("b1")
     # Metashape's P1 and P2 are OpenCV's p2 and p1; its centre counts from the middle of the picture.
@@ -149,15 +186,24 @@ def _chunk_to_world(chunk: Element, path: Path) -> Float[Tensor, "4 4"]:
     transform = chunk.find("transform")
     if transform is None:
         return matrix
-    rotation = torch.tensor(_numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), path))
-    shift = torch.tensor(_numbers(transform.findtext("translation", "0 0 0").split(), path))
-    (scale,) = _numbers(transform.findtext("scale", "1").split(), path)
-    matrix[:3, :3], matrix[:3, 3] = scale * rotation.reshape(3, 3), shift
+    rotation = _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), path)
+    shift = _numbers(transform.findtext("translation", "0 0 0").split(), path)
+    scale = _number(transform.findtext("scale", "1"), path)
+    if (len(rotation), len(shift)) == (9, 3):
+        matrix[:3] = torch.cat([matrix.new_tensor(rotation).reshape(3, 3), matrix.new_tensor(shift)[:, None]], dim=1)
+    if (len(rotation), len(shift)) != (9, 3) or not is_rigid(matrix[:3]):
+        raise InputError(f"{path}: the chunk's transform is no rotation with a shift and a scale. {CURE}")
+    matrix[:3, :3] *= scale
     return matrix
+
+
+def _number(word: str | None, path: Path) -> float:
+    (number,) = _numbers([word or ""], path)
+    return number
 
 
 def _numbers(words: list[str], path: Path) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError:
-        raise InputError(f"{path} holds words where numbers of a camera belong. {CURE}") from None
+        raise InputError(f"{path} holds {' '.join(words)!r} where numbers of a camera belong. {CURE}") from None

@@ -1,5 +1,6 @@
 """Captures of NeuS and IDR (DTU, BlendedMVS): `cameras_sphere.npz` beside `image/` and `mask/`."""
 
+import logging
 import re
 import zipfile
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, numeric_order
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import image_size
@@ -21,11 +22,14 @@ from nerf_lightning.files.budgets import require_within
 from nerf_lightning.files.numpy_files import archive_headers, read_member
 from nerf_lightning.files.regular import open_regular
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.poses import from_opencv_axes
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 MOST_BYTES = 1 << 28
 CURE = "Copy the file again."
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -51,13 +55,18 @@ class NeusReader(CaptureReader):
         root = self.folder()
         path = root / (self.found_in(root) or FILES[0])
         world, scale = _matrices(path)
-        asked = [self.images] if self.images else PICTURE_FOLDERS
-        folder = next((root / name for name in asked if (root / name).is_dir() and picture_files(root / name)), root)
+        folder = first_with_pictures(root, [self.images] if self.images else PICTURE_FOLDERS) or root
         names = picture_files(folder)
         if len(names) != len(world):
             raise InputError(
                 f"{path} has {len(world)} cameras, but {folder} has {len(names)} photographs, and they belong together "
                 "in order of names. Copy those that are missing, or set scene.images to their folder."
+            )
+        if numeric_order(names) != names:
+            log.warning(
+                "%s: the names of the photographs in text order (%s), in which NeuS reads them, are not in order of "
+                "their numbers. If renderings are blurred, call them 001, 002, ...",
+                *(path, listed(names, 3)),
             )
         left_out, views = LeftOut(str(path)), []
         for name, number in zip(names, sorted(world), strict=True):

@@ -39,6 +39,8 @@ def read_ply_points(path: Path) -> ColmapPoints:
             file.seek(body)
             if order == "ascii":
                 rows = np.loadtxt(file, max_rows=count, ndmin=2, comments=None) if count else np.zeros((0, 3))
+                if len(rows) < count:
+                    raise InputError(f"{path} is cut short: it announces {count} points. {CURE}")
                 columns = [rows[:, list(kind.names or ()).index(axis)] for axis in "xyz"]
             else:
                 if os.fstat(file.fileno()).st_size - body < count * kind.itemsize:
@@ -56,7 +58,8 @@ def _header(text: str, path: Path) -> tuple[str, int, np.dtype]:
     lines = [line.split() for line in text.splitlines()]
     order = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "")
     elements = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
-    if order not in ORDERS or not elements or lines[elements[0]][1:2] != ["vertex"]:
+    first = lines[elements[0]] if elements else []
+    if order not in ORDERS or len(first) != 3 or first[1] != "vertex" or not first[2].isdecimal():
         raise InputError(f"{path} is a PLY file of an unknown kind, or does not begin with its vertices. {CURE}")
     of_vertices = lines[elements[0] + 1 : elements[1] if len(elements) > 1 else len(lines)]
     properties = [words for words in of_vertices if words[:1] == ["property"]]
@@ -65,4 +68,4 @@ def _header(text: str, path: Path) -> tuple[str, int, np.dtype]:
     kind = np.dtype([(words[2], ORDERS[order] + TYPES[words[1]]) for words in properties])
     if not {"x", "y", "z"} <= set(kind.names or ()):
         raise InputError(f"{path} has vertices without x, y and z. {CURE}")
-    return order, int(lines[elements[0]][2]), kind
+    return order, int(first[2]), kind

@@ -6,7 +6,8 @@ from pathlib import Path
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.pictures import pictures_below, pictures_by_stem
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.readers.frames import number_of
 from nerf_lightning.files.budgets import require_within
@@ -31,21 +32,15 @@ class PolycamReader(CaptureReader):
     @classmethod
     def found_in(cls, folder: Path) -> str | None:
         """Return the folder by which this format is known, where a folder has it."""
-        return next((f"keyframes/{name}" for name, _ in FOLDERS if (folder / "keyframes" / name).is_dir()), None)
+        found = _folders_in(folder)
+        return None if found is None else found[0].relative_to(folder).as_posix()
 
     def capture(self) -> Capture:
         """Return the photographs in order of their names."""
         keyframes = self.folder() / "keyframes"
-        cameras, pictures = next(
-            (
-                (keyframes / of_cameras, keyframes / of_pictures)
-                for of_cameras, of_pictures in FOLDERS
-                if (keyframes / of_cameras).is_dir()
-            ),
-            (keyframes, keyframes),
-        )
-        files = {Path(name).stem: pictures / name for name in picture_files(pictures)}
-        poses = sorted(cameras.glob("*.json"))
+        cameras, pictures = _folders_in(self.folder()) or (keyframes / FOLDERS[-1][0], keyframes / FOLDERS[-1][1])
+        files = pictures_by_stem(pictures)
+        poses = sorted(cameras.glob("[!.]*.json"))
         require_within("views", len(poses), str(cameras), "views")
         left_out, views = LeftOut(str(cameras)), []
         for path in poses:
@@ -57,6 +52,14 @@ class PolycamReader(CaptureReader):
         posed = {path.stem for path in poses}
         left_out.without_pose = tuple(file.name for stem, file in files.items() if stem not in posed)
         return Capture(tuple(views), cameras, left_out=left_out, depth_unit=self.depth_unit)
+
+
+def _folders_in(root: Path) -> tuple[Path, Path] | None:
+    """Return the folders of poses and of photographs, those first that have both; None where there are no poses."""
+    found = [(root / "keyframes" / poses, root / "keyframes" / pictures) for poses, pictures in FOLDERS]
+    found = [(poses, pictures) for poses, pictures in found if next(poses.glob("[!.]*.json"), None)]
+    whole = [(poses, pictures) for poses, pictures in found if next(iter(pictures_below(pictures)), None)]
+    return next(iter((*whole, *found)), None)
 
 
 def _view(path: Path, picture: Path, depth: Path) -> View:

@@ -14,8 +14,8 @@ from torch import Tensor
 from nerf_lightning.data.captures.capture import Capture, View
 from nerf_lightning.data.captures.checks import pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
-from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS
-from nerf_lightning.data.captures.reader import CaptureReader, picture_files
+from nerf_lightning.data.captures.pictures import PICTURE_FOLDERS, first_with_pictures, pictures_by_stem
+from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.pixels.decoding import Photograph
 from nerf_lightning.data.pixels.images import image_size
 from nerf_lightning.files.budgets import require_within
@@ -27,7 +27,7 @@ MOST_BYTES = 1 << 16
 CURE = "Copy it again."
 NSVF_SPLITS = {"0": "train", "1": "val", "2": "test"}
 """By the first character of a picture's name, as in 0_train_0001.png."""
-NERFPP_SPLITS = {"train": "train", "validation": "val", "test": "test"}
+NERFPP_SPLITS = {"train": "train", "validation": "val", "val": "val", "test": "test"}
 
 
 @dataclass
@@ -76,54 +76,68 @@ class NerfPlusPlusReader(CaptureReader):
         for name, split in NERFPP_SPLITS.items():
             start = len(views)
             views += _views(root / name, f"{name}/", left_out)
-            splits[split] = tuple(range(start, len(views)))
+            splits[split] = (*splits.get(split, ()), *range(start, len(views)))
         left_out.require_enough(len(views))
         return Capture(tuple(views), root, splits=splits, left_out=left_out)
 
 
 def _views(folder: Path, prefix: str, left_out: LeftOut) -> Iterator[View]:
     """Return the views of a folder with `pose/`, photographs, and intrinsics for each or for all."""
-    places = [folder / name for name in PICTURE_FOLDERS if name and (folder / name).is_dir()]
-    if not places:
-        return
-    names = picture_files(places[0])
-    require_within("views", len(names), str(places[0]), "views")
-    for name in names:
-        stem = Path(name).stem
+    place = first_with_pictures(folder, [name for name in PICTURE_FOLDERS if name])
+    pictures = {} if place is None else pictures_by_stem(place)
+    require_within("views", len(pictures), str(folder), "views")
+    for pose in sorted((folder / "pose").glob("[!.]*.txt")):
+        with left_out.unless_usable(prefix + pose.stem):
+            if pose.stem not in pictures:
+                raise InputError(f"{folder} holds no photograph of the pose {pose.name}. Copy it there.")
+    for stem, picture in pictures.items():
+        name = picture.name
         with left_out.unless_usable(prefix + name):
             pose, own = folder / "pose" / f"{stem}.txt", folder / "intrinsics" / f"{stem}.txt"
             if not pose.is_file():
                 raise InputError(f"{pose} does not exist, so {name} has no pose.")
             intrinsics = _numbers(own if own.is_file() else folder / "intrinsics.txt")
-            width, height = image_size(places[0] / name)
-            # A 4 x 4 matrix, or f, cx, cy and what else programs put there.
-            of_matrix = len(intrinsics) >= 16 or len(intrinsics) == 9
-            across = 4 if len(intrinsics) >= 16 else 3
-            fx, fy, cx, cy = (
-                (intrinsics[0], intrinsics[across + 1], intrinsics[2], intrinsics[across + 2])
-                if of_matrix
-                else (intrinsics[0], *intrinsics[:3])
-            )
+            (fx, fy, cx, cy), size = _intrinsics(intrinsics, image_size(picture))
             yield View(
                 name=prefix + name,
-                photograph=Photograph(places[0] / name),
+                photograph=Photograph(picture),
                 c2w=from_opencv_axes(pose_from_matrix(_numbers(pose)[:16], str(pose))),
                 focal=(fx, fy),
                 center=(cx, cy),
-                size=(float(width), float(height)),
+                size=size,
             )
+
+
+def _intrinsics(
+    numbers: list[float], size: tuple[int, int]
+) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+    """Return fx, fy, cx, cy, and the (width, height) that they hold for: that of the picture where none is said.
+
+    The numbers are a matrix of 4 x 4 or 3 x 3; fx, fy, cx, cy; or NSVF's f, cx, cy and others, with height and width
+    at the end.
+    """
+    as_it_is = (float(size[0]), float(size[1]))
+    if len(numbers) == 4 and numbers[3]:
+        return (numbers[0], numbers[1], numbers[2], numbers[3]), as_it_is
+    if len(numbers) == 11:
+        return (numbers[0], numbers[0], numbers[1], numbers[2]), (numbers[10], numbers[9])
+    if len(numbers) >= 16 or len(numbers) == 9:
+        across = 4 if len(numbers) >= 16 else 3
+        return (numbers[0], numbers[across + 1], numbers[2], numbers[across + 2]), as_it_is
+    return (numbers[0], numbers[0], numbers[1], numbers[2]), as_it_is
 
 
 def _numbers(path: Path) -> list[float]:
     """Return the numbers at the beginning of a text file."""
     found = list[float]()
-    for word in read_text(path, MOST_BYTES, CURE).split():
+    lines = [line for line in read_text(path, MOST_BYTES, CURE).splitlines() if not line.startswith("#")]
+    for word in " ".join(lines).replace(",", " ").split():
         try:
             found.append(float(word))
         except ValueError:
             break
     if len(found) < 3:
-        raise InputError(f"{path} does not begin with the numbers of a camera. {CURE}")
+        raise InputError(f"{path} does not begin with the numbers that belong there. {CURE}")
     return found
 
 
@@ -132,4 +146,6 @@ def _box(root: Path) -> Float[Tensor, "2 3"] | None:
     if not (root / "bbox.txt").is_file():
         return None
     numbers = torch.tensor(_numbers(root / "bbox.txt")[:6], dtype=torch.float64)
-    return numbers.reshape(2, 3) if len(numbers) == 6 and bool(torch.isfinite(numbers).all()) else None
+    return (
+        numbers.reshape(2, 3).sort(dim=0).values if len(numbers) == 6 and bool(torch.isfinite(numbers).all()) else None
+    )

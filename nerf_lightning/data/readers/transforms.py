@@ -15,7 +15,15 @@ from nerf_lightning.data.captures.checks import contents, pose_from_matrix
 from nerf_lightning.data.captures.left_out import LeftOut
 from nerf_lightning.data.captures.pictures import find_pictures
 from nerf_lightning.data.captures.reader import CaptureReader, picture_files
-from nerf_lightning.data.readers.frames import FoundFrame, FrameFile, number_of, path_of, positive_of, views_of
+from nerf_lightning.data.readers.frames import (
+    FoundFrame,
+    FrameFile,
+    number_of,
+    path_of,
+    positive_of,
+    say_of_files,
+    views_of,
+)
 from nerf_lightning.data.readers.ply_points import read_ply_points
 from nerf_lightning.files.links import is_there
 from nerf_lightning.messages.errors import InputError
@@ -52,6 +60,8 @@ class TransformsReader(CaptureReader):
         """Return all frames, in the files' order."""
         paths = self._paths()
         left_out, files = LeftOut(str(paths[0])), [FrameFile.read(path) for path in paths]
+        if self.file is None:
+            say_of_files(files)
         each = [views_of(file, self.folder(), self.allow_outside, left_out) for file in files]
         found = [frame for frames in each for frame in frames]
         left_out.require_enough(len(found))
@@ -65,37 +75,36 @@ class TransformsReader(CaptureReader):
             )
         views = self._with_masks_and_depths(paths[0], found)
         left_out.without_pose = self._without_pose(views, left_out)
-        content, where = files[0].content, str(paths[0])
+        undo = _undo_of(files)
         return Capture(
             views=tuple(views),
             source=paths[0],
             lens_model=lens_model,
-            points=_points(files[0], self.folder()),
+            points=_points(files, self.folder(), self.allow_outside),
             splits=_splits(files[0], found)
             if len(files) == 1
             else _splits_of_files(paths, [len(each_) for each_ in each]),
-            undo=_undo(content, where),
-            box=_ngp_box(content, where),
+            undo=undo,
+            box=next((box for file in files if (box := _ngp_box(file.content, str(file.path))) is not None), None),
             left_out=left_out,
-            depth_unit=self.depth_unit,
+            depth_unit=self.depth_unit / unit_of(undo),  # depths are those before applied_scale
         )
 
     def _paths(self) -> list[Path]:
         root = Path(self.root).expanduser()
         if self.file is not None or os.path.isfile(root):
-            path = self.folder() / self.file if self.file is not None else root
+            path = root
+            if self.file is not None:  # it may lie in a folder that is a capture itself
+                places = [folder / self.file for folder in (self.named_folder(), self.folder())]
+                path = next(filter(is_there, places), places[0])
             if not is_there(path):
                 raise InputError(_absent(path))
             return [path]
         paths = _files_in(self.folder())
         if not paths:
             raise InputError(_absent(self.folder() / "transforms.json"))
-        others = [path for path in sorted(self.folder().glob("transforms_*.json")) if path not in paths]
-        if others:
-            log.warning(
-                "%s is read; %s beside it %s not (scene.file=NAME reads another)",
-                *(paths[0], listed(path.name for path in others), "is" if len(others) == 1 else "are"),
-            )
+        if len(paths) > 1:
+            log.info("%s: read as one capture: %s", self.folder(), listed((path.name for path in paths), 5))
         return paths
 
     def _without_pose(self, views: list[View], left_out: LeftOut) -> tuple[str, ...]:
@@ -121,8 +130,7 @@ class TransformsReader(CaptureReader):
         names = [str(each.settings[key]) if each.settings.get(key) else None for each in found]
         wanted = [name for name in names if name is not None]
         photographs = {each.view.photograph.path for each in found}
-        files = find_pictures(wanted, path.parent, self.folder(), path, self.allow_outside, say=False)
-        files = {name: file for name, file in files.items() if file not in photographs}
+        files = find_pictures(wanted, path.parent, self.folder(), path, self.allow_outside, beside=photographs)
         absent = [name for name in wanted if name not in files]
         if absent:
             log.warning(
@@ -150,18 +158,24 @@ def _absent(path: Path) -> str:
     return f"{path} does not exist; the folder holds {held}. Point scene.root at the folder with {path.name}."
 
 
-def _points(file: FrameFile, root: Path) -> Float[Tensor, "points 3"]:
+def _points(files: list[FrameFile], root: Path, outside: bool) -> Float[Tensor, "points 3"]:
     """Return the points of `ply_file_path` (nerfstudio), or none."""
-    name = file.content.get("ply_file_path")
-    if not name:
-        return torch.zeros(0, 3, dtype=torch.float64)
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    file = next((file for file in files if file.content.get("ply_file_path")), None)
+    if file is None:
+        return none
+    name = file.content["ply_file_path"]
     path = file.path.parent / path_of(name, "ply_file_path", str(file.path)).replace("\\", "/")
-    if not is_there(path):
+    if not is_there(path) or not (outside or Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root))):
         path = root / path.name
     if not is_there(path):
         log.warning("%s: the points of ply_file_path=%s are not there, and are left out", file.path, name)
-        return torch.zeros(0, 3, dtype=torch.float64)
-    return torch.from_numpy(read_ply_points(path).positions)
+        return none
+    try:
+        return torch.from_numpy(read_ply_points(path).positions)
+    except InputError as error:
+        log.warning("%s: the points of ply_file_path are left out. %s", file.path, error)
+        return none
 
 
 def _splits_of_files(paths: list[Path], counts: list[int]) -> dict[str, tuple[int, ...]] | None:
@@ -180,13 +194,15 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
     content, path = file.content, file.path
     lists = {split: content[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in content}
     if not lists:
-        lists = {split: [each.view.name for each in found if split in Path(each.name).parts[:-1]] for split in SPLITS}
+        lists = {
+            split: [each.view.name for each in found if split in PurePosixPath(_plain(each.name)).parts[:-1]]
+            for split in SPLITS
+        }
         if not lists["train"] or not (lists["val"] or lists["test"]):
             return None
-    numbers = {each.view.name: number for number, each in enumerate(found)}
     # As the frames write them, too: without an ending, say.
-    numbers |= {_plain(each.name): number for number, each in enumerate(found)}
-    listed_at_all = {_plain(frame["file_path"]) for frame in file.frames if isinstance(frame, dict)}
+    numbers = {name: n for n, each in enumerate(found) for name in (each.view.name, _plain(each.name))}
+    listed_at_all = {_plain(frame.get("file_path")) for frame in file.frames if isinstance(frame, dict)}
     splits = {}
     for split in SPLITS:
         names = lists.get(split, [])
@@ -196,6 +212,11 @@ def _splits(file: FrameFile, found: list[FoundFrame]) -> dict[str, tuple[int, ..
         if lost:
             log.warning("%s: %s_filenames lists %s, which no frame has; this is passed over", path, split, listed(lost))
         splits[split] = tuple(dict.fromkeys(numbers[_plain(name)] for name in names if _plain(name) in numbers))
+    unused = [each.view.name for number, each in enumerate(found) if all(number not in splits[key] for key in SPLITS)]
+    if unused:
+        log.warning(
+            "%s: %d of %d views are in no split, and are not used: %s", path, len(unused), len(found), listed(unused, 3)
+        )
     return splits
 
 
@@ -217,6 +238,18 @@ def _ngp_box(content: dict[str, Any], where: str) -> Float[Tensor, "2 3"] | None
     numbers = [number_of({"offset": number}, "offset", where) for number in offset]
     middle, half = (0.5 - torch.tensor(numbers, dtype=torch.float64)) / scale, 0.5 * size / scale
     return torch.stack([middle - half, middle + half])
+
+
+def _undo_of(files: list[FrameFile]) -> Float[Tensor, "4 4"]:
+    """Return what takes the poses of all files to the frame that they come from, which must be one."""
+    undo, *others = (_undo(file.content, str(file.path)) for file in files)
+    for file, other in zip(files[1:], others, strict=True):
+        if not torch.allclose(undo, other):
+            raise InputError(
+                f"{files[0].path} and {file.path} differ in applied_transform or applied_scale, so their poses are in "
+                "two frames. Read one of them with scene.file=NAME, or export both together."
+            )
+    return undo
 
 
 def _undo(content: dict[str, Any], where: str) -> Float[Tensor, "4 4"]:

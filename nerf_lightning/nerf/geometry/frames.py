@@ -1,7 +1,7 @@
 """A working frame for a capture: which way is up, where the middle is, and how large a unit should be."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.nn import functional
 
@@ -115,16 +115,16 @@ def average_pose(c2w: Float[Tensor, "views 3 4"]) -> Float[Tensor, "3 4"]:
     return torch.stack([right, torch.linalg.cross(back, right), back, c2w[:, :, 3].mean(dim=0)], dim=-1)
 
 
-def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit: float) -> Float[Tensor, "4 4"]:
-    """Return `to_user`: x_user = unit * rotation x + center.
+def similarity(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"], unit: float) -> Float64[Tensor, "4 4"]:
+    """Return `to_user`, in float64: x_user = unit * rotation x + center.
 
     Args:
         rotation: the working frame's axes, as columns in the user's frame.
         center: the working frame's origin in the user's frame.
         unit: how many of the user's units make one of the scene's.
     """
-    matrix = torch.eye(4, dtype=rotation.dtype)
-    matrix[:3, :3], matrix[:3, 3] = unit * rotation, center
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = unit * rotation.double(), center
     return matrix
 
 

@@ -33,6 +33,16 @@ def test_photographs_come_sorted_and_hidden_files_and_folders_are_passed_over(tm
     assert {(p.width, p.height, p.upright) for p in found} == {(96, 64, True)}
 
 
+def test_raw_files_without_a_jpeg_are_one_line(tmp_path, caplog):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        save(tmp_path / name)
+    for name in ("a.NEF", "d.nef"):
+        (tmp_path / name).touch()
+    find_photographs(tmp_path)
+    (raw,) = caplog.messages
+    assert raw.startswith("1 files are left out: d.nef. RAW is not read. Develop")
+
+
 def test_cameras_are_told_apart_by_size_and_focal_length(tmp_path):
     for number, changes in enumerate([{}, {}, {"width": 104}, {"focal": 5.0}, {"focal": 5.0}, {"focal": 7.5}]):
         save(tmp_path / f"{number}.jpg", **changes)

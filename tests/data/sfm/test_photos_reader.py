@@ -56,6 +56,12 @@ def test_cameras_are_found_once_and_again_where_a_photograph_has_changed(photogr
     assert len(found) == 2
 
 
+def test_cameras_of_plain_photographs_are_not_taken_for_those_of_panoramas(photographs, found, tmp_path):
+    for panoramas in ("auto", False, False):
+        PhotosReader(root=str(photographs), cache_dir=str(tmp_path / "cache"), panoramas=panoramas).read()
+    assert found == [photographs] * 2
+
+
 def test_photographs_in_images_below_the_folder_are_found(photographs, found, tmp_path):
     (tmp_path / "capture").mkdir()
     shutil.move(photographs, tmp_path / "capture" / "images")

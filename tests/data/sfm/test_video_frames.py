@@ -1,8 +1,12 @@
+import subprocess
+
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 from support.corner import noise
 
+from nerf_lightning.data.sfm import hdr_films
 from nerf_lightning.data.sfm.video_frames import count_frames, frame_stride, is_blurred, sharpness, write_sharp_frames
 from nerf_lightning.messages.errors import InputError
 
@@ -78,3 +82,57 @@ def test_what_is_not_a_video_is_named(tmp_path):
         write_sharp_frames(path, tmp_path, every=2)
     with pytest.raises(InputError, match=r"none\.mp4: there is no such file"):
         count_frames(tmp_path / "none.mp4")
+
+
+def ffmpeg(*arguments):
+    """Run ffmpeg, or skip the test where it lacks an encoder, a filter or an option."""
+    result = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *map(str, arguments)], capture_output=True)
+    if result.returncode:
+        pytest.skip(f"this ffmpeg fails: {result.stderr.decode()[:200]}")
+
+
+def test_a_film_that_was_held_upright_is_upright(film, tmp_path, caplog):
+    ffmpeg("-display_rotation", 90, "-i", film[0], "-c", "copy", tmp_path / "turned.mp4")
+    write_sharp_frames(tmp_path / "turned.mp4", tmp_path, every=6)
+    written = np.asarray(Image.open(tmp_path / "frame_000009.jpg"), dtype=float)
+    assert np.abs(written - np.rot90(film[1][9])).mean() < 6
+    assert not caplog.messages
+
+
+def test_frames_that_come_at_uneven_times_are_read_once_each(film, tmp_path):
+    path = tmp_path / "uneven.mp4"
+    ffmpeg("-i", film[0], "-vf", "setpts='if(lt(N,9),N,4*N)/(10*TB)'", "-fps_mode", "passthrough", path)
+    assert write_sharp_frames(path, tmp_path, every=1) == count_frames(path) == 20
+
+
+@pytest.fixture(scope="module")
+def hlg_film(tmp_path_factory):
+    """Three greys: the HLG signal 0.25, 0.5 and 0.75, of which the last is white."""
+    path = tmp_path_factory.mktemp("hlg") / "hlg.mp4"
+    tags = "log-level=0:colorprim=bt2020:transfer=arib-std-b67:colormatrix=bt2020nc"
+    grey = "color=s=192x64:d=0.3:r=10,format=yuv420p10le,geq=lum='64+876*(1+floor(X/64))/4':cb=512:cr=512"
+    ffmpeg("-f", "lavfi", "-i", grey, "-c:v", "libx265", "-crf", 4, "-x265-params", tags, path)
+    return path
+
+
+def greys(folder):
+    return np.asarray(Image.open(folder / "frame_000000.jpg"))[32, 32::64, 1].astype(int)
+
+
+def test_a_film_in_hdr_is_tone_mapped(hlg_film, tmp_path, caplog):
+    caplog.set_level("INFO")
+    write_sharp_frames(hlg_film, tmp_path, every=3)
+    if "will look flat" in caplog.text:
+        pytest.skip("this ffmpeg has no zscale")
+    # In linear light 0.25 and 0.5 are 0.08 and 0.31 of white, which BT.709 encodes; white itself is compressed.
+    assert np.abs(greys(tmp_path) - [64, 136, 237]).max() <= 8
+    assert len(caplog.messages) == 1
+
+
+def test_where_hdr_cannot_be_tone_mapped_one_line_says_so(hlg_film, tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(hdr_films, "FILTERS", {"no_such_filter"})
+    write_sharp_frames(hlg_film, tmp_path, every=3)
+    assert np.abs(greys(tmp_path) - [64, 128, 191]).max() <= 4
+    (said,) = caplog.messages
+    assert "HDR (arib-std-b67)" in said
+    assert "will look flat. Film without HDR" in said

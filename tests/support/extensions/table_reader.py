@@ -25,7 +25,6 @@ class TableReader(CaptureReader):
 
     def capture(self):
         path = self.folder() / self.file
-        self.require_inside(path)
         try:
             with path.open(newline="", encoding="utf-8") as rows:
                 return Capture(tuple(self._view(row) for row in csv.reader(rows)), source=path)
@@ -36,12 +35,11 @@ class TableReader(CaptureReader):
         name, *numbers = row
         focal, *position, to_x, to_y, to_z = map(float, numbers)
         photograph = self.folder() / name
-        self.require_inside(photograph)
         width, height = map(float, image_size(photograph))
         eye, target, up = torch.tensor([position, [to_x, to_y, to_z], [0.0, 0.0, 1.0]], dtype=torch.float64)
         return View(
             name=name,
-            photograph=Photograph(photograph, self.mask_of(name)),
+            photograph=Photograph(photograph),
             c2w=look_at(eye, target, up),
             focal=(focal, focal),
             center=(width / 2, height / 2),
