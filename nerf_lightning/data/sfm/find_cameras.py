@@ -4,8 +4,15 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.sfm.gps import align_to_gps
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
-from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel, in_short, reconstruct
+from nerf_lightning.data.sfm.reconstruction import (
+    NothingFoundError,
+    SparseModel,
+    in_short,
+    reconstruct,
+    require_pycolmap,
+)
 from nerf_lightning.data.sfm.settings import SfmSettings, attempts, stage_costs
 from nerf_lightning.files.made_folders import make_folder
 from nerf_lightning.messages.console import StageProgress
@@ -21,8 +28,8 @@ def find_cameras(
 ) -> SparseModel:
     """Find the cameras of photographs and write the largest model in COLMAP's binary form.
 
-    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own. Of several
-    attempts, the one that places most photographs counts.
+    Poses are COLMAP's: world to camera, axes right, down, forwards, in a frame and scale of its own, or in metres with
+    z up where GPS tells (`align_to_gps`). Of several attempts, the one that places most photographs counts.
 
     Args:
         photographs: in the order in which they were taken.
@@ -52,8 +59,9 @@ def find_cameras(
             "that overlap by two thirds, from places some steps apart (do not turn on the spot), sharp, with one "
             "zoom and without mirrors or bare walls filling the picture; then try again."
         )
+    align_to_gps(require_pycolmap(), best[0], folder)
     best[0].write_binary(make_folder(sparse))
-    return in_short(best, [photograph.path.name for photograph in photographs])
+    return in_short(best, [photograph.name for photograph in photographs])
 
 
 def _is_better(model: Any, than: Any) -> bool:

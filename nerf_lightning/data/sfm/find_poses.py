@@ -6,6 +6,7 @@ from pathlib import Path
 
 from nerf_lightning.data.pixels.images import read_rgba
 from nerf_lightning.data.sfm.find_cameras import find_cameras
+from nerf_lightning.data.sfm.panoramas import of_one_kind
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph, check_pixels, find_photographs, put_upright
 from nerf_lightning.data.sfm.reconstruction import NothingFoundError, SparseModel
 from nerf_lightning.data.sfm.settings import SfmSettings, chosen_matching
@@ -61,13 +62,14 @@ def from_photographs(source: Path, folder: Path, settings: SfmSettings) -> tuple
     Raises:
         InputError: photographs that cannot be used, or whose cameras cannot be found.
     """
-    photographs = find_photographs(source)
+    photographs = of_one_kind(find_photographs(source), settings.panoramas, f"images={source}")
     in_place = (folder / "images").exists()
-    turned = [photograph.path.name for photograph in photographs if not photograph.upright]
-    if in_place and turned:
+    anew = [photograph.path.name for photograph in photographs if not photograph.as_it_is]
+    if in_place and anew:
         raise InputError(
-            f"{listed(turned)} in {source} are stored turned (EXIF orientation) and must be written anew, but they lie "
-            "in the output folder itself. Give another folder with paths.output_dir=DIR."
+            f"{listed(anew)} in {source} are stored turned (EXIF orientation), or in a format that COLMAP does not "
+            "read, and must be written anew, but they lie in the output folder itself. Give another folder with "
+            "paths.output_dir=DIR."
         )
     costs = {READING: READING_COST * sum(p.width * p.height for p in photographs) / 1e6}
     with _unfinished(folder) as work:
@@ -96,12 +98,13 @@ def from_video(video: Path, every: int | None, folder: Path, settings: SfmSettin
         with StageProgress({FRAMES: FRAME_COST * num_frames}) as report:
             write_sharp_frames(video, images, stride, lambda count: report(FRAMES, count / num_frames))
         try:
-            photographs = find_photographs(images)
+            found = find_photographs(images)
         except InputError as error:
             raise InputError(
                 f"video={video}: one of every {stride} of its {num_frames} frames is not enough, or they are tiny. "
                 "Give a longer or larger video, or a smaller every=."
             ) from error
+        photographs = of_one_kind(found, settings.panoramas, f"video={video}")
         try:
             model = find_cameras(photographs, images, work, work / "sparse" / "0", settings)
         except NothingFoundError as error:

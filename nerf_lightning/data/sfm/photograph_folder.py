@@ -8,11 +8,12 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
+from nerf_lightning.data.captures.left_out import LeftOut
+from nerf_lightning.data.pixels.formats import HEIC_CURE, HEIC_ENDINGS, UNREAD, decoders
 from nerf_lightning.data.pixels.images import (
     DECODER_ERRORS,
-    FORMATS,
-    HEIC_CURE,
     ORIENTATION,
+    QUARTER_TURNS,
     image_size,
     open_picture,
     read_rgba,
@@ -21,8 +22,9 @@ from nerf_lightning.files.budgets import require_within
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import is_plain, listed
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+READ_BY_COLMAP = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+WRITTEN_ANEW = (".webp", ".avif")
+"""And HEIC, where it is read."""
 PANORAMA = b"equirectangular"
 """In XMP (Google's GPano:ProjectionType), which panorama cameras write."""
 FEWEST = 3
@@ -44,14 +46,27 @@ class FoundPhotograph:
     upright: bool
     """Whether the pixels are stored as they are shown, not turned by an EXIF tag."""
     is_panorama: bool
-    """Whether it says that it shows all directions."""
+    """Whether it shows all directions: as its header says, or as `of_one_kind` has decided."""
     lens: tuple[str, ...]
     """What EXIF says of camera, focal length and zoom; empty words where it says nothing."""
+    has_alpha: bool = False
+
+    @property
+    def name(self) -> str:
+        """Return what it is called beside the poses: with another ending where COLMAP does not read its format."""
+        if self.path.suffix.lower() in READ_BY_COLMAP:
+            return self.path.name
+        return f"{self.path.name}.{'png' if self.has_alpha else 'jpg'}"
+
+    @property
+    def as_it_is(self) -> bool:
+        """Return whether COLMAP reads the file itself, upright."""
+        return self.upright and self.name == self.path.name
 
     @property
     def camera(self) -> tuple[int, int, tuple[str, ...]]:
-        """Return what photographs of one camera and zoom share."""
-        return self.width, self.height, self.lens
+        """Return what photographs of one camera and zoom share; panoramas of one size differ in nothing."""
+        return self.width, self.height, () if self.is_panorama else self.lens
 
 
 def find_photographs(folder: Path) -> list[FoundPhotograph]:
@@ -79,37 +94,51 @@ def find_photographs(folder: Path) -> list[FoundPhotograph]:
             *(len(odd), len(pictures), listed(odd, 5)),
         )
         pictures = [path for path in pictures if is_plain(path.name)]
-    # A HEIC beside its JPEG of the same name is the original of it.
+    # What lies beside a JPEG of its name is the original of it.
     known = {path.stem.lower() for path in pictures}
-    heic = [path.name for path in files if path.suffix.lower() in HEIC_SUFFIXES and path.stem.lower() not in known]
-    if heic:
+    others = [path for path in files if path.stem.lower() not in known]
+    heic = [path.name for path in others if path.suffix.lower() in HEIC_ENDINGS]
+    if heic and "HEIF" not in decoders():
         raise InputError(f"images={folder} holds {listed(heic, 4)}. {HEIC_CURE}")
     if len(pictures) < FEWEST:
         raise InputError(_too_few(folder, pictures, files))
+    if unread := [path for path in others if path.suffix.lower() in UNREAD]:
+        cure = UNREAD[unread[0].suffix.lower()]
+        log.warning("%d files are left out: %s. %s", len(unread), listed((path.name for path in unread), 3), cure)
     require_within("views", len(pictures), f"images={folder}", "photographs")
-    photographs = [_photograph(path) for path in pictures]
-    around = [photograph.path.name for photograph in photographs if photograph.is_panorama]
-    if around:
-        mixed = " among other photographs" if len(around) < len(photographs) else ""
-        raise InputError(
-            f"images={folder} holds panoramas of all directions{mixed} ({listed(around, 4)}), and cameras are found of "
-            "plain photographs only. Move them away, or find their cameras with a program for panoramas that writes a "
-            "transforms.json with camera_model EQUIRECTANGULAR, which scene=transforms reads."
-        )
+    left_out, photographs = LeftOut(f"images={folder}"), list[FoundPhotograph]()
+    for path in pictures:
+        with left_out.unless_usable(path.name):
+            photographs.append(_photograph(path))
+    left_out.require_enough(len(photographs))
+    left_out.say(len(photographs))
     return photographs
 
 
 def files_in(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files that lie in a folder, sorted by name, and those that are photographs by their names."""
+    """Return the files that lie in a folder, sorted by name, and those that are photographs by their names.
+
+    A HEIC, AVIF or WebP beside a JPEG, PNG or TIFF of the same name is the original of it, and no other photograph.
+    """
     files = sorted(path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir())
-    return files, [path for path in files if path.suffix.lower() in SUFFIXES]
+    plain = {path.stem.lower() for path in files if path.suffix.lower() in READ_BY_COLMAP}
+    anew = (*WRITTEN_ANEW, *HEIC_ENDINGS) if "HEIF" in decoders() else WRITTEN_ANEW
+
+    def is_photograph(path: Path) -> bool:
+        ending = path.suffix.lower()
+        return ending in READ_BY_COLMAP or (ending in anew and plain.isdisjoint((path.stem.lower(), path.name.lower())))
+
+    return files, [path for path in files if is_photograph(path)]
 
 
 def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
-    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew."""
-    target = folder / photograph.path.name
-    if not photograph.upright:
-        _write_turned(photograph.path, target)
+    """Put a photograph into a folder as a hard link, or a copy where that cannot be; a turned one is written anew.
+
+    So is one of a format that COLMAP does not read.
+    """
+    target = folder / photograph.name
+    if not photograph.as_it_is:
+        _write_anew(photograph.path, target)
         return
     try:
         os.link(photograph.path.resolve(), target)
@@ -119,7 +148,7 @@ def put_upright(photograph: FoundPhotograph, folder: Path) -> None:
 
 def check_pixels(photograph: FoundPhotograph) -> None:
     """Decode a photograph once, so that a damaged one is named before hours are spent on the others."""
-    if photograph.upright:
+    if photograph.as_it_is:
         read_rgba(photograph.path)
 
 
@@ -130,15 +159,15 @@ def _photograph(path: Path) -> FoundPhotograph:
             f"{path} is {width} x {height} pixels: too small to find anything again in it. Remove thumbnails and "
             f"icons from the folder; a photograph needs at least {SMALLEST_SIDE} pixels on its shorter side."
         )
-    turned, is_panorama, lens = _said_of(path)
+    turned, is_panorama, lens, has_alpha = _said_of(path)
     # Orientations 5 to 8 are quarter turns.
-    size = (height, width) if turned in (5, 6, 7, 8) else (width, height)
-    return FoundPhotograph(path, *size, turned == 1, is_panorama, lens)
+    size = (height, width) if turned in QUARTER_TURNS else (width, height)
+    return FoundPhotograph(path, *size, turned == 1, is_panorama, lens, has_alpha)
 
 
-def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...]]:
-    """Return how a photograph is turned, whether it is a panorama, and what tells its lens apart from others."""
-    with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
+def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...], bool]:
+    """Return how a photograph is turned, whether it is a panorama, what tells its lens apart, and if it has alpha."""
+    with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
         try:
             # Pillow would decode a whole PNG to look for EXIF behind its pixels.
             exif = image.getexif() if image.format != "PNG" or "exif" in image.info else Image.Exif()
@@ -148,18 +177,19 @@ def _said_of(path: Path) -> tuple[object, bool, tuple[str, ...]]:
             exif, details = Image.Exif(), {}  # damage is named once the pixels are decoded
         xmp = image.info.get("xmp", b"")
         is_panorama = PANORAMA in (xmp if isinstance(xmp, bytes) else str(xmp).encode())
+        has_alpha = image.has_transparency_data
     lens = (exif.get(ExifTags.Base.Model, ""), *(details.get(tag, "") for tag in LENS_TAGS))
-    return exif.get(ORIENTATION, 1), is_panorama, tuple(str(value)[:LONGEST_TAG] for value in lens)
+    return exif.get(ORIENTATION, 1), is_panorama, tuple(str(value)[:LONGEST_TAG] for value in lens), has_alpha
 
 
-def _write_turned(path: Path, target: Path) -> None:
+def _write_anew(path: Path, target: Path) -> None:
     try:
-        with open_picture(path) as file, Image.open(file, formats=FORMATS) as image:
+        with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
             upright = ImageOps.exif_transpose(image)
             profile = image.info.get("icc_profile")
     except DECODER_ERRORS as error:
         raise InputError(
-            f"{path} cannot be turned upright: {error}. It may be damaged or cut short; copy it from the camera again."
+            f"{path} cannot be written anew: {error}. It may be damaged or cut short; copy it from the camera again."
         ) from error
     # PNG and TIFF take no notice of the quality.
     upright.save(target, exif=upright.getexif(), icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
@@ -179,4 +209,4 @@ def _too_few(folder: Path, pictures: list[Path], files: list[Path]) -> str:
     else:
         others, cure = "nothing", ""
     folders = f" It has folders of its own ({listed(inside, cap=4)}): was one of them meant?" if inside else ""
-    return f"images={folder} holds no PNG, JPEG or TIFF, {others}.{folders}{cure}"
+    return f"images={folder} holds no PNG, JPEG, TIFF, WebP, AVIF or HEIC, {others}.{folders}{cure}"

@@ -15,7 +15,7 @@ from nerf_lightning.data.readers.colmap import ColmapReader
 from nerf_lightning.data.sfm.find_poses import from_photographs, from_video
 from nerf_lightning.data.sfm.photograph_folder import files_in
 from nerf_lightning.data.sfm.reconstruction import require_pycolmap
-from nerf_lightning.data.sfm.settings import SfmSettings
+from nerf_lightning.data.sfm.settings import Panoramas, SfmSettings
 from nerf_lightning.data.sfm.summary import remarks
 from nerf_lightning.files.folders import default_folder
 from nerf_lightning.files.private import make_own_folder
@@ -31,11 +31,14 @@ class PhotosReader(AutoReader):
     Args:
         root: the folder of the photographs; they lie in it, or in `images` below it.
         video: a video, in place of root.
+        panoramas: whether the pictures are equirectangular panoramas of all directions; auto: where they say so, or
+            all are exactly twice as wide as high.
     """
 
     root: str | None = None  # type: ignore[assignment]
     name: str = "photos"
     video: str | None = None
+    panoramas: Panoramas = "auto"
     downscale: int | Literal["auto"] = "auto"
 
     def reader(self) -> Reader:
@@ -57,7 +60,7 @@ class PhotosReader(AutoReader):
 
     def _cameras(self) -> Path:
         """Return the folder of a capture, which is made where it is not there yet."""
-        source, settings = self._source(), SfmSettings()
+        source, settings = self._source(), SfmSettings(panoramas=self.panoramas)
         cache = default_folder("poses") if self.cache_dir is None else Path(self.cache_dir).expanduser() / "poses"
         folder = cache / _key(source, settings)
         if (folder / "sparse" / "0").is_dir():

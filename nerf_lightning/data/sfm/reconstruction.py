@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.data.sfm.panoramas import lens_of, verification_of
 from nerf_lightning.data.sfm.photograph_folder import FoundPhotograph
 from nerf_lightning.data.sfm.settings import (
     FEATURES,
@@ -79,7 +80,7 @@ def reconstruct(
     """Return COLMAP's models of photographs, the largest first: photographs of several places make several.
 
     Args:
-        photographs: in the order in which they were taken.
+        photographs: of one kind, in the order in which they were taken.
         folder: where the pixels lie, upright, under the photographs' names.
         work: a folder for databases and lists; features that an attempt has left there are taken again.
         settings: how.
@@ -87,17 +88,17 @@ def reconstruct(
         report: called with a stage of `stage_costs` and how much of it is done, 0 to 1.
 
     Raises:
-        InputError: no pycolmap, or photographs of several sizes for one camera.
+        InputError: no pycolmap, or one without panoramas, or photographs of several sizes for one camera.
     """
     colmap = require_pycolmap()
-    names = [photograph.path.name for photograph in photographs]
+    lens = lens_of(colmap, photographs, settings.camera_model)
     groups = _camera_groups(photographs, settings.camera_mode)
     database = work / attempt.database
     with _quiet(colmap), _room_asked_for(work):
         colmap.set_random_seed(settings.seed)
         if not database.exists():
-            _find_features(colmap, database, folder, groups, settings, attempt, report)
-            _match(colmap, database, names, work / "pairs.txt", settings, report)
+            _find_features(colmap, database, folder, groups, lens, settings, attempt, report)
+            _match(colmap, database, photographs, work / "pairs.txt", settings, report)
         models = work / f"{attempt.database}_{attempt.mapper}"
         if attempt.mapper == "global":
             return _mapped_globally(colmap, database, folder, models, settings, report)
@@ -142,7 +143,7 @@ def _room_asked_for(work: Path) -> Iterator[None]:
 def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tuple[list[list[str]], list[str]]:
     """Return the names that share a camera, group by group, and those that have a camera each."""
     if mode == "per_image":
-        return [], [p.path.name for p in photographs]
+        return [], [p.name for p in photographs]
     if mode == "single":
         sizes = Counter((p.width, p.height) for p in photographs).most_common()
         if len(sizes) > 1:
@@ -151,10 +152,10 @@ def _camera_groups(photographs: list[FoundPhotograph], mode: CameraMode) -> tupl
                 f"camera_mode=single, but the photographs have several sizes ({shown} pixels). Give camera_mode=auto "
                 "(one camera per size and zoom) or per_image, or leave out the odd ones."
             )
-        return [[p.path.name for p in photographs]], []
+        return [[p.name for p in photographs]], []
     sharing = Counter(p.camera for p in photographs)
-    groups = [[p.path.name for p in photographs if p.camera == camera] for camera, n in sharing.items() if n > 1]
-    return groups, [p.path.name for p in photographs if sharing[p.camera] == 1]
+    groups = [[p.name for p in photographs if p.camera == camera] for camera, n in sharing.items() if n > 1]
+    return groups, [p.name for p in photographs if sharing[p.camera] == 1]
 
 
 def _find_features(
@@ -162,6 +163,7 @@ def _find_features(
     database: Path,
     folder: Path,
     groups: tuple[list[list[str]], list[str]],
+    lens: str,
     settings: SfmSettings,
     attempt: Attempt,
     report: Report,
@@ -178,7 +180,7 @@ def _find_features(
     report(FEATURES, 0.0)
     for names, mode in [*((group, colmap.CameraMode.SINGLE) for group in shared), (alone, colmap.CameraMode.PER_IMAGE)]:
         reader = colmap.ImageReaderOptions()
-        reader.camera_model = settings.camera_model
+        reader.camera_model = lens
         for start in range(0, len(names), settings.threads):
             part = names[start : start + settings.threads]
             colmap.extract_features(
@@ -198,23 +200,29 @@ def _find_features(
 
 
 def _match(
-    colmap: Any, database: Path, names: list[str], pair_list: Path, settings: SfmSettings, report: Report
+    colmap: Any,
+    database: Path,
+    photographs: list[FoundPhotograph],
+    pair_list: Path,
+    settings: SfmSettings,
+    report: Report,
 ) -> None:
     """Match and verify pairs of photographs."""
     options = colmap.FeatureMatchingOptions()
     options.type = colmap.FeatureMatcherType.SIFT_BRUTEFORCE
     options.use_gpu, options.num_threads = False, settings.threads
+    verification = verification_of(colmap, photographs)
     pairing = colmap.ImportedPairingOptions()
     pairing.match_list_path = str(pair_list)
-    pairs = image_pairs(settings.matching, len(names))
+    pairs = image_pairs(settings.matching, len(photographs))
     # The list is cut at spaces, and names may have some.
-    plain = {name: f"{number:06d}" for number, name in enumerate(names)}
+    plain = {photograph.name: f"{number:06d}" for number, photograph in enumerate(photographs)}
     _rename(colmap, database, plain)
     done = 0
     report(MATCHING, 0.0)
     for tile in tiles_of(pairs):
         pair_list.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in tile))
-        colmap.match_image_pairs(database, options, pairing, device=colmap.Device.cpu)
+        colmap.match_image_pairs(database, options, pairing, verification, device=colmap.Device.cpu)
         done += len(tile)
         report(MATCHING, done / len(pairs))
     _rename(colmap, database, {number: name for name, number in plain.items()})

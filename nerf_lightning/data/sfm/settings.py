@@ -10,6 +10,7 @@ from nerf_lightning.messages.errors import require_positive
 
 Matching = Literal["exhaustive", "sequential", "auto"]
 CameraMode = Literal["single", "per_image", "auto"]
+Panoramas = bool | Literal["auto"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 FEATURES, MATCHING, MAPPING = "finding features", "comparing photographs", "placing cameras"
@@ -28,7 +29,9 @@ class SfmSettings:
     Args:
         matching: which photographs are compared: all pairs, neighbours in the order of names, or by their number.
         camera_mode: one camera for all, one each, or one per size and EXIF focal length.
-        camera_model: COLMAP's name of the lens model.
+        camera_model: COLMAP's name of the lens model; panoramas have one of their own.
+        panoramas: whether the pictures are equirectangular panoramas of all directions; auto: where they say so, or
+            all are exactly twice as wide as high.
         num_features: most features of a photograph; auto: 8192, of more than 24 photographs 3072, of more than 80 2048,
             and other ways where photographs are left out (`attempts`).
         max_image_size: the longer side in pixels to which photographs are shrunk for finding features.
@@ -42,6 +45,7 @@ class SfmSettings:
     matching: Matching = "auto"
     camera_mode: CameraMode = "auto"
     camera_model: CameraModel = "OPENCV"
+    panoramas: Panoramas = "auto"
     num_features: int | Literal["auto"] = "auto"
     max_image_size: int = 2000
     num_threads: int | None = None

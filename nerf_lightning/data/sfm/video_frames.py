@@ -1,6 +1,8 @@
 """Sharp frames of a video: of every few consecutive frames the one that is blurred least. Only videos are opened."""
 
+import logging
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -8,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageFilter
 
+from nerf_lightning.data.sfm.hdr_films import hdr_transfer, tone_mapped
 from nerf_lightning.files.regular import explained, open_regular
 from nerf_lightning.messages.errors import InputError
 
@@ -19,6 +22,11 @@ JPEG_QUALITY = 95
 BLURRED = 0.7
 # Nothing but the file itself is opened.
 INPUT = ["-protocol_whitelist", "file"]
+# Else frames are repeated where they come at uneven times, as phones film.
+EACH_ONCE = ["-fps_mode", "passthrough"]
+
+# It warns that films which were held upright have another size than their stream.
+logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def sharpness(frame: UInt8[np.ndarray, "height width 3"]) -> float:
@@ -80,11 +88,14 @@ def frame_stride(num_frames: int, every: int | None) -> int:
 def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[int], None] = lambda count: None) -> int:
     """Write the sharpest of every `every` frames as frame_000123.jpg, by its number in the video; return how many.
 
-    Frames come upright; a shorter last group counts as one; `seen` is called with the number of frames read so far.
+    Frames come upright, and those of HDR films tone-mapped; a shorter last group counts as one; `seen` is called with
+    the number of frames read so far.
 
     Raises:
         InputError: not a video, or one without frames.
     """
+    with _named(video):
+        transfer = hdr_transfer(video, INPUT)
     written, sharpest = 0, -1.0
     for index, frame in enumerate(_frames(video)):
         # Only the best so far is kept: a group of large frames would be gigabytes.
@@ -92,22 +103,30 @@ def write_sharp_frames(video: Path, folder: Path, every: int, seen: Callable[[in
             sharpest, best, number = here, frame, index
         seen(index + 1)
         if (index + 1) % every == 0:
-            written, sharpest = written + _write(folder, best, number), -1.0
+            written, sharpest = written + _write(folder, best, number, transfer), -1.0
     if sharpest >= 0:
-        written += _write(folder, best, number)
+        written += _write(folder, best, number, transfer)
     if not written:
         raise InputError(_not_a_video(video))
     return written
 
 
-def _write(folder: Path, frame: UInt8[np.ndarray, "height width 3"], number: int) -> int:
-    Image.fromarray(frame).save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
+def _write(folder: Path, frame: UInt8[np.ndarray, "height width 3"], number: int, transfer: str | None) -> int:
+    shown = frame if transfer is None else tone_mapped(frame, transfer)
+    Image.fromarray(shown).save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
     return 1
 
 
 def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    with _named(video):
+        yield from iio.imiter(video, plugin="FFMPEG", input_params=INPUT, output_params=EACH_ONCE)
+
+
+@contextmanager
+def _named(video: Path) -> Iterator[None]:
+    """Say of what ffmpeg cannot read that it is no video."""
     try:
-        yield from iio.imiter(video, plugin="FFMPEG", input_params=INPUT)
+        yield
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise InputError(_not_a_video(video)) from error
 

@@ -1,0 +1,99 @@
+"""Scale, up and north from the places that cameras and drones write into their photographs (EXIF)."""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import ExifTags, Image
+
+from nerf_lightning.data.pixels.formats import decoders
+from nerf_lightning.data.pixels.images import DECODER_ERRORS, open_picture
+
+EQUATOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
+"""Radius of the earth in metres, and by how much it is less at the poles (WGS 84)."""
+FEWEST = 4
+OFF = 10.0
+"""Metres by which a receiver may be wrong."""
+LEAST_SPREAD = 4.0
+"""How much farther the places must lie apart, across their longest line, than they are off."""
+
+log = logging.getLogger(__name__)
+
+
+def gps_of(path: Path) -> tuple[float, float, float] | None:
+    """Return latitude and longitude in degrees, and metres above the sea; None where a photograph does not say."""
+    try:
+        with open_picture(path) as file, Image.open(file, formats=decoders()) as image:
+            said: Mapping[int, Any] = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        place = [_degrees(said, key, negative) for key, negative in ((2, "S"), (4, "W"))]
+        height = float(said.get(6, 0.0)) * (-1 if said.get(5) in (1, b"\x01") else 1)
+    except DECODER_ERRORS:
+        return None
+    latitude, longitude = place
+    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and abs(height) < 1e5 and (latitude or longitude)
+    return (latitude, longitude, height) if sound else None
+
+
+def _degrees(said: Mapping[int, Any], key: int, negative: str) -> float:
+    degrees, minutes, seconds = (float(part) for part in said[key])
+    return (degrees + minutes / 60 + seconds / 3600) * (-1 if said.get(key - 1) == negative else 1)
+
+
+def in_metres(places: Sequence[tuple[float, float, float]]) -> Float[ndarray, "photographs 3"]:
+    """Return places as metres east, north and up from their middle, on the plane that touches the earth there.
+
+    >>> in_metres([(0.0, 0.0, 5.0), (0.0, 0.001, 5.0)]).round(1).tolist()
+    [[-55.7, 0.0, 0.0], [55.7, 0.0, 0.0]]
+    """
+    latitude, longitude, height = np.array(places, dtype=np.float64).T
+    longitude = longitude[0] + (longitude - longitude[0] + 180) % 360 - 180  # across the date line, too
+    middle = math.radians(latitude.mean())
+    squashed = 1 - FLATTENING * (2 - FLATTENING) * math.sin(middle) ** 2
+    along_parallel = EQUATOR / math.sqrt(squashed) * math.cos(middle)
+    along_meridian = EQUATOR * (1 - FLATTENING) ** 2 / squashed**1.5
+    metres = np.stack([np.radians(longitude) * along_parallel, np.radians(latitude) * along_meridian, height], axis=1)
+    return metres - metres.mean(axis=0)
+
+
+def align_to_gps(colmap: Any, model: Any, folder: Path) -> bool:
+    """Bring a COLMAP model into metres, x to the east and z up, where its photographs say well enough where they were.
+
+    The places must fit the model, and lie apart in two directions by several times what they are off: a table that
+    was photographed from all sides is smaller than a receiver's error.
+
+    Args:
+        colmap: the module pycolmap.
+        model: its reconstruction; changed where this returns true.
+        folder: of the photographs.
+    """
+    names = [model.image(number).name for number in model.reg_image_ids()]
+    places = {name: place for name in names if (place := gps_of(folder / name)) is not None}
+    if len(places) < FEWEST:
+        return False
+    wanted = in_metres(list(places.values()))
+    options = colmap.RANSACOptions()
+    options.max_error = OFF
+    found = colmap.align_reconstruction_to_locations(model, list(places), wanted, FEWEST, options)
+    if found is None:
+        return False
+    centers = {
+        image.name: image.projection_center() for image in (model.image(number) for number in model.reg_image_ids())
+    }
+    off = np.linalg.norm(np.stack([found * centers[name] for name in places]) - wanted, axis=1)
+    across = np.linalg.svd(wanted, compute_uv=False)[1] / math.sqrt(len(wanted))
+    if across < LEAST_SPREAD * np.median(off):
+        log.info(
+            "cameras: GPS places are off by %.1f m, too much for photographs so near to each other", np.median(off)
+        )
+        return False
+    model.transform(found)
+    log.info(
+        "cameras: placed by the GPS of %d photographs, to %.1f m: units are metres, z is up (scene.metres_per_unit=1)",
+        *(len(places), np.median(off)),
+    )
+    return True
