@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerf_lightning.doctor.check import Check, Evidence, Given, look, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, Given, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.geometry.cameras import image_plane
 from nerf_lightning.nerf.geometry.coverage import directions_seen, middle_of
@@ -47,9 +47,9 @@ def common_middle(evidence: Given) -> Check:
     """Judge whether the cameras look at, or away from, the place where their axes meet."""
     c2w = evidence.scene.cameras.c2w.double()
     if evidence.scene.cameras.lens_model == "equirectangular":
-        return ok("not judged: panoramas look everywhere")
+        return not_judged("panoramas look everywhere", "See the check of axes.")
     if evidence.scene.space == "ndc" or bool((c2w[:, :, 2].mean(dim=0).norm() > 0.95).item()):
-        return ok("the cameras all look the same way")
+        return not_judged("the cameras all look the same way", "See the check of axes.")
     to_middle = focus_point(c2w) - c2w[:, :, 3]
     ahead = float(((to_middle * -c2w[:, :, 2]).sum(dim=-1) > 0).double().mean())
     if ahead >= 0.8:
@@ -99,6 +99,15 @@ def field_of_view(evidence: Given) -> Check:
         message += "; pixels are not square" if uneven else ", which is unusual"
         return look(message, "Check the focal length (pixels, for photographs of this size).")
     return ok(message)
+
+
+def panoramas(evidence: Given) -> Check:
+    """Look for panoramas of all directions that are read as perspective photographs."""
+    cameras = evidence.scene.cameras
+    if cameras.lens_model in ("equirectangular", "fisheye") or bool((cameras.width != 2 * cameras.height).any()):
+        return ok("the lens fits the shape of the photographs")
+    cure = "If so, give camera_model EQUIRECTANGULAR in transforms.json, without focal lengths. If not, all is well."
+    return look("all photographs are exactly 2:1: are these panoramas?", cure)
 
 
 def principal_point(evidence: Given) -> Check:
@@ -184,7 +193,7 @@ def overlap(evidence: Evidence) -> Check:
     total = len(evidence.scene.view_names)
     counts = torch.bincount(matches.view.flatten(), minlength=total)[list(matches.views)]
     if not len(matches.view) or int(counts.median()) < 2 * FEW_MATCHES:
-        return ok("not judged: too few details could be found again")
+        return not_judged("too few details could be found again", MORE_DETAILS)
     lonely = [matches.views[place] for place in (counts < FEW_MATCHES).nonzero()[:, 0].tolist()]
     if not lonely:
         return ok(f"every view shares at least {int(counts.min())} details with others")
@@ -222,6 +231,7 @@ CHECKS = {
     "common middle": common_middle,
     "upright": upright,
     "field of view": field_of_view,
+    "panoramas": panoramas,
     "principal point": principal_point,
     "lens": lens,
 }

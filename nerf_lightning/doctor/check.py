@@ -14,8 +14,9 @@ from nerf_lightning.messages.escaping import listed
 from nerf_lightning.nerf.types.scene import Scene
 
 PAIRS_AT_ONCE = 1 << 24  # a capture may have 200,000 views
-Verdict = Literal["ok", "look", "wrong"]
-"""`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be."""
+Verdict = Literal["ok", "look", "wrong", "not judged"]
+"""`look`: may be meant so, have a look; `wrong`: training will not work or will be much worse than it could be;
+`not judged`: there is too little evidence to tell."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Check:
     message: str
     """What was found, in numbers."""
     cure: str = ""
-    """What to do about it; empty where all is well."""
+    """What to do about it, or what it would need to judge; empty where all is well."""
     proofs: tuple[Proof, ...] = field(default=(), compare=False, repr=False)
     """What can be shown for it, in a picture."""
 
@@ -64,7 +65,10 @@ class Evidence(Given):
 
 CheckFn = Callable[[Evidence], Check]
 ok, look, wrong = partial(Check, "", "ok"), partial(Check, "", "look"), partial(Check, "", "wrong")
-"""What checks return: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`."""
+not_judged = partial(Check, "", "not judged")
+"""What checks return: `ok(message)`, `look(message, cure)`, `wrong(message, cure, proofs)`; where the evidence is too
+thin, `not_judged(message, needs)`."""
+MORE_DETAILS = "It needs details that several photographs show: take larger, sharper or more of them."
 
 
 def rows_at_once(columns: int) -> int:

@@ -7,8 +7,7 @@ from torch.nn import functional
 
 from nerf_lightning.doctor.matches import Matches
 
-TOLERANCE = 1.5
-"""Pixels of the shrunk pictures."""
+TOLERANCE = 1.5  # Pixels of the shrunk pictures
 
 
 def agreeing(matches: Matches, c2w: Float[Tensor, "views 3 4"], zoom: float = 1.0) -> Bool[Tensor, "matches"]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 
+from nerf_lightning.compute.machine import torch_threads
 from nerf_lightning.data.pixels.store import in_threads
 from nerf_lightning.doctor import cameras, extent, image_quality, poses
 from nerf_lightning.doctor.check import Check, CheckFn, Evidence
@@ -28,29 +29,21 @@ FIRST_ADVICE = ("coverage", "photographs without pose", "number of views", "over
 
 
 def examine(scene: Scene) -> tuple[Evidence, list[Check]]:
-    """Return the outcome of every check, and what they looked at; takes seconds.
-
-    Raises:
-        InputError: several captures were joined, of which each has a frame of its own.
-    """
+    """Return the outcome of every check, and what they looked at; takes seconds."""
     if scene.capture_of is not None:
         raise InputError(
             f"{scene.name} joins {len(scene.captures)} captures, and the doctor examines one at a time: give "
             "scene=auto scene.root=DIR; or doctor=off to train all the same."
         )
     # Pictures are spread over our own threads; torch's would only stand in their way.
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with torch_threads(1):
         evidence = gather_evidence(scene)
         return evidence, [replace(check(evidence), name=name) for name, check in CHECKS.items()]
-    finally:
-        torch.set_num_threads(before)
 
 
 def advice(checks: Sequence[Check]) -> str | None:
     """Return the one thing that would improve a result most; None where nothing was found."""
-    doubtful = {check.name: check.cure for check in checks if check.verdict != "ok" and check.cure}
+    doubtful = {check.name: check.cure for check in checks if check.verdict in ("look", "wrong") and check.cure}
     return next((doubtful[name] for name in [*FIRST_ADVICE, *doubtful] if name in doubtful), None)
 
 

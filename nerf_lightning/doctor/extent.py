@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, Evidence, look, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.doctor.epipolar import distances, parallax, places
 from nerf_lightning.nerf.geometry.boxes import distances_in_box
 from nerf_lightning.nerf.geometry.cameras import rays_through_pixels
@@ -27,7 +27,7 @@ def near_and_far(evidence: Evidence) -> Check:
     scene = evidence.scene
     found = content_distances(evidence)
     if found is None:
-        return ok("not judged: no sparse points, and too few details were found again")
+        return not_judged("no sparse points, and too few details were found again", MORE_DETAILS)
     view, distance = found
     unit = unit_of(scene.to_user.double())
     if scene.space == "ndc":
@@ -152,8 +152,4 @@ def _units(low: float, high: float, near: float, far: float) -> str:
     return ""
 
 
-CHECKS = {
-    "near and far": near_and_far,
-    "box in view": box_in_view,
-    "scale": scale,
-}
+CHECKS = {"near and far": near_and_far, "box in view": box_in_view, "scale": scale}

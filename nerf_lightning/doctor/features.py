@@ -7,15 +7,14 @@ motion.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.nerf.geometry.cameras import resized
 from nerf_lightning.nerf.types.scene import Cameras, PixelStore
 
-LONGER_SIDE = 288
-"""Pixels of the longer side of the pictures that are looked at."""
+LONGER_SIDE = 288  # Pixels of the longer side of the pictures that are looked at
 MOST_CORNERS = 400
 BORDER = 8
 LEAST_CLEAR = 1e-6
@@ -25,8 +24,12 @@ PLACES, SPACING = 4, 4.0
 # A match must be this much better than the second best (of distances; Lowe, "Distinctive image features", 2004).
 RATIO = 0.85
 THUMBNAIL = 24
-# Sharpness is judged at no more pixels than this along the longer side; finer detail is noise on many cameras.
-SHARP_SIDE = 768
+# Fine detail is looked for at no more pixels than this along the longer side; finer is noise on many cameras.
+SHARP_SIDE = 1600
+# Deviations (pixels) of what blurs the picture for fine and for coarse detail; pixels of the outline that are left out;
+# slope (per pixel, of 1) from which on there is texture, and pixels of it that tell something.
+FINE, COARSE, OUTLINE = 0.7, 2.0, 3
+LEAST_SLOPE, LEAST_TEXTURE = 0.002, 150
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,8 @@ class Looks:
 
     thumbnail: Float[Tensor, "views side side"]
     """Brightness, on middle grey where transparent or masked."""
-    sharpness: Float[Tensor, "views"]
-    """Power of the Laplacian as a share of the gradient's: how fine the detail is, however much of it there is."""
+    fineness: Float[Tensor, "views directions"]
+    """How fine the detail is, however much of it there is: see `fineness_of`."""
     kept: Float[Tensor, "views"]
     """Share of the pixels that the mask keeps."""
     covered: Float[Tensor, "views"]
@@ -156,8 +159,8 @@ class Looks:
     """Median colour of the picture's edge."""
     border_even: Float[Tensor, "views"]
     """Share of the edge's pixels that have this colour, to two levels."""
-    premultiplied: Float[Tensor, "views"]
-    """Share of the half-transparent pixels whose colour is not brighter than their alpha; 1 with less than 20 such."""
+    faint: Float[Tensor, "views 2"]
+    """How many nearly transparent pixels are brighter than half of their alpha: up to alpha, and beyond."""
 
 
 def look_at_view(pixels: PixelStore, view: int, picture: Float[Tensor, "3 height width"]) -> tuple[Tensor, ...]:
@@ -170,33 +173,54 @@ def look_at_view(pixels: PixelStore, view: int, picture: Float[Tensor, "3 height
     alpha = rgba[..., 3]
     return (
         functional.interpolate(brightness(picture)[None, None], (THUMBNAIL, THUMBNAIL), mode="area")[0, 0],
-        sharpness_of(pixels, view),
+        fineness_of(pixels, view),
         torch.tensor(1.0) if kept is None else kept.float().mean(),
         alpha.float().mean() / 255,
         median / 255,
         even,
-        _premultiplied(rgba) if pixels.has_transparency else torch.tensor(1.0),
+        _faint(rgba) if pixels.has_transparency else torch.zeros(2),
     )
 
 
-def sharpness_of(pixels: PixelStore, view: int) -> Float[Tensor, ""]:
-    """Return the power of the Laplacian over that of the gradient, where the photograph shows something."""
-    rgba = pixels.view(view)
-    step = max(1, -(-max(rgba.shape[:2]) // SHARP_SIDE))
-    channels = rgba[..., [1, 3]].float().permute(2, 0, 1) / 255
-    small = functional.avg_pool2d(channels, step) if step > 1 else channels
-    grey, solid = small[0], small[1] > 0.99
-    up, down, left, right = grey[:-2, 1:-1], grey[2:, 1:-1], grey[1:-1, :-2], grey[1:-1, 2:]
-    laplacian = up + down + left + right - 4 * grey[1:-1, 1:-1]
-    gradient = (right - left).square() + (down - up).square()
+def fineness_of(pixels: PixelStore, view: int) -> Float[Tensor, "directions"]:
+    """Return how fine the detail of a photograph is along each of eight directions, of half a circle.
+
+    It is the log of the power of the second derivative over that of the slopes of a blurred picture, in the textured
+    half of what is neither transparent nor masked. A moving camera takes it along one direction only. NaN: there is too
+    little texture.
+    """
+    rgba, kept = pixels.view(view), pixels.kept(view)
+    solid = rgba[..., 3] > 252 if kept is None else (rgba[..., 3] > 252) & kept
+    both = torch.stack([rgba[..., 1] / 255, solid.float()])
+    step = -(-max(rgba.shape[:2]) // SHARP_SIDE)
+    grey, whole = functional.avg_pool2d(both, step)[:, None] if step > 1 else both[:, None]
     # The outline against what is transparent is as sharp in a blurred photograph.
-    inside = -functional.max_pool2d(-solid[None].float(), 5, stride=1, padding=2)[0, 1:-1, 1:-1]
-    return (laplacian.square() * inside).sum() / (gradient * inside).sum().clamp(min=1e-9)
+    rim = functional.max_pool2d(functional.pad(1 - whole, (OUTLINE,) * 4, value=1.0), 2 * OUTLINE + 1, stride=1)
+    slopes = torch.cat(_gradient(_blurred(grey, COARSE)))
+    power = slopes.square().sum(dim=0)
+    inside = rim[0] == 0
+    textured = inside & (power > LEAST_SLOPE**2)
+    if int(textured.sum()) < LEAST_TEXTURE:
+        return torch.full((DIRECTIONS,), torch.nan)
+    textured &= power >= power[inside].median()
+    fine = _blurred(grey, FINE)
+    padded = functional.pad(fine, (1, 1, 1, 1), mode="replicate")
+    across = padded[:, 1:-1, 2:] + padded[:, 1:-1, :-2] - 2 * fine
+    down = padded[:, 2:, 1:-1] + padded[:, :-2, 1:-1] - 2 * fine
+    bends = torch.cat([across, 2 * _gradient(_gradient(fine)[0])[1], down])
+    angle = torch.arange(DIRECTIONS) * (torch.pi / DIRECTIONS)
+    c, s = angle.cos(), angle.sin()
+    first = _power_along(torch.stack([c, s], dim=1), slopes[:, textured])
+    return (_power_along(torch.stack([c * c, c * s, s * s], dim=1), bends[:, textured]) / first).log()
 
 
-def _premultiplied(rgba: Tensor) -> Float[Tensor, ""]:
-    alpha = rgba[..., 3]
-    half = rgba[(alpha > 8) & (alpha < 160)]
-    if len(half) < 20:
-        return torch.tensor(1.0)
-    return (half[:, :3].amax(dim=-1) <= half[:, 3].to(torch.int16) + 1).float().mean()
+def _power_along(
+    ways: Float[Tensor, "directions parts"], parts: Float[Tensor, "parts pixels"]
+) -> Float[Tensor, "directions"]:
+    return (ways @ (parts @ parts.T) * ways).sum(dim=1).clamp(min=1e-12)
+
+
+def _faint(rgba: UInt8[Tensor, "height width 4"]) -> Float[Tensor, "2"]:
+    alpha, brightest = rgba[..., 3].int(), rgba[..., :3].amax(dim=-1).int()
+    faint = (alpha > 8) & (alpha < 64) & (2 * brightest > alpha)
+    return torch.stack([(faint & (brightest <= alpha + 1)).sum(), (faint & (brightest > alpha + 1)).sum()]).float()

@@ -19,20 +19,14 @@ QUICK: dict[str, Callable[[Given], Check]] = {
     "number of views": cameras.number_of_views,
 }
 """Checks that cost nothing, and find what is wrong."""
-ROWS = 8
-"""Of a photograph, that are looked at first: nearly all show something there."""
-SPREAD = 3
-"""Levels of 255 that a JPEG makes of one."""
+ROWS = 8  # Of a photograph, that are looked at first: nearly all show something there
+SPREAD = 3  # Levels of 255 that a JPEG makes of one
 
 log = logging.getLogger(__name__)
 
 
 def require_sound(scene: Scene) -> list[Check]:
-    """Examine a scene, and return what each check says; takes seconds.
-
-    Raises:
-        InputError: a check says that it is wrong; with the cure.
-    """
+    """Examine a scene, and return what each check says; takes seconds."""
     _, checks = examine(scene)
     for check in checks:
         if check.verdict == "look":
@@ -45,7 +39,10 @@ def require_sound(scene: Scene) -> list[Check]:
             f"{f' Wrong, too: {others}.' if others else ''} nerf doctor shows all that it sees, in a picture; "
             "doctor=off trains all the same."
         )
-    log.info("doctor: %d checks find nothing wrong (doctor=off leaves them out)", len(checks))
+    unknown = [check.name for check in checks if check.verdict == "not judged"]
+    left = f"; not judged: {', '.join(unknown)}" if unknown else ""
+    count = len(checks) - len(unknown)
+    log.info("doctor: %d checks find nothing wrong%s (doctor=off leaves them out)", count, left)
     return checks
 
 

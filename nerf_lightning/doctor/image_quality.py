@@ -1,20 +1,27 @@
 """Checks of the photographs themselves, and of the memory that training on them takes."""
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.compute.machine import free_memory
 from nerf_lightning.data.captures.extent import IN_A_BOX, PHOTOGRAPHS, model_for
-from nerf_lightning.doctor.check import Check, Evidence, look, ok, rows_at_once, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Check, Evidence, look, not_judged, ok, rows_at_once, wrong
 from nerf_lightning.doctor.features import THUMBNAIL
-from nerf_lightning.doctor.matches import Matches
+from nerf_lightning.doctor.matches import Matches, nearest_views
 from nerf_lightning.nerf.rendering.blending import at_evaluation
 
 # Mean difference of thumbnails, in units of their contrast.
 SAME = 0.012
-# Of the median sharpness.
-BLURRED = 0.4
+# So many views nearby are compared with; fewer say nothing.
+NEIGHBORS, FEWEST_NEIGHBORS = 6, 4
+# A photograph is blurred that has less than this share of its neighbours' fine detail; within these bounds the share
+# depends on how much photographs differ anyway: so many deviations.
+SOFT, SOFTEST, DEVIATIONS = 0.5, 0.27, 4.5
+# Pixels that tell whether colours are multiplied by alpha, and the share of them that may be brighter all the same.
+FAINT, STRAY = 100, 0.005
 # Factors of brightness and of red or blue against green.
 EXPOSURE, TINT = 1.35, 1.2
 # Matches of a pair of photographs that say something of their brightness.
@@ -57,14 +64,25 @@ def _pairs_alike(
 
 
 def blur(evidence: Evidence) -> Check:
-    """Look for photographs that are much less sharp than the rest."""
-    sharpness = evidence.looks.sharpness
-    relative = sharpness / sharpness.median().clamp(min=1e-9)
-    bad = (relative < BLURRED).nonzero()[:, 0]
-    if not len(bad):
-        return ok(f"the softest photograph has {100 * float(relative.min()):.0f} % of the usual")
-    worst = bad[relative[bad].argsort()].tolist()
-    message = f"{len(bad)} of {len(relative)} are blurred: {evidence.named(worst)}"
+    """Look for photographs that are much less sharp, along any direction, than those from nearby."""
+    fineness = evidence.looks.fineness
+    shown = (~fineness.isnan().any(dim=1)).nonzero()[:, 0]
+    if len(shown) <= FEWEST_NEIGHBORS or 2 * len(shown) < len(fineness):
+        message = f"only {len(shown)} of {len(fineness)} photographs show enough texture"
+        return not_judged(message, "It needs photographs in which the content is larger, or more of them.")
+    parts = shown.split(rows_at_once(len(shown)))
+    near = torch.cat([nearest_views(evidence.scene.cameras.c2w, part, shown, NEIGHBORS) for part in parts])
+    off = fineness[shown] - fineness[near].median(dim=1).values
+    limit = min(max(math.exp(-DEVIATIONS * 1.48 * float(off.abs().median())), SOFTEST), SOFT)
+    share = off.amin(dim=1).exp()
+    order = share.argsort()
+    bad = shown[order[share[order] < limit]].tolist()
+    least = f"{100 * float(share.min()):.0f} % of the fine detail of photographs from nearby"
+    if hidden := fineness.isnan().any(dim=1).nonzero()[:, 0].tolist():
+        least += f" ({evidence.named(hidden)} show too little texture to tell)"
+    if not bad:
+        return ok(f"the softest of {len(shown)} photographs has {least}")
+    message = f"{len(bad)} of {len(shown)} are blurred: {evidence.named(bad)}; the worst has {least}"
     return look(message, "Remove them (scene.frames, or from the file), or photograph again.")
 
 
@@ -75,7 +93,7 @@ def exposure(evidence: Evidence) -> Check:
         matches = matches.where(evidence.agrees)
     gains = gains_of(matches, len(evidence.scene.view_names))
     if gains is None:
-        return ok("not judged: too few details could be found again")
+        return not_judged("too few details could be found again", MORE_DETAILS)
     bright = gains.mean(dim=1).exp()
     tint = (gains - gains[:, 1:2])[:, [0, 2]].abs().amax(dim=1).exp()
     dark, odd = _jumps(bright, EXPOSURE), _jumps(tint, TINT)
@@ -117,16 +135,21 @@ def transparency(evidence: Evidence) -> Check:
     scene, looks = evidence.scene, evidence.looks
     if not scene.pixels.has_transparency:
         return ok("the photographs are opaque")
-    covered = float(looks.covered.mean())
+    covered = f"{100 * float(looks.covered.mean()):.0f} % of the pixels show the content"
     empty = (looks.covered < 0.003).nonzero()[:, 0].tolist()
     if empty:
         message = f"{evidence.named(empty)} show (almost) nothing: all is transparent"
         return look(message, "See that alpha was exported, or remove these views.")
-    known = looks.premultiplied
-    if float(known.min()) > 0.995 and at_evaluation(scene.background) not in ("black", "none"):
-        message = "no half-transparent pixel is brighter than its alpha: colours are multiplied by alpha, it seems"
-        return look(message, "Export straight alpha, or edges get dark seams.")
-    return ok(f"{100 * covered:.0f} % of the pixels show the content, the rest is transparent")
+    up_to, beyond = looks.faint.sum(dim=0).tolist()
+    # Cutting out leaves the colours as they were.
+    if "cut_out" not in scene.protocol and up_to + beyond < FAINT:
+        needs = f"It needs {FAINT} pixels that are nearly transparent; of hard outlines there is nothing to multiply."
+        return not_judged(f"{covered}; whether colours are multiplied by alpha cannot be seen", needs)
+    multiplied = "cut_out" not in scene.protocol and beyond <= STRAY * up_to
+    if multiplied and at_evaluation(scene.background) not in ("black", "none"):
+        message = f"of {up_to + beyond:.0f} nearly transparent pixels {beyond:.0f} are brighter than alpha"
+        return look(f"{message}: colours are multiplied by alpha", "Export straight alpha, or edges get dark seams.")
+    return ok(f"{covered}, the rest is transparent")
 
 
 def baked_background(evidence: Evidence) -> Check:

@@ -128,3 +128,19 @@ def _plane(cameras: Cameras, view: int, at: Float[Tensor, "places 2"]) -> Float[
         return plane
     local = unproject(plane, cameras.lens[view], cameras.lens_model)
     return local[..., :2] / local[..., 2:].clamp(min=HARDLY_AHEAD)
+
+
+def nearest_views(
+    c2w: Float[Tensor, "all 3 4"], views: Int[Tensor, "views"], others: Int[Tensor, "others"], most: int
+) -> Int[Tensor, "views nearest"]:
+    """Return for each of some views up to `most` of the others, itself left out, that stand near and look its way.
+
+    The nearest comes first; half of the distance that others usually have counts as much as 30 degrees.
+    """
+    away = torch.cdist(c2w[views, :, 3], c2w[others, :, 3])
+    # Cameras side by side that look elsewhere share nothing.
+    turned = torch.cdist(c2w[views, :, 2], c2w[others, :, 2])
+    apart = away / away.mean(dim=1, keepdim=True).clamp(min=1e-12) + turned
+    apart[views[:, None] == others] = torch.inf
+    count = min(most, int(apart.isfinite().sum(dim=1).min()))
+    return others[apart.topk(count, largest=False).indices]

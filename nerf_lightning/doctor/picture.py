@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDEST = 130
-VERDICTS = {"ok": "#3c9d6b", "look": "#d9a400", "wrong": "#c8372d"}
+VERDICTS = {"ok": "#3c9d6b", "look": "#d9a400", "wrong": "#c8372d", "not judged": "0.5"}
 MOST_PROOFS, MOST_DETAILS = 4, 7
 COLORS = ("#ff2d2d", "#ffd500", "#2dff5a", "#2dd5ff", "#ff7bf2", "#ff9a2d", "#b39dff")
 # Pixels of the longer side of a photograph, and of a row of the picture.
@@ -37,10 +37,7 @@ NEAREST, FARTHEST, STEPS = -1.5, 3.0, 400
 def about_capture(scene: Scene, place: str | None, form: str) -> str:
     """Return what was examined, in one line: which folder, read as which format, how many photographs of what size.
 
-    Args:
-        scene: as it was read.
-        place: the folder or file that it was read from, if any.
-        form: how scene= names the format.
+    `place` is the folder or file that it was read from, if any, and `form` how scene= names the format.
     """
     pixels = scene.pixels
     sizes = sorted(set(zip(pixels.width.tolist(), pixels.height.tolist(), strict=True)))
@@ -93,9 +90,9 @@ def _write_verdicts(axes: "Axes", checks: Sequence[Check]) -> None:
     for row, check in enumerate(checks):
         y = 1.0 - (row + 0.5) * step
         axes.text(0.0, y, check.verdict, color=VERDICTS[check.verdict], fontsize=8.5, weight="bold", va="center")
-        axes.text(0.08, y, check.name, fontsize=8.5, va="center")
+        axes.text(0.13, y, check.name, fontsize=8.5, va="center")
         text = check.message if len(check.message) <= 80 else check.message[:78].rstrip() + " ..."
-        axes.text(0.34, y, text, fontsize=7.5, color="0.35", va="center", parse_math=False)
+        axes.text(0.38, y, text, fontsize=7.5, color="0.35", va="center", parse_math=False)
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1)
 

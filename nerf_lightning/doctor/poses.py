@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.doctor.check import Check, CheckFn, Evidence, look, ok, wrong
+from nerf_lightning.doctor.check import MORE_DETAILS, Check, CheckFn, Evidence, look, not_judged, ok, wrong
 from nerf_lightning.doctor.conventions import AXES, ORDERS, PHOTOGRAPHS, Reading
 from nerf_lightning.doctor.epipolar import agreeing
 from nerf_lightning.doctor.matches import Matches, Proof, strongest_proof
@@ -20,8 +20,7 @@ from nerf_lightning.doctor.second_opinion import (
     with_pose,
 )
 
-FEWEST = 200
-"""Matches below which nothing is said of the whole capture."""
+FEWEST = 200  # Matches below which nothing is said of the whole capture
 # More matches than these are thinned out to try other readings.
 ENOUGH = 5000
 # The largest pair of a view, as a share of the usual, from which on a view is judged; and its share of agreeing
@@ -40,14 +39,14 @@ MOST_REFITTED, MOST_TOLD = 20, 3
 # Pairs of photographs that must be clear before all poses are wrong, and the share of them that contradicts the poses.
 FEWEST_CLEAR, MOST_AGAINST = 4, 0.8
 DOUBTFUL = "It may be details that repeat or shine, or photographs far apart; more or larger photographs help to tell."
-NOT_JUDGED = "not judged: too few details could be found again from one photograph to another"
+TOO_FEW = "too few details could be found again from one photograph to another"
 
 
 def poses_and_pixels(evidence: Evidence) -> Check:
     """Judge whether the poses explain what photographs have in common."""
     share, count = evidence.agreement, len(evidence.matches.view)
     if count < FEWEST:
-        return look(NOT_JUDGED, "Look at the poses in doctor.png; larger or sharper photographs help.")
+        return not_judged(TOO_FEW, MORE_DETAILS)
     message = f"{100 * share:.0f} % of {count} matched details lie where the cameras say (to 1.5 pixels of 288)"
     if share >= SOUND:
         return ok(message)
@@ -59,7 +58,7 @@ def _by_clear_pairs(evidence: Evidence, message: str) -> Check:
     pairs = clear_pairs(evidence.matches, evidence.scene.cameras)
     against = [proof for contradicts, proof in pairs if contradicts]
     if len(pairs) < FEWEST_CLEAR:
-        return look(f"{message}; too few photographs share enough details to tell", DOUBTFUL)
+        return not_judged(f"{message}; too few photographs share enough details to tell", DOUBTFUL)
     share = len(against) / len(pairs)
     message += f"; {len(against)} of {len(pairs)} pairs whose details fit each other contradict the poses"
     if share <= 1 - MOST_AGAINST:
@@ -74,12 +73,16 @@ def focal_length(evidence: Evidence) -> Check:
     """Judge whether another focal length explains the pixels better."""
     matches, cameras, c2w = thinned(evidence.matches, ENOUGH), evidence.scene.cameras, evidence.scene.cameras.c2w
     shares = {zoom: _share(matches, c2w, zoom) for zoom in ZOOMS}
-    if len(matches.view) < FEWEST or max(shares.values()) < HOPELESS:
-        return ok(NOT_JUDGED if len(matches.view) < FEWEST else "not judged: the poses do not fit")
+    if len(matches.view) < FEWEST:
+        return not_judged(TOO_FEW, MORE_DETAILS)
+    if max(shares.values()) < HOPELESS:
+        return not_judged("too few details lie where the cameras say, with any focal length", DOUBTFUL)
     best = max(shares, key=lambda zoom: shares[zoom])
     off = max(best, 1 / best)
     focal = float(cameras.focal.median())
     if off < OFF or shares[best] < shares[1.0] + CLEARER:
+        if max(shares[zoom] for zoom in ZOOMS if max(zoom, 1 / zoom) >= FAR_OFF) > shares[1.0] - CLEARER:
+            return not_judged("other focal lengths fit as well", "It needs photographs from more sides.")
         return ok(f"{focal:.0f} pixels (median) fits the poses and the pixels best")
     against = agreeing(evidence.matches, c2w, best) & ~evidence.agrees
     return (wrong if off >= FAR_OFF else look)(
@@ -94,11 +97,16 @@ def focal_length(evidence: Evidence) -> Check:
 def single_poses(evidence: Evidence) -> Check:
     """Judge each view's pose by the views that share most with it."""
     matches, c2w = evidence.matches, evidence.scene.cameras.c2w
-    if len(matches.view) < FEWEST or evidence.agreement < SOUND:
-        reason = "too few details" if len(matches.view) < FEWEST else "the poses as a whole do not fit"
-        return ok(f"not judged: {reason}")
+    if len(matches.view) < FEWEST:
+        return not_judged(TOO_FEW, MORE_DETAILS)
+    if evidence.agreement < SOUND:
+        # Of which the poses as a whole may be guilty or not: poses_and_pixels tells.
+        share = f"{100 * evidence.agreement:.0f} % of matched details lie where the cameras say"
+        return not_judged(f"only {share}, too few to tell one view from another", DOUBTFUL)
     bad, judged, least = odd_views(matches, evidence.agrees, len(c2w))
-    found = f"{judged} views could be judged"
+    found = f"{judged} of {len(matches.views)} views could be judged"
+    if 2 * judged < len(matches.views):
+        return not_judged(f"only {found}", MORE_DETAILS)
     if not bad:
         return ok(f"{found}, and agree with their neighbours (least {least:.0%})")
     others = [view for view in range(len(c2w)) if view not in bad]
@@ -108,10 +116,7 @@ def single_poses(evidence: Evidence) -> Check:
     better = [pose for view in doubted[:MOST_REFITTED] if (pose := better_pose(evidence, view, bad))]
     if not better:
         message = f"few details that {evidence.named(doubted)} share with others lie where the cameras say"
-        cure = (
-            "No other pose fits better, so it may be details that repeat or shine. See whether they come out blurred."
-        )
-        return look(message, cure)
+        return not_judged(f"{message}, but no other pose fits better", DOUBTFUL)
     return _wrong_poses(evidence, better, bad)
 
 
@@ -119,9 +124,8 @@ def _wrong_poses(evidence: Evidence, better: list[BetterPose], suspects: list[in
     c2w = evidence.scene.cameras.c2w
     least, views = CONVINCING * evidence.agreement, [pose.view for pose in better]
     fits = {view: fitting_pose(evidence.matches, c2w, view, suspects, least) for view in views}
-    swapped = [
-        f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in fits.items() if b is not None
-    ]
+    mixed_up = {view: other for view, other in fits.items() if other is not None}
+    swapped = [f"{evidence.named([a])} fits the camera of {evidence.named([b])}" for a, b in mixed_up.items()]
     turned = [
         f"{evidence.named([pose.view])} fits with a pose {pose.degrees:.1f} degrees away ({100 * pose.explained:.0f} % "
         f"of its details lie where that one says, {100 * pose.before:.0f} % where the given one does)"
@@ -221,12 +225,13 @@ def best_reading(evidence: Evidence, readings: tuple[Reading, ...], fine: str) -
     """Judge whether one of other readings of the capture explains the pixels better; `fine`: what holds if not."""
     scene, matches = evidence.scene, thinned(evidence.matches, ENOUGH)
     if len(matches.view) < FEWEST:
-        return ok(NOT_JUDGED)
+        return not_judged(TOO_FEW, MORE_DETAILS)
     given = _share(matches, scene.cameras.c2w)
     shares = [_share(changed, poses) for poses, changed in (reading.change(scene, matches) for reading in readings)]
     best = max(range(len(readings)), key=shares.__getitem__)
     if shares[best] < max(given + BETTER, HOPELESS):
-        # Where nothing fits, poses_and_pixels says so.
+        if given < HOPELESS:
+            return not_judged("too few details lie where the cameras say, by any reading", DOUBTFUL)
         return ok(f"{fine}: no other reading fits the pixels better")
     poses, changed = readings[best].change(scene, evidence.matches)
     fits = replace(scene.cameras, c2w=poses.to(scene.cameras.c2w)) if changed is evidence.matches else None

@@ -14,7 +14,7 @@ from torch.nn import functional
 from nerf_lightning.doctor.check import Evidence
 from nerf_lightning.doctor.epipolar import agreeing, parallax, rays_of
 from nerf_lightning.doctor.features import shrunk_cameras
-from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs
+from nerf_lightning.doctor.matches import Matches, Proof, matched_pairs, nearest_views
 from nerf_lightning.nerf.types.scene import Cameras
 
 # The other pose must explain so many details that the given one does not, of so many from each of two other views.
@@ -54,12 +54,8 @@ class BetterPose:
 def is_vouched_for(evidence: Evidence, view: int, others: list[int]) -> bool:
     """Tell whether the views that stand nearest, of `others` that nothing is said against, agree with a view."""
     c2w = evidence.scene.cameras.c2w
-    known = [other for other in others if other != view and other in evidence.corners]
-    away = (c2w[known, :, 3] - c2w[view, :, 3]).norm(dim=-1)
-    # Cameras side by side that look elsewhere share nothing.
-    turned = (c2w[known, :, 2] - c2w[view, :, 2]).norm(dim=-1)
-    order = (away / away.median().clamp(min=1e-12) + turned).argsort()[:NEAREST].tolist()
-    pairs = [(view, known[place]) for place in order]
+    known = torch.tensor([other for other in others if other in evidence.corners], dtype=torch.long)
+    pairs = [(view, other) for other in nearest_views(c2w, torch.tensor([view]), known, NEAREST)[0].tolist()]
     matches = matched_pairs(shrunk_cameras(evidence.scene.cameras), evidence.corners, pairs)
     agrees = agreeing(matches, c2w)
     return int(agrees.sum()) >= FEWEST_FOR and float(agrees.float().mean()) >= SPEAKS_FOR * evidence.agreement
@@ -152,12 +148,8 @@ def refitted(
 ) -> Float[Tensor, "starts 3 4"]:
     """Return each start after Gauss-Newton steps on how far matches lie from the planes of their partners' rays.
 
-    Large distances count less and less (Cauchy's weights, ever narrower), since a part of the matches is mistaken.
-
-    Args:
-        own: matches of one view, that view first in each.
-        c2w: the poses, of which those of the other views are taken for right.
-        starts: poses of the view to begin with.
+    Large distances count less and less (Cauchy's weights, ever narrower), since a part of the matches is mistaken. The
+    matches are of one view, it first in each, and the poses of the others are taken for right.
     """
     rays, _ = rays_of(own, c2w)
     there, focal = rays[:, 1], own.focal[:, 0].double()
