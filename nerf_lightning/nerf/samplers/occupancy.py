@@ -14,7 +14,7 @@ from nerf_lightning.nerf.geometry.contraction import Contracted
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, GridMarch, MarchState
 from nerf_lightning.nerf.kernels.march.march import march
 from nerf_lightning.nerf.kernels.march.reference import in_occupied
-from nerf_lightning.nerf.randomness import RayRandom, batch_random, fold
+from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.samplers.base import DensityFn, RaggedSampler, RayMarcher
 from nerf_lightning.nerf.samplers.occupancy_grid import OccupancyGrid
@@ -24,7 +24,6 @@ from nerf_lightning.nerf.types.scene import Scene
 
 log = logging.getLogger(__name__)
 
-CELLS_AT_ONCE = 1 << 18
 CAPACITY = 1 << 20
 # Of scenes without an end: the last box is 32 times the first, and intervals grow with the distance.
 CASCADES_ENDLESS, CONE_ENDLESS = 6, 1 / 256
@@ -263,9 +262,7 @@ class OccupancySampler(RaggedSampler):
         number = self._numbers = self._numbers.to(grid.possible.device)
         if step > self.warmup_steps:
             number = number[(step // self.update_every) % 2 :: 2]
-        within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
-        for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
-            grid.learn(cells, density(grid.positions(cells, part)).float(), self.decay)
+        grid.update(density, number, key, self.decay)
         if step >= self.prune_after:
             mean = grid.density.sum() / grid.possible.sum()
             grid.occupy((grid.density > (0.5 * mean).clamp(max=self._least_density)) & grid.possible)

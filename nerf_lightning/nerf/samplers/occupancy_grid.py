@@ -9,6 +9,10 @@ from torch import Tensor, nn
 from nerf_lightning.messages.errors import ANOTHER, InputError
 from nerf_lightning.nerf.geometry.boxes import center_and_half, require_box
 from nerf_lightning.nerf.kernels.march.grid import BLOCK, OccupancyCells, blocks_of, leaps_over
+from nerf_lightning.nerf.randomness import batch_random, fold
+from nerf_lightning.nerf.samplers.base import DensityFn
+
+CELLS_AT_ONCE = 1 << 18
 
 
 class OccupancyGrid(nn.Module):
@@ -70,10 +74,19 @@ class OccupancyGrid(nn.Module):
         self.density.zero_()
         self.occupy(self.possible)
 
-    def learn(self, number: Int[Tensor, "cells"], found: Float[Tensor, "cells"], decay: float) -> None:
-        """Take note of the densities that were found in some cells; older ones decay."""
-        density = self.density.view(-1)
-        density[number] = torch.maximum(decay * density[number], found)
+    def update(self, density: DensityFn, number: Int[Tensor, "cells"], key: int, decay: float) -> None:
+        """Ask the field at a random point of each of some cells: a cell keeps the larger of its decayed value and that.
+
+        Args:
+            density: the field's.
+            number: of the cells.
+            key: of this step's random numbers.
+            decay: of what a cell held.
+        """
+        kept = self.density.view(-1)
+        within = batch_random(fold(key, "occupancy_grid"), number.shape[0], number.device).uniform("cell", 3)
+        for cells, part in zip(number.split(CELLS_AT_ONCE), within.split(CELLS_AT_ONCE), strict=True):
+            kept[cells] = torch.maximum(decay * kept[cells], density(self.positions(cells, part)).float())
 
     def occupy(self, occupied: Tensor) -> None:
         """Say which cells rays may not pass over."""
