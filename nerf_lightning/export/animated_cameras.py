@@ -19,8 +19,7 @@ CAMERA_TYPES: dict[LensModel, str] = {
     "fisheye": "fisheye",
     "equirectangular": "equirectangular",
 }
-SENSOR_WIDTH = 36.0
-"""Of Blender's camera, in millimetres; its focal length is in these too."""
+SENSOR_WIDTH = 36.0  # Of Blender's camera, in millimetres; its focal length is in these too.
 
 
 def nerfstudio_path(cameras: Cameras, fps: int) -> dict[str, Any]:
@@ -77,15 +76,9 @@ for number, (name, place, rotation, lens, shift) in enumerate(FRAMES, start=1):
 
 
 def blender_script(cameras: Cameras, names: Sequence[str], fps: int) -> str:
-    """Return a script in Python that Blender runs; it holds numbers, and names as literals in ASCII.
+    """Return a script in Python that Blender runs, of cameras in the user's frame and of `fps` photographs per second.
 
-    Args:
-        cameras: in the user's frame.
-        names: of the photographs, which may come from anybody.
-        fps: photographs per second.
-
-    Raises:
-        InputError: a lens that Blender's perspective camera is far from.
+    It holds numbers, and names, which may come from anybody, as literals in ASCII.
     """
     if cameras.lens_model in ("fisheye", "equirectangular"):
         raise InputError(
@@ -101,13 +94,8 @@ def blender_script(cameras: Cameras, names: Sequence[str], fps: int) -> str:
     offset = cameras.center - 0.5 * torch.stack([width, height], dim=-1)
     shift = torch.stack([-offset[:, 0], offset[:, 1]], dim=-1) / width[:, None]  # to the right, and up
     rows = zip(names, cameras.c2w[:, :, 3].tolist(), rotations.tolist(), lens.tolist(), shift.tolist(), strict=True)
-    return SCRIPT.format(
-        width=int(width[0]),
-        height=int(height[0]),
-        fps=fps,
-        sensor=SENSOR_WIDTH,
-        frames="\n".join(f"    {row!a}," for row in rows),
-    )
+    frames = "\n".join(f"    {row!a}," for row in rows)
+    return SCRIPT.format(width=int(width[0]), height=int(height[0]), fps=fps, sensor=SENSOR_WIDTH, frames=frames)
 
 
 def beyond_pinholes(cameras: Cameras, shifts: bool) -> list[str]:

@@ -55,40 +55,24 @@ class Export(ABC):
 
 
 def require_setting(name: str, value: object, good: bool, rule: str) -> None:
-    """Refuse a setting of an exporter that is not good.
-
-    Raises:
-        InputError: it names the setting, and says the rule.
-    """
+    """Refuse a setting of an exporter that is not good: its name and value are said, and the rule."""
     if not good:
         raise InputError(f"what.{name}={value}: {rule}")
 
 
 def refuse_ndc(record: SceneRecord, what: str) -> None:
-    """Refuse a scene whose field lives in normalised device coordinates.
-
-    Raises:
-        InputError: it does.
-    """
+    """Refuse a scene whose field lives in normalised device coordinates."""
     if record.space == "ndc":
         raise InputError(
-            f"what={what}: {record.name} was trained in normalised device coordinates (scene.space=ndc), where the "
-            "density of a place depends on how far away it is, and far things have no box. Use what=points or "
-            "what=images, which take the depth back to the world, or train again with scene.space=contracted."
+            f"what={what}: {record.name} was trained in normalised device coordinates (scene.space=ndc), where far "
+            "things have no box. Use what=points or what=images, or train again with scene.space=contracted."
         )
 
 
 def require_free(files: Iterable[Path] = (), folders: Iterable[Path] = ()) -> None:
-    """Refuse places for files where folders lie, and for folders where files lie: before the work, not after it.
-
-    Raises:
-        InputError: with the first of them.
-    """
-    taken = [(path, "a folder, and a file of that name is to be written") for path in files if path.is_dir()]
-    taken += [
-        (path, "a file, and a folder of that name is to be filled")
-        for path in folders
-        if path.exists() and not path.is_dir()
-    ]
-    for path, reason in taken[:1]:
-        raise InputError(f"{path} is {reason}. Remove it, or give another place with paths.output_dir=DIR.")
+    """Refuse places for files where folders lie, and for folders where files lie: before the work, not after it."""
+    taken = [f"{path} is a folder, and a file of that name is to be written" for path in files if path.is_dir()]
+    filled = [path for path in folders if path.exists() and not path.is_dir()]
+    taken += [f"{path} is a file, and a folder of that name is to be filled" for path in filled]
+    for reason in taken:
+        raise InputError(f"{reason}. Remove it, or give another place with paths.output_dir=DIR.")

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from nerf_lightning.export.animated_cameras import beyond_pinholes, blender_script, nerfstudio_path
 from nerf_lightning.export.base import Export, require_free, require_setting
@@ -28,7 +30,7 @@ CAMERA_MODELS: dict[LensModel, str] = {
     "fisheye": "OPENCV_FISHEYE",
     "equirectangular": "EQUIRECTANGULAR",
 }
-WITHOUT_COEFFICIENTS = ("pinhole", "equirectangular")
+WHOLE = 1e-3  # Of a panorama's size, to which it shows all directions.
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 COLMAP_TAKES = {"pinhole": [], "radial_tangential": [0, 1, 4, 5], "fisheye": [0, 1, 2, 3]}
 """Which of the coefficients each of COLMAP's models has, in its order."""
@@ -46,9 +48,6 @@ class CamerasExport(Export):
             pictures of the training; `nerfstudio` `camera_path.json`, a film of the photographs for `ns-render
             camera-path`; `blender` `cameras_blender.py`, which makes the same film's keyframes when Blender runs it.
         fps: photographs per second of such a film.
-
-    Raises:
-        InputError: fewer than one photograph per second.
     """
 
     needs_density = False
@@ -68,8 +67,7 @@ class CamerasExport(Export):
         transforms = folder / "transforms.json"
         require_free(files=[transforms], folders=[folder / "sparse", folder / "sparse" / "0"])
         write_json(transforms, self._transforms(record, cameras))
-        reason = beyond_colmap(cameras)
-        if reason:
+        if reason := beyond_colmap(cameras):
             log.warning("%s No COLMAP model is written, only transforms.json.", reason)
             return [transforms]
         sparse = make_folder(folder, "sparse", "0")
@@ -79,15 +77,12 @@ class CamerasExport(Export):
 
     def _animation(self, cameras: Cameras, names: Sequence[str], path: Path) -> Path:
         require_free(files=[path])
-        blender = self.format == "blender"
-        text = blender_script(cameras, names, self.fps) if blender else None
-        lost = beyond_pinholes(cameras, shifts=blender)
-        if lost:
-            log.warning("%s does not say %s.", path.name, ", or ".join(lost))
-        if text is None:
-            write_json(path, nerfstudio_path(cameras, self.fps))
+        if self.format == "blender":
+            _write_text(path, blender_script(cameras, names, self.fps))
         else:
-            _write_text(path, text)
+            write_json(path, nerfstudio_path(cameras, self.fps))
+        if lost := beyond_pinholes(cameras, shifts=self.format == "blender"):
+            log.warning("%s does not say %s.", path.name, ", or ".join(lost))
         return path
 
     def _transforms(self, record: SceneRecord, cameras: Cameras) -> dict[str, Any]:
@@ -118,7 +113,7 @@ def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
     (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.center[view].tolist()
     if cameras.lens_model == "equirectangular":
         fx, fy = math.pi * fx, math.pi * fy  # nerfstudio counts pixels per half turn
-    plain = cameras.lens_model in WITHOUT_COEFFICIENTS
+    plain = cameras.lens_model in ("pinhole", "equirectangular")
     return {
         "file_path": name,
         "w": int(cameras.width[view]),
@@ -131,8 +126,8 @@ def _frame(cameras: Cameras, view: int, name: str) -> dict[str, Any]:
 
 def beyond_colmap(cameras: Cameras) -> str | None:
     """Return why COLMAP has no model for a lens, or None where it has."""
-    if cameras.lens_model == "equirectangular":
-        return "COLMAP has no model for panoramas."
+    if cameras.lens_model == "equirectangular" and not bool(_is_whole(cameras).all()):
+        return "COLMAP has no model for panoramas of a part of the directions."
     if cameras.lens_model == "radial_tangential" and bool(cameras.lens[:, 2:4].any()):
         return "The lens has the coefficients k3 or k4, which COLMAP's model OPENCV lacks."
     return None
@@ -154,7 +149,17 @@ def colmap_files(cameras: Cameras, names: Sequence[str]) -> dict[str, str]:
     }
 
 
+def _is_whole(cameras: Cameras) -> Bool[Tensor, "views"]:
+    """Tell which panoramas show all directions, as COLMAP's EQUIRECTANGULAR camera (4.1 or later) does."""
+    size = torch.stack([cameras.width, cameras.height], dim=-1).double()
+    turns = torch.tensor([2.0, 1.0], dtype=torch.float64) * math.pi
+    return ((cameras.focal.double() * turns - size).abs() < WHOLE * size).all(dim=-1)
+
+
 def _camera(cameras: Cameras, view: int) -> str:
+    if cameras.lens_model == "equirectangular":
+        width, height = int(cameras.width[view]), int(cameras.height[view])
+        return f"EQUIRECTANGULAR {width} {height} {width} {height}"
     lens = cameras.lens[view, COLMAP_TAKES[cameras.lens_model]]
     numbers = [*cameras.focal[view].tolist(), *cameras.center[view].tolist(), *lens.tolist()]
     size = f"{int(cameras.width[view])} {int(cameras.height[view])}"

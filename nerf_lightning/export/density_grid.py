@@ -19,8 +19,7 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 Report = Callable[[str, float], None]
 """Takes the name of a stage, and how much of it is done, from 0 to 1."""
 
-# Points of which coordinates are held at a time; a report follows each.
-CHUNK = 1 << 18
+CHUNK = 1 << 18  # Points of which coordinates are held at a time; a report follows each.
 
 
 @dataclass(frozen=True)
@@ -82,11 +81,7 @@ def sample_density(
 
 
 def require_resolution(record: SceneRecord, resolution: int, bytes_per_point: int) -> Lattice:
-    """Return the lattice over the scene's box.
-
-    Raises:
-        InputError: fewer than 2 cells, or more than memory holds.
-    """
+    """Return the lattice over the scene's box, of 2 cells or more that memory holds."""
     if resolution < 2:
         raise InputError(f"what.resolution={resolution}: give the number of cells along the longest side, 2 or more.")
     lattice = Lattice.over(record.aabb, resolution)

@@ -19,13 +19,10 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import Model
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# The density's grid, and as much again for the mesh.
-BYTES_PER_POINT = 8
-# So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
-RATIO = 10.0
+BYTES_PER_POINT = 8  # The density's grid, and as much again for the mesh.
+RATIO = 10.0  # So many times the surface's density, or so small a part of it, are as good as solid and as nothing.
 
-BLOCK = 64
-"""Cells along a block's side."""
+BLOCK = 64  # Cells along a block's side.
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +33,6 @@ def mesh_of_density(
     """Return vertices (scene frame) and faces of the surface where the density is `threshold` per scene unit.
 
     Without a threshold, that is where rendering sees it (`surface_level`).
-
-    Raises:
-        InputError: there is no such surface.
     """
     density = sample_density(model, lattice, tile_points, report)
     if record.space == "bounded":
@@ -65,13 +59,12 @@ def _level(
         return level
     found = f"the densities of its box go from {lowest:.3g} to {highest:.3g} per scene unit"
     if level is None:
-        raise InputError(
-            f"There is no surface to export: {found}, and no training view of {record.name} sees anything opaque "
-            "there. Train longer, or say with what.threshold=DENSITY what counts as the surface."
-        )
+        missing, seen = "", ", and no training view sees anything opaque there"
+    else:
+        missing, seen = f" where the density is {level:.3g}", ""
     raise InputError(
-        f"There is no surface in {record.name} where the density is {level:.3g}: {found}. Give what.threshold="
-        "DENSITY between the two, or train longer."
+        f"There is no surface in {record.name}{missing}: {found}{seen}. Train longer, or give what.threshold=DENSITY "
+        "between the two."
     )
 
 

@@ -23,13 +23,11 @@ from nerf_lightning.nerf.randomness import fold
 from nerf_lightning.nerf.rendering.ray_statistics import median_distances
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 
-# The distance and its weight; and as much as one of them again for the mesh.
-BYTES_PER_POINT = 12
+BYTES_PER_POINT = 12  # The distance and its weight; and as much as one of them again for the mesh.
 # Views that are fused, and the longer side of their pictures: as many pixels as the grid has cells, but so many
 # at most.
 VIEWS, LONGEST = 60, 512
-# Pixels that stop less light see through the box.
-OPAQUE = 0.5
+OPAQUE = 0.5  # Pixels that stop less light see through the box.
 # A view at a grazing angle says little; of nothing, less than of something; a coarse one, less than a fine one.
 LEAST_COSINE, NOTHING, LEAST_SHARE = 0.05, 0.3, 0.25
 # Half of what one view counts that looks squarely: a surface that all of them see less well is not there.
@@ -42,9 +40,6 @@ def mesh_of_depth(
     """Return vertices (scene frame) and faces of the surface that training views see, open where none looks.
 
     `truncation` says how far before and behind a surface its distance is kept, in cells.
-
-    Raises:
-        InputError: no view sees a surface in the box, or none sees one well.
     """
     fuse = kernels("tsdf_fusion", "what.surface=tsdf", "Reinstall numba, or take what.surface=density.")
     lower, reach = lattice.lower.numpy(), truncation * lattice.spacing

@@ -29,8 +29,7 @@ from nerf_lightning.visualization.pictures import save_png, to_bytes
 
 DepthKind = Literal["distance", "z"]
 Split = Literal["train", "val", "test", "all"]
-# Pixels that stop less light have no depth.
-OPAQUE = 0.5
+OPAQUE = 0.5  # Pixels that stop less light have no depth.
 LARGEST = 65_535
 KINDS = ("depth", "opacity", "normals")
 MILLIMETRE = 1e-3
@@ -82,7 +81,8 @@ class ImagesExport(Export):
                     channels[name] = make_folder(folder, name)
                     _save_array(channels[name] / f"{names[view]}.npy", values.numpy())
                 report("pictures", (number + 1) / len(views))
-            scale = _scale(record, farthest)
+            in_millimetres = record.metres_per_unit is not None and farthest <= MILLIMETRE * LARGEST
+            scale = MILLIMETRE if in_millimetres else farthest / LARGEST or 1.0
             for number, view in enumerate(views):
                 depth = np.nan_to_num(np.load(depths / f"{names[view]}.npy"), nan=0.0)
                 with whole_file(depths / f"{names[view]}.png") as part:
@@ -90,7 +90,7 @@ class ImagesExport(Export):
                 report("depth", (number + 1) / len(views))
         about = folder / "images.json"
         write_json(about, self._described(record, names, scale))
-        said = "millimetres" if scale == MILLIMETRE and record.metres_per_unit is not None else f"{scale:.4g} of these"
+        said = "millimetres" if in_millimetres else f"{scale:.4g} of these"
         say(f"depth        in {told_length(record)[1]}; a step of the 16-bit PNG is {said}")
         return [depths, opacities, directions, *channels.values(), about]
 
@@ -120,13 +120,6 @@ class ImagesExport(Export):
             "normals": "8 bits, (n + 1) / 2, in the capture's axes, facing the camera",
             "views": {record.view_names[view]: name for view, name in names.items()},
         }
-
-
-def _scale(record: SceneRecord, farthest: float) -> float:
-    """Return what a step of a depth's PNG is, given what is farthest in metres or the capture's units."""
-    if record.metres_per_unit is not None and farthest <= MILLIMETRE * LARGEST:
-        return MILLIMETRE
-    return farthest / LARGEST or 1.0
 
 
 def _plain(name: str) -> str:

@@ -37,13 +37,9 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 Surface = Literal["density", "tsdf"]
 BYTES_PER_POINT = {"density": density_mesh.BYTES_PER_POINT, "tsdf": fused_mesh.BYTES_PER_POINT}
 # A guess at how the time is shared; the bar corrects itself.
-COSTS = {
-    "density": {"density": 6.0, "surface": 2.0, "views": 6.0},
-    "tsdf": {"depth": 12.0, "surface": 2.0},
-}
+COSTS = {"density": {"density": 6.0, "surface": 2.0, "views": 6.0}, "tsdf": {"depth": 12.0, "surface": 2.0}}
 COLORING = {False: {"colours": 4.0}, True: {"charts": 6.0, "sight": 4.0, "texels": 40.0}}
-# In cells: so far the surface may be off to each side.
-REACH = 2.0
+REACH = 2.0  # In cells: so far the surface may be off to each side.
 # Most faces of a mesh with a texture, where nobody says how many: the charts of more take minutes.
 TEXTURED_FACES = 60_000
 
@@ -70,8 +66,8 @@ class MeshExport(Export):
         texture_size: texels along each side of the picture.
         format: of the file; PLY and OBJ open everywhere, in the capture's frame; GLB is one file for browsers, and its
             root node turns it so that y is up, and gives it its size in metres where the capture's unit is known, as
-            glTF has it. None: PLY, or GLB where there is a texture, which PLY
-            does not know; OBJ then has an MTL and a PNG beside it.
+            glTF has it. None: PLY, or GLB where there is a texture, which PLY does not know; OBJ then has an MTL and a
+            PNG beside it.
     """
 
     kernels = (f"{ROOM}.tsdf_fusion", f"{ROOM}.texels")
@@ -90,34 +86,22 @@ class MeshExport(Export):
 
     def __post_init__(self) -> None:
         positive = self.threshold is None or self.threshold > 0
-        require_setting(
-            "threshold", self.threshold, positive, "give a density above 0, or null to take it from the data."
-        )
-        require_setting(
-            "truncation", self.truncation, 1 <= self.truncation <= 64, "give a number of cells from 1 to 64."
-        )
-        shares = "give a share from 0 (all is kept) to 1 (the largest part)."
-        require_setting("min_share", self.min_share, 0 <= self.min_share <= 1, shares)
+        require_setting("threshold", self.threshold, positive, "give a density above 0, or null to find it.")
+        cells = 1 <= self.truncation <= 64
+        require_setting("truncation", self.truncation, cells, "give a number of cells from 1 to 64.")
+        share = 0 <= self.min_share <= 1
+        require_setting("min_share", self.min_share, share, "give a share from 0 (all) to 1 (the largest part).")
         enough = self.faces is None or self.faces >= 4
         require_setting("faces", self.faces, enough, "a closed mesh has 4 or more; null keeps all.")
         sizes = f"give a number of texels from {LEAST_SIZE} to {LARGEST_SIZE}."
         fits = LEAST_SIZE <= self.texture_size <= LARGEST_SIZE
         require_setting("texture_size", self.texture_size, fits, sizes)
         if self.surface == "tsdf" and self.threshold is not None:
-            raise InputError(
-                f"what.threshold={self.threshold} belongs to what.surface=density: with what.surface=tsdf the surface "
-                "is where the views' light is stopped. Leave one of the two out."
-            )
+            raise InputError(f"what.threshold={self.threshold} belongs to what.surface=density. Leave one of them out.")
         if self.surface == "tsdf" and not self.seen_only:
-            raise InputError(
-                "what.seen_only=false asks for a closed mesh, and what.surface=tsdf knows only what the views see. "
-                "Take what.surface=density for it."
-            )
+            raise InputError("what.seen_only=false asks for a closed mesh. Take what.surface=density for it.")
         if self.texture and self.format == "ply":
-            raise InputError(
-                "what.format=ply has no texture, and what.texture=true makes one. Give what.format=glb (one file), or "
-                "obj (with an MTL and a PNG beside it)."
-            )
+            raise InputError("what.format=ply has no texture. Give what.format=glb (one file), or obj (three).")
         if self.texture and self.faces is None:
             self.faces = TEXTURED_FACES
         self.format = self.format or ("glb" if self.texture else "ply")

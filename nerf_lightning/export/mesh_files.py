@@ -1,7 +1,6 @@
 """Mesh files: PLY, OBJ and GLB, with a normal and a colour for each vertex or with a texture, by optional libraries."""
 
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +11,7 @@ from numpy import ndarray
 from PIL import Image
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.frames import upright_rotation
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
@@ -56,8 +55,9 @@ def save_mesh(
     """Write a mesh with an sRGB colour per vertex, whole or not at all; the ending says in which format."""
     trimesh = require_library("trimesh")
     form = path.suffix[1:]
-    shown = _linear(colors) if form == "glb" else colors
-    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=shown, process=False)
+    if form == "glb":  # glTF takes the bytes of vertices' colours for linear light
+        colors = np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
     settings: dict[str, dict[str, Any]] = {
         "ply": {"vertex_normal": True},
         "obj": {"include_normals": True, "header": None},
@@ -80,16 +80,8 @@ def save_textured_mesh(
 ) -> list[Path]:
     """Write a mesh with a texture as GLB, or as OBJ with its MTL and PNG beside it, and return the files.
 
-    Each is whole or not there; the OBJ, which names the others, comes last.
-
-    Args:
-        path: of the file; its ending says in which format.
-        vertices: where the corners are.
-        faces: three corners each.
-        normals: of the corners.
-        frame: of the vertices.
-        uv: where each corner lies in the picture, from 0 to 1, to the right and up.
-        picture: sRGB.
+    Each is whole or not there; the OBJ, which names the others, comes last. `uv` says where each vertex lies in the
+    picture (sRGB), from 0 to 1, to the right and up.
     """
     trimesh = require_library("trimesh")
     image, visual = Image.fromarray(picture), trimesh.visual
@@ -115,11 +107,6 @@ def save_textured_mesh(
     return list(contents)
 
 
-def _linear(colors: UInt8[ndarray, "vertices 3"]) -> UInt8[ndarray, "vertices 3"]:
-    """Return sRGB codes as bytes of linear light, which glTF takes vertex colours for."""
-    return np.rint(255.0 * to_linear(torch.from_numpy(colors / 255.0)).numpy()).astype(np.uint8)
-
-
 def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
     """Return the rotation that takes `up` to +y, and what a frame with z up calls x to x.
 
@@ -132,16 +119,5 @@ def y_up(up: Float[ndarray, "3"]) -> Float[ndarray, "4 4"]:
 
 
 def require_library(name: str, extra: str = "mesh") -> Any:
-    """Return a module of an extra.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0].replace("skimage", "scikit-image")
-        raise InputError(
-            f"Exporting {MADE_BY[extra]} needs {package}, which is not "
-            f"installed or does not load here ({error}). Install it with: pip install 'nerf-lightning[{extra}]'"
-        ) from error
+    """Return a module of an extra, or say how it is installed."""
+    return require_extra(name, extra, f"Exporting {MADE_BY[extra]}")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from nerf_lightning.export.baking.bake import bake
-from nerf_lightning.export.baking.cost import Cost, measured_cost
+from nerf_lightning.export.baking.cost import measured_cost
 from nerf_lightning.export.baking.fitting import fitted
 from nerf_lightning.export.baking.marcher import Marcher
 from nerf_lightning.export.base import Export, require_setting
@@ -30,16 +30,8 @@ HARMONICS: dict[Space, dict[Quality, int]] = {
     "ndc": {"small": 4, "medium": 4, "large": 9},
     "contracted": {"small": 4, "medium": 9, "large": 9},
 }
-COSTS = {
-    "box": 1.0,
-    "coarse": 1.0,
-    "density": 4.0,
-    "lit": 4.0,
-    "seen": 10.0,
-    "colours": 15.0,
-    "fitted": 20.0,
-    "measured": 8.0,
-}
+BAKING = {"box": 1.0, "coarse": 1.0, "density": 4.0, "lit": 4.0, "seen": 10.0, "colours": 15.0}
+COSTS = BAKING | {"fitted": 20.0, "measured": 8.0}
 
 
 @dataclass
@@ -77,7 +69,9 @@ class PageExport(Export):
     def export(self, model: Model, record: SceneRecord, folder: Path, tile_points: int) -> list[Path]:
         """Write the page, and say what it costs."""
         target = folder / "page.html"
-        require_no_other(target)
+        if target.is_dir() or (target.exists() and not is_page(target)):
+            kind = "a folder" if target.is_dir() else "a file that is no page of this program"
+            raise InputError(f"{target} is {kind}, and would be lost. Move it away, or give paths.output_dir=DIR.")
         with StageProgress(COSTS) as report:
             resolution = self.resolution or RESOLUTIONS[record.space][self.quality]
             baked = bake(model, record, resolution, HARMONICS[record.space][self.quality], tile_points, report)
@@ -87,22 +81,6 @@ class PageExport(Export):
             marcher = Marcher(baked)
             cost = measured_cost(marcher, model, record, self.beside.photographs, self.max_views, tile_points, report)
         write_page(target, marcher, record, self.beside, self.photographs, cost.facts())
-        say(*self._said(target, cost))
+        size = f"{target.stat().st_size / 1e6:.1f} MB (what.quality={self.quality})"
+        say(*(f"{name:<12} {fact}" for name, fact in [("size", size), *cost.facts()]))
         return [target]
-
-    def _said(self, target: Path, cost: Cost) -> list[str]:
-        size = f"{target.stat().st_size / 1e6:.1f} MB"
-        return [f"size         {size} (what.quality={self.quality})", *(f"{a:<12} {b}" for a, b in cost.facts())]
-
-
-def require_no_other(target: Path) -> None:
-    """Refuse to write over what is no page of ours.
-
-    Raises:
-        InputError: there is such a file, or a folder.
-    """
-    if target.is_dir() or (target.exists() and not is_page(target)):
-        kind = "a folder" if target.is_dir() else "a file that is no page of this program"
-        raise InputError(
-            f"{target} is {kind}, and would be lost. Move it away, or give another folder with paths.output_dir=DIR."
-        )

@@ -34,11 +34,9 @@ FOLDER = Path(__file__).parent / "page_files"
 SCRIPTS = ("page.js", "path.js")
 MARK = b"<!-- nerf_lightning page 1 -->"
 BEHIND: dict[Background, str] = {"white": "#ffffff", "black": "#000000", "none": "#000000"}
-# Pixels of the longer side: of the still picture, of photographs.
-STILL, PHOTOGRAPH = 640, 320
+STILL, PHOTOGRAPH = 640, 320  # Pixels of the longer side: of the still picture, of photographs.
 JPEG_QUALITY = 80
-# How much is seen around a panorama's direction, in radians.
-PART_OF_PANORAMA = 1.5
+PART_OF_PANORAMA = 1.5  # How much is seen around a panorama's direction, in radians.
 
 
 @dataclass(frozen=True)
@@ -77,16 +75,13 @@ def write_page(
         # A film has the shape of the first photograph.
         "film": [int(record.cameras.width[0]), int(record.cameras.height[0])],
     }
-    grid = " x ".join(str(8 * count) for count in marcher.baked.shape)
-    grid_fact = ("grid", f"{grid}, {about['blocks']:,} blocks of 8 x 8 x 8")
-    known = [("scene", record.name), *beside.facts, *facts, grid_fact]
-    places = [_view(record, beside, view if max_photographs else None) for view in views]
+    grid = f"{' x '.join(str(8 * count) for count in marcher.baked.shape)}, {about['blocks']:,} blocks of 8 x 8 x 8"
     cameras = at_most(record.cameras, STILL)
     rays = view_rays(RayGenerator(cameras, record.near, record.far), all_pixels(cameras, views[0]))[0]
     page = {
         "title": record.name,
-        "facts": known,
-        "views": places,
+        "facts": [("scene", record.name), *beside.facts, *facts, ("grid", grid)],
+        "views": [_view(record, beside, view if max_photographs else None) for view in views],
         "still": _jpeg(over(marcher.render(rays), record.background), STILL),
         "background": BEHIND[at_evaluation(record.background)],
     }

@@ -15,7 +15,7 @@ from torch import Tensor
 from nerf_lightning.compute.machine import require_memory
 from nerf_lightning.export.base import Export, require_free, require_setting
 from nerf_lightning.export.mesh_files import require_library
-from nerf_lightning.export.visibility import SeenView, nearest_views, num_agreeing, see
+from nerf_lightning.export.visibility import nearest_views, num_agreeing, see
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.console import StageProgress
 from nerf_lightning.messages.errors import InputError
@@ -30,8 +30,7 @@ from nerf_lightning.visualization.pictures import to_bytes
 BYTES_PER_PIXEL = 90
 # And of those that are written: in the user's frame, in double precision, and as rows of the file.
 BYTES_PER_POINT = 150
-# So many of the nearest other views are asked whether they agree.
-NEIGHBOURS = 8
+NEIGHBOURS = 8  # So many of the nearest other views are asked whether they agree.
 PointFormat = Literal["ply", "las"]
 COSTS = {"depth": 10.0, "agreement": 1.0}
 
@@ -88,7 +87,9 @@ class PointsExport(Export):
             for number, view in enumerate(views):
                 seen = see(model, record, cameras, view, tile_points)
                 opaque = (seen.opacity > self.min_opacity) & seen.depth.isfinite()
-                clouds[view], depths[view] = _cloud(seen, opaque), torch.where(opaque, seen.depth, torch.inf)
+                kept = opaque & (seen.normals.norm(dim=-1) > 0.5)
+                clouds[view] = torch.cat([seen.points[kept], seen.normals[kept], seen.rgb[kept]], dim=-1)
+                depths[view] = torch.where(opaque, seen.depth, torch.inf)
                 candidates += int(opaque.sum())
                 opacities += [float(seen.opacity.min()), float(seen.opacity.max())]
                 report("depth", (number + 1) / len(views))
@@ -149,12 +150,6 @@ class PointsExport(Export):
         )
 
 
-def _cloud(view: SeenView, kept: Tensor) -> Float[Tensor, "points 9"]:
-    """Return places, normals and colours of the pixels that are kept and have a normal."""
-    kept = kept & (view.normals.norm(dim=-1) > 0.5)
-    return torch.cat([view.points[kept], view.normals[kept], view.rgb[kept]], dim=-1)
-
-
 NUMBERS, COLORS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
 LAYOUT = np.dtype([*((name, "<f4") for name in NUMBERS), *((name, "u1") for name in COLORS)])
 
@@ -179,20 +174,13 @@ def save_points(
         part.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
 
 
-# LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
-MOST_STEPS = 1e9
-# What a cloud of one place at zero gets.
-FINEST = 1e-30
-# Colours have 16 bits there, full scale: 255 becomes 65535.
-COLOR_SCALE = 257
+MOST_STEPS = 1e9  # LAS holds places as 32-bit whole numbers; the extent takes from a tenth of this to all of it.
+FINEST = 1e-30  # What a cloud of one place at zero gets.
+COLOR_SCALE = 257  # Colours have 16 bits there, full scale: 255 becomes 65535.
 
 
 def save_las(path: Path, points: Float[ndarray, "points 3"], colors: UInt8[ndarray, "points 3"]) -> None:
-    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colours, no normals), whole or not at all.
-
-    Raises:
-        InputError: laspy is not installed.
-    """
+    """Write a point cloud as LAS 1.2 (point format 2: places and sRGB colours, no normals), whole or not at all."""
     laspy = require_library("laspy", "las")
     header = laspy.LasHeader(version="1.2", point_format=2)
     header.generating_software = "nerf-lightning"

@@ -20,10 +20,8 @@ from nerf_lightning.nerf.types.renderings import DenseRendering
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-# So many rays of the training views are asked.
-RAYS = 1 << 13
-# Rays that stop less light than this have met no surface.
-OPAQUE = 0.9
+RAYS = 1 << 13  # So many rays of the training views are asked.
+OPAQUE = 0.9  # Rays that stop less light than this have met no surface.
 # Where four fifths of the rays end it is denser than the level. At the median, thin and grazed surfaces have holes;
 # much lower, surfaces swell.
 QUANTILE = 0.2
@@ -64,8 +62,7 @@ def _some_rays(record: SceneRecord) -> RayBundle:
 
 
 SeenFrom = Literal["cameras", "normal"]
-# Of a short ray.
-SAMPLES = 8
+SAMPLES = 8  # Of a short ray.
 
 
 def surface_colors(
@@ -105,16 +102,9 @@ def short_rays(
     samples: int,
     closed: bool,
 ) -> DenseRendering:
-    """Return what rays see from a little before points to a little behind them, asking the last level alone.
+    """Return what rays along unit directions see from `before` points to `behind` them, by the last level alone.
 
-    Args:
-        model: in evaluation mode.
-        at: on the surface, scene frame.
-        look: unit directions.
-        before: how far before the points rays begin, scene units.
-        behind: how far behind them they end.
-        samples: of each ray.
-        closed: whether the light that is left ends there, or goes on.
+    All is in the scene's frame and units; `closed` says whether the light that is left ends there, or goes on.
     """
     edges = torch.linspace(0.0, before + behind, samples + 1, device=at.device).expand(len(at), samples + 1)
     intervals, origins = RaySamples(edges), at - before * look
@@ -124,10 +114,8 @@ def short_rays(
     return composite(output, intervals, RayBundle(origins, look, near, near + before + behind, look), beyond)
 
 
-# Cameras that are taken of each point.
-NEAREST = 3
-# The ways of all points to all cameras would take gigabytes: so many are held at a time, of 36 bytes.
-PAIRS = 1 << 20
+NEAREST = 3  # Cameras that are taken of each point.
+PAIRS = 1 << 20  # The ways of all points to all cameras would take gigabytes: so many are held at a time, of 36 bytes.
 
 
 def looks_from_nearest(

@@ -27,22 +27,18 @@ from nerf_lightning.nerf.types.rays import RayBundle
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-# Texels between charts, so that none shines into another where a viewer mixes neighbours.
-PADDING = 4
+PADDING = 4  # Texels between charts, so that none shines into another where a viewer mixes neighbours.
 # Training views that are asked which places they see, and how many of them give a texel its colour.
 VIEWS, LOOKS = 100, 3
-# Views that see a surface less squarely (cosine) are not asked.
-LEAST_COSINE = 0.1
-# A texel of which less is seen has no colour of its own: that of the nearest one that has.
-LEAST_SEEN = 1e-3
+LEAST_COSINE = 0.1  # Views that see a surface less squarely (cosine) are not asked.
+LEAST_SEEN = 1e-3  # A texel of which less is seen has no colour of its own: that of the nearest one that has.
 LEAST_SIZE, LARGEST_SIZE = 16, 16_384
 # Which face and where on it, its colour, and the nearest that has one: measured, where charts fill the picture.
 BYTES_PER_TEXEL = 100
 # Rays of texels begin before the surface by so many times the reach, and have so many samples: nearer, what is hazy
 # after a short training is painted too light; farther costs more and gains nothing that is seen.
 BEFORE, SAMPLES = 4.0, 20
-# Texels that are looked at together; a report follows each lot.
-TOGETHER = 1 << 16
+TOGETHER = 1 << 16  # Texels that are looked at together; a report follows each lot.
 
 
 @dataclass(frozen=True)
@@ -91,11 +87,7 @@ def find_texels(atlas: Atlas, size: int) -> Texels:
 
 
 def require_texture_room(size: int) -> None:
-    """Refuse a texture that takes more memory than can be had.
-
-    Raises:
-        InputError: with the size that would fit.
-    """
+    """Refuse a texture that takes more memory than can be had."""
     require_memory(
         f"what.texture_size={size} makes a picture of {size} x {size} texels",
         size,
@@ -104,6 +96,7 @@ def require_texture_room(size: int) -> None:
     )
 
 
+@dataclass
 class TextureMaker:
     """Look at the places of a mesh from the training cameras that see them best.
 
@@ -112,25 +105,19 @@ class TextureMaker:
     the scene's frame; `reach` is how far the mesh may be from the surface that the views see, scene units.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        record: SceneRecord,
-        points: Float[Tensor, "vertices 3"],
-        normals: Float[Tensor, "vertices 3"],
-        reach: float,
-        tile_points: int,
-    ):
-        self.model, self.record, self.tile_points = model, record, tile_points
-        self.points, self.normals, self.reach = points, normals, reach
-        self.views, self.device = evenly_spaced_subset(record.splits["train"], VIEWS), next(model.parameters()).device
+    model: Model
+    record: SceneRecord
+    points: Float[Tensor, "vertices 3"]
+    normals: Float[Tensor, "vertices 3"]
+    reach: float
+    tile_points: int
+
+    def __post_init__(self) -> None:
+        self.views = evenly_spaced_subset(self.record.splits["train"], VIEWS)
+        self.device = next(self.model.parameters()).device
 
     def __call__(self, texels: Texels, size: int, report: Report) -> UInt8[ndarray, "size size 3"]:
-        """Return the picture; between charts the nearest colour goes on, so that no seam shows.
-
-        Raises:
-            InputError: no training view sees any of it.
-        """
+        """Return the picture; between charts the nearest colour goes on, so that no seam shows."""
         scores = self.vertex_scores(report)
         colors = torch.zeros(len(texels.row), 3)
         seen = torch.zeros(len(texels.row), dtype=torch.bool)

@@ -21,10 +21,9 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
-# Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals;
-STRAIGHT = 250
+# Bytes per pixel, measured on the CPU: all rays of a view, what is rendered of them, and their points and normals; and
 # where rays go through normalised device coordinates.
-BENT = 370
+STRAIGHT, BENT = 250, 370
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,7 @@ class SeenView:
 
 
 def require_room(cameras: Cameras, views: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse views whose rays take more memory than can be had, before the first of them is made.
-
-    Raises:
-        InputError: with the largest view, and what would fit.
-    """
+    """Refuse views whose rays take more memory than can be had, before the first of them is made."""
     each = BENT if cameras.ndc is not None else STRAIGHT
     sizes = {view: int(cameras.width[view]) * int(cameras.height[view]) for view in views}
     view = max(sizes, key=lambda view: sizes[view])
@@ -85,12 +80,8 @@ def num_agreeing(
 ) -> Int[Tensor, "points"]:
     """Return how many of the views see each point, in the working frame, as their surface.
 
-    Args:
-        points: in the working frame.
-        cameras: of all views.
-        depths: by view, along each pixel's ray to the surface (scene units); inf where nothing opaque is seen.
-        views: those that are asked.
-        tolerance: how far the point may lie from the surface, as a share of its distance.
+    `depths` are along each pixel's ray to the surface (scene units), inf where nothing opaque is seen. A point may lie
+    off it by `tolerance` times its distance.
     """
     count = torch.zeros(len(points), dtype=torch.int64)
     for view in views:
@@ -100,14 +91,10 @@ def num_agreeing(
     return count
 
 
-# Training views that are rendered, and their longer side in pixels.
-VIEWS, LONGEST = 60, 400
-# A vertex is seen where a view's depth is its distance, up to this share of it.
-TOLERANCE = 0.015
-# Pixels that stop less light see no surface.
-OPAQUE = 0.5
-# The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
-RINGS = 2
+VIEWS, LONGEST = 60, 400  # Training views that are rendered, and their longer side in pixels.
+TOLERANCE = 0.015  # A vertex is seen where a view's depth is its distance, up to this share of it.
+OPAQUE = 0.5  # Pixels that stop less light see no surface.
+RINGS = 2  # The rim of what is seen grows by so many rings of faces, so that grazed and thin places get no holes.
 
 
 def seen_faces(
@@ -118,11 +105,7 @@ def seen_faces(
     tile_points: int,
     report: Report,
 ) -> Int[ndarray, "seen 3"]:
-    """Return the faces that a training view sees, or whose neighbours it does.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the faces that a training view sees, or whose neighbours it does, of which there must be some."""
     cameras, views = at_most(record.cameras, LONGEST), evenly_spaced_subset(record.splits["train"], VIEWS)
     points = torch.from_numpy(vertices).float()
     seen = torch.zeros(len(points), dtype=torch.bool)

@@ -22,10 +22,8 @@ from nerf_lightning.nerf.types.points import Points
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
-# Density, colour, and the density again in the user's units.
-BYTES_PER_POINT = 12
-# A cell less opaque than this has no colour.
-LEAST_ALPHA = 1e-3
+BYTES_PER_POINT = 12  # Density, colour, and the density again in the user's units.
+LEAST_ALPHA = 1e-3  # A cell less opaque than this has no colour.
 COSTS = {"density": 2.0, "colours": 3.0}
 
 

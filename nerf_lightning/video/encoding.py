@@ -79,8 +79,7 @@ def write_video(
             pipe.write(pad_to_even(frame).contiguous().numpy().tobytes())
 
 
-LARGEST_SIDE = 16383
-"""Of a WebP, in pixels."""
+LARGEST_SIDE = 16383  # Of a WebP, in pixels.
 QUALITY = 80
 
 
@@ -91,10 +90,6 @@ def write_animation(
 
     The arguments are those of `write_video`; each frame is shown for a whole number of milliseconds, equal neighbours
     as one.
-
-    Raises:
-        InputError: frames larger than the format's largest.
-        ValueError: no frames, another number than `total`, or frames of different sizes.
     """
     first, frames = _counted(path, frames, total)
     height, width, _ = first.shape
@@ -180,11 +175,7 @@ _CURE = (
 
 
 def require_encoder(ending: str) -> None:
-    """Refuse videos of an ending whose encoder this machine's ffmpeg lacks.
-
-    Raises:
-        InputError: it does, or there is no ffmpeg.
-    """
+    """Refuse videos of an ending whose encoder this machine's ffmpeg lacks, and all where there is no ffmpeg."""
     name, program = CODECS[ending].encoder, require_ffmpeg()
     asked = [program, "-v", "error", "-hide_banner", "-h", f"encoder={name}"]
     try:
@@ -196,11 +187,7 @@ def require_encoder(ending: str) -> None:
 
 
 def require_ffmpeg() -> str:
-    """Return where ffmpeg is.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return where ffmpeg is, or say how it is installed."""
     import imageio_ffmpeg
 
     try:

@@ -1,7 +1,6 @@
 """Frames for compositing as EXR, by OpenEXR: colours in linear light, and depth, as floats."""
 
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.nerf.rendering.linear_light import to_linear
 
-NOTHING = 1e10
-"""The depth of a pixel that stops less than half of the light, as Blender writes it."""
-COMMENTS = "R, G, B: linear light. Z: distance from the camera in {unit}, 1e10 where nothing is."
+NOTHING = 1e10  # The depth of a pixel that stops less than half of the light, as Blender writes it.
 
 
 def exr_channels(
     picture: Picture, depth: Float[Tensor, "height width"] | None, colors: bool, alpha: bool
 ) -> dict[str, Float[Tensor, "height width"]]:
-    """Return what a frame holds, by the names that compositors know.
+    """Return what a frame holds, by the names that compositors know: Z of `depth`, R, G, B of `colors`, A of `alpha`.
 
-    Args:
-        picture: the view; where alpha is wanted, rendered over black.
-        depth: of what stops the light, for channel Z; None: without it.
-        colors: whether to hold R, G and B.
-        alpha: whether to hold A too; then colours are multiplied with it, as EXR has them.
+    With alpha, colours are multiplied with it, as EXR has them; then the picture has been rendered over black.
     """
     channels: dict[str, Tensor] = {}
     if colors:
@@ -44,18 +37,10 @@ def exr_channels(
 
 
 def save_exr(path: Path, channels: Mapping[str, Float[Tensor, "height width"]], unit: str) -> None:
-    """Write one frame, whose depth is in `unit`, in 32-bit floats: whole or not at all. Missing folders are made.
-
-    Raises:
-        InputError: OpenEXR is not installed.
-        OSError: the disk is full, or cannot be written.
-    """
+    """Write one frame, whose depth is in `unit`, in 32-bit floats: whole or not at all. Missing folders are made."""
     openexr = require_openexr()
-    header = {
-        "compression": openexr.ZIP_COMPRESSION,
-        "type": openexr.scanlineimage,
-        "comments": COMMENTS.format(unit=unit),
-    }
+    comments = f"R, G, B: linear light. Z: distance from the camera in {unit}, 1e10 where nothing is."
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, "comments": comments}
     content = {name: values.float().contiguous().numpy() for name, values in channels.items()}
     with whole_file(path) as part:
         try:
@@ -65,15 +50,5 @@ def save_exr(path: Path, channels: Mapping[str, Float[Tensor, "height width"]], 
 
 
 def require_openexr() -> Any:
-    """Return the module.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return import_module("OpenEXR")
-    except ImportError as error:
-        raise InputError(
-            f"format=exr needs OpenEXR, which is not installed or does not load here ({error}). Install it with: "
-            "pip install 'nerf-lightning[exr]'"
-        ) from error
+    """Return the module, or say how it is installed."""
+    return require_extra("OpenEXR", "exr", "format=exr")

@@ -41,13 +41,7 @@ def film(
 
     A film that was stopped goes on with its missing frames. Depth is along the ray, in metres where the capture's unit
     is known and else in its own, coloured over the range of what is seen on the whole path, with its scale beside it.
-
-    Args:
-        subjects: models of one capture; where there are several, they are shown side by side.
-        path: where the cameras are.
-        tile_points: most points that go through a field at once.
-        folder: where to.
-        settings: what is filmed; None: colour and depth as videos.
+    Several models of one capture are shown side by side. Without settings, colour and depth are filmed, as videos.
 
     Raises:
         InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
@@ -60,11 +54,7 @@ def film(
 
 
 def films_of(steps: FilmSteps) -> list[Path]:
-    """Make the films whose frames are all there, and return them, or their folders of frames.
-
-    Raises:
-        InputError: as `film`.
-    """
+    """Make the films whose frames are all there, and return them, or their folders of frames."""
     try:
         next(steps)
     except StopIteration as end:
@@ -85,16 +75,11 @@ def film_steps(
 
     Yields how many frames of how many are there: at first, and after each. Then `films_of` makes the films;
     `shows_encoding`: show in the terminal how far that is.
-
-    Raises:
-        InputError: what is asked for cannot be filmed, or written; frames that were finished are kept.
     """
     _check(subjects, settings)
     if settings.alpha:
         subjects = [replace(subject, background="black") for subject in subjects]
-    shots = make_shots(
-        subjects, path, tile_points, settings.near, settings.crop, settings.hold_camera, settings.projection
-    )
+    shots = make_shots(subjects, path, tile_points, settings)
     require_room(shots[0].cameras, settings, len(subjects))
     for name in [name for name in settings.outputs if name not in FILMS]:
         channel_picture(name, shots[0].picture(0))  # or says that there is none, before anything is written
@@ -148,19 +133,17 @@ def _check(subjects: list[Subject], settings: FilmSettings) -> None:
     if settings.form == "exr":
         require_openexr()
     if (settings.alpha or settings.form == "exr") and len(subjects) > 1:
-        raise InputError(
-            "alpha=true and format=exr: checkpoints side by side stand on white paper. Render them one by one."
-        )
+        raise InputError("alpha=true and format=exr take one checkpoint: several stand side by side on white paper.")
     for subject in subjects:
         name = f" ({subject.label})" if len(subjects) > 1 else ""
         if "levels" in settings.outputs and subject.model.first_picture is None:
             raise InputError(
-                f"outputs: this model{name} has one level that makes pictures, so there is no difference of levels to "
-                "show. Leave levels out; model=nerf and its smaller versions have two."
+                f"outputs: this model{name} has one level that makes pictures, and levels shows how two differ, as "
+                "those of model=nerf. Leave levels out."
             )
         if settings.crop is not None and subject.background == "none" and not settings.alpha:
             raise InputError(
-                f"crop: this model{name} has no background that could be seen around the box. Add background=white, "
+                f"crop: this model{name} has no background to be seen around the box. Add background=white, "
                 "background=black, or alpha=true with another format."
             )
 
@@ -170,21 +153,18 @@ def _fingerprint(shots: list[Shot], settings: FilmSettings) -> str:
     digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
     for shot in shots:
         digest.update(f"{shot.subject.label} {shot.subject.background} {shot.unit}".encode())
-        cameras, seen_from = shot.cameras, shot.seen_from
+        cameras = shot.cameras
         tensors = [cameras.c2w, cameras.focal, cameras.width, cameras.height, shot.near, shot.far]
-        tensors += [] if seen_from is None else [seen_from.c2w]
+        tensors += [] if shot.seen_from is None else [shot.seen_from.c2w]
         for tensor in (*tensors, *shot.subject.model.state_dict().values()):
             flat = tensor.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)
             digest.update(flat.view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]
 
 
-# Bytes per pixel, measured on the CPU: the picture rendered;
-PICTURE = 40
-# where the surface is looked at too: its points and normals, or the channels of an EXR.
-SURFACE = 80
-# What is shown of it: a panel, its caption and its place in the frame.
-PANEL = 16
+PICTURE = 40  # Bytes per pixel, measured on the CPU, of the picture rendered.
+SURFACE = 80  # Where the surface is looked at too: its points and normals, or the channels of an EXR.
+PANEL = 16  # What is shown of it: a panel, its caption and its place in the frame.
 
 
 def bytes_per_pixel(settings: FilmSettings, num_models: int) -> int:
@@ -194,11 +174,7 @@ def bytes_per_pixel(settings: FilmSettings, num_models: int) -> int:
 
 
 def require_room(cameras: Cameras, settings: FilmSettings, num_models: int = 1) -> None:
-    """Refuse frames (of cameras of one size) that take more memory than can be had.
-
-    Raises:
-        InputError: in all processes; it says which size would fit.
-    """
+    """Refuse frames (of cameras of one size) that take more memory than can be had, in all processes."""
     width, height = int(cameras.width[0]), int(cameras.height[0])
     together = processes_here() if ranks.world_size() > 1 else 1
     each = together * bytes_per_pixel(settings, num_models)

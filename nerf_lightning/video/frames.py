@@ -4,7 +4,6 @@
 seen) and over which depths their colours reach.
 """
 
-import json
 import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,8 +14,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from nerf_lightning.data.pixels.images import read_rgba
-from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.json_files import read_json_object
+from nerf_lightning.files.json_files import read_json_object, write_json
 from nerf_lightning.files.made_folders import ScratchFolder, empty_ours, make_folder, make_ours
 from nerf_lightning.messages.console import tracked
 from nerf_lightning.messages.errors import InputError
@@ -33,8 +31,7 @@ class FilmFrames:
     """Frames of one or more films of equal length.
 
     Args:
-        folder: where the films go.
-        films: their names.
+        films: their names; they go into `folder`.
         count: how many frames each has.
         form: `frames` and `exr` are the result; the others keep frames in a hidden folder until one file is made of
             them.
@@ -60,11 +57,8 @@ class FilmFrames:
     def open(self, fingerprint: str, measure: Callable[[], Range]) -> tuple[list[int], Range]:
         """Take hold of the folder; return the frames that are missing, and the range of the depth's colours.
 
-        Frames of another film are removed, and the range is measured anew.
-
-        Raises:
-            InputError: another process films into this folder, it cannot be written, or it holds files that would be
-                removed and are not ours.
+        Frames of another film are removed, and the range is measured anew. A folder that another process films into, or
+        whose files are not ours, is refused.
         """
         with self._kept():
             self.scratch.hold()
@@ -78,44 +72,29 @@ class FilmFrames:
                 for folder in results:
                     empty_ours(folder, self._pattern)
             note = {"fingerprint": fingerprint, "depth_range": list(measure())}
-            with self._kept(), whole_file(about) as part:
-                part.write_text(json.dumps(note, indent=2) + "\n")
+            with self._kept():
+                write_json(about, note)
         missing = [number for number in range(self.count) if not self._is_there(number)]
         if len(missing) < self.count:
-            log.info(
-                "%d of %d frames are there already: the missing ones follow", self.count - len(missing), self.count
-            )
+            there = self.count - len(missing)
+            log.info("%d of %d frames are there already: the missing ones follow", there, self.count)
         near, far = note["depth_range"]
         return missing, (near, far)
 
     def save(self, film: str, number: int, write: Callable[[Path], None]) -> None:
-        """Keep one frame, which `write` writes to a file.
-
-        Raises:
-            InputError: the disk is full, or cannot be written.
-        """
-        try:
-            with self._kept():
-                file = self._file(film, number)
-                make_folder(self.folder, *file.parent.relative_to(self.folder).parts)
-                write(file)
-        except InputError as error:
-            raise InputError(f"{error} {self._cure()}") from error
+        """Keep one frame, which `write` writes to a file."""
+        with self._resumable():
+            file = self._file(film, number)
+            make_folder(self.folder, *file.parent.relative_to(self.folder).parts)
+            write(file)
 
     def finish(self, fps: int) -> None:
-        """Make the films of the frames, remove these, and let others have the folder.
-
-        Raises:
-            InputError: ffmpeg fails, or the disk is full; the frames stay.
-        """
+        """Make the films of the frames, remove these, and let others have the folder; on an error the frames stay."""
         if ENDINGS[self.form]:
             write = write_animation if self.form == "animation" else write_video
             for film, file in zip(self.films, self.results(), strict=True):
-                try:
-                    with self._kept():
-                        write(file, self._read(film), fps, self.count)
-                except InputError as error:
-                    raise InputError(f"{error} {self._cure()}") from error
+                with self._resumable():
+                    write(file, self._read(film), fps, self.count)
             self.scratch.remove()
         else:
             self.close()
@@ -156,12 +135,17 @@ class FilmFrames:
             where = error.filename or self.folder
             raise InputError(f"{where}: {error.strerror or error}. See that there is space left.") from error
 
-    def _cure(self) -> str:
-        there = sum(map(self._is_there, range(self.count)))
-        return (
-            f"{there} of {self.count} frames are kept in {self.root}: the same command, given again, goes on with the "
-            "missing ones."
-        )
+    @contextmanager
+    def _resumable(self) -> Iterator[None]:
+        try:
+            with self._kept():
+                yield
+        except InputError as error:
+            there = sum(map(self._is_there, range(self.count)))
+            raise InputError(
+                f"{error} {there} of {self.count} frames are kept in {self.root}: the same command, given again, goes "
+                "on with the missing ones."
+            ) from error
 
 
 def _is_range(value: object) -> bool:

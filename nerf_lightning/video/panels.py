@@ -5,13 +5,16 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.render_image import Picture
 from nerf_lightning.visualization.pictures import (
+    PAPER,
     depth_picture,
     error_picture,
     faded,
+    framed,
     letter_size,
     side_by_side,
     to_bytes,
@@ -21,8 +24,6 @@ from nerf_lightning.visualization.pictures import (
 FILMS = {"rgb": "video", "depth": "depth", "opacity": "opacity", "normals": "normals", "levels": "levels"}
 """What can be shown of every model, and the name of its film. Any other name is a channel of the model's field."""
 
-_PAPER = 255
-
 
 def panel(
     output: str,
@@ -31,15 +32,11 @@ def panel(
     unit: float,
     normals: Float[Tensor, "height width 3"] | None,
 ) -> UInt8[Tensor, "height wider 3"]:
-    """Return one output of a view as a picture.
+    """Return one output of a view (a key of `FILMS`, or a channel) as a picture.
 
-    Args:
-        output: a key of `FILMS`. `levels` is the absolute difference of the first level that makes pictures and the
-            last; `normals` are the surface's, as colours: 0.5 + 0.5 n along the axes of the capture's own frame.
-        picture: the view.
-        depth_range: near and far of the depth's colours, in metres or the user's units.
-        unit: how many of these make one of the scene's.
-        normals: in the user's axes, where they are wanted.
+    `levels` is the absolute difference of the first level that makes pictures and the last; `normals` are the
+    surface's, as colours: 0.5 + 0.5 n along the axes of the capture's own frame. `depth_range` is near and far of the
+    depth's colours, in metres or the user's units, of which `unit` make one of the scene's.
     """
     if output == "depth":
         return depth_picture(unit * picture.depth, *depth_range, picture.opacity)
@@ -56,9 +53,6 @@ def channel_picture(name: str, picture: Picture) -> UInt8[Tensor, "height width 
     """Return a channel as a picture: one number a pixel in grey, three as colours, more in the colour of the largest.
 
     Numbers are shown as they are, from 0 to 1.
-
-    Raises:
-        InputError: the model's field has no such channel.
     """
     if name not in picture.channels:
         known = [*FILMS, *picture.channels]
@@ -90,19 +84,10 @@ def film_pictures(
     if mosaic:
         named = zip(panels, [f"{label} | " if several else "" for label in labels], strict=True)
         rows = [row((each[name], prefix + name) for name in each) for each, prefix in named]
-        return {"mosaic": _framed(_stacked(rows, size), size)}
+        width = max(each.shape[1] for each in rows)
+        below = [pad(each, (0, 0, 0, width - each.shape[1], 0, size), value=PAPER) for each in rows]
+        return {"mosaic": framed(torch.cat(below)[:-size], size)}
     if not several:
         return {FILMS.get(name, name): picture for name, picture in panels[0].items()}
     beside = {name: row(zip((each[name] for each in panels), labels, strict=True)) for name in panels[0]}
-    return {FILMS.get(name, name): _framed(picture, size) for name, picture in beside.items()}
-
-
-def _stacked(rows: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int) -> UInt8[Tensor, "height width 3"]:
-    """Return pictures one above the other, aligned on the left."""
-    width = max(row.shape[1] for row in rows)
-    padded = [torch.nn.functional.pad(row, (0, 0, 0, width - row.shape[1], 0, gap), value=_PAPER) for row in rows]
-    return torch.cat(padded)[:-gap]
-
-
-def _framed(picture: UInt8[Tensor, "height width 3"], size: int) -> UInt8[Tensor, "taller wider 3"]:
-    return torch.nn.functional.pad(picture, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)
+    return {FILMS.get(name, name): framed(picture, size) for name, picture in beside.items()}

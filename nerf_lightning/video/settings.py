@@ -10,14 +10,8 @@ from nerf_lightning.video.panels import FILMS
 from nerf_lightning.video.paths.base import is_point
 
 Form = Literal["video", "webm", "prores", "animation", "frames", "exr"]
-ENDINGS: dict[Form, str] = {
-    "video": ".mp4",
-    "webm": ".webm",
-    "prores": ".mov",
-    "animation": ".webp",
-    "frames": "",
-    "exr": "",
-}
+FILES: dict[Form, str] = {"video": ".mp4", "webm": ".webm", "prores": ".mov", "animation": ".webp"}
+ENDINGS: dict[Form, str] = FILES | {"frames": "", "exr": ""}
 Projection = Literal["perspective", "equirectangular"]
 Corner = tuple[float, float, float]
 EXR_OUTPUTS = ("rgb", "depth")
@@ -48,11 +42,7 @@ class FilmSettings:
 
 
 def film_settings(config: Mapping[str, Any]) -> FilmSettings:
-    """Return what is to be filmed, by settings that are plain values.
-
-    Raises:
-        InputError: an output, a form, a box or a distance that makes no film.
-    """
+    """Return what is to be filmed, by settings that are plain values; those that make no film are refused."""
     for name in SWITCHES:
         if not isinstance(config[name], bool):
             raise InputError(f"{name}={config[name]} does not fit: it must be true or false.")
@@ -68,8 +58,7 @@ def film_settings(config: Mapping[str, Any]) -> FilmSettings:
         )
     if config["format"] == "exr" and (config["mosaic"] or not set(outputs) <= set(EXR_OUTPUTS)):
         raise InputError(
-            f"format=exr holds {' and '.join(EXR_OUTPUTS)} as numbers. Leave mosaic and other outputs out, or give "
-            "format=frames."
+            f"format=exr holds {' and '.join(EXR_OUTPUTS)} as numbers. Leave mosaic and other outputs out."
         )
     if config["alpha"]:
         _check_alpha(config, outputs)
@@ -112,14 +101,10 @@ def _crop(corners: Any) -> tuple[Corner, Corner] | None:
     if corners is None:
         return None
     if not isinstance(corners, list) or len(corners) != 2 or not all(map(is_point, corners)):
-        raise InputError(
-            f"crop={corners}: give the lower and the upper corner of a box in the capture's own frame, "
-            "crop=[[x,y,z],[x,y,z]]."
-        )
+        raise InputError(f"crop={corners}: give the lower and the upper corner of a box, crop=[[x,y,z],[x,y,z]].")
     (x, y, z), (upper_x, upper_y, upper_z) = (map(float, corner) for corner in corners)
     if not (x < upper_x and y < upper_y and z < upper_z):
         raise InputError(
-            f"crop={corners} holds nothing: every coordinate of the first corner must be smaller than that of the "
-            "second."
+            f"crop={corners} holds nothing: the first corner must be smaller than the second along each axis."
         )
     return (x, y, z), (upper_x, upper_y, upper_z)

@@ -12,7 +12,7 @@ from nerf_lightning.nerf.geometry.cameras import at_most, camera_coordinates, co
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import poses_from_user, told_length, unit_of
 from nerf_lightning.nerf.geometry.ndc import LEAST_FORWARD
-from nerf_lightning.nerf.geometry.near_far import near_and_far_from
+from nerf_lightning.nerf.geometry.near_far_of_new_views import near_and_far_from
 from nerf_lightning.nerf.geometry.panoramas import panorama_cameras
 from nerf_lightning.nerf.geometry.subset import evenly_spaced_subset
 from nerf_lightning.nerf.geometry.surfaces import normals_from_depth
@@ -21,7 +21,7 @@ from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.models.render_image import Picture, picture_surface, render_picture
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.video.paths.base import CameraPath, frame_of
-from nerf_lightning.video.settings import Corner, Projection
+from nerf_lightning.video.settings import FilmSettings
 
 # The range of the depth's colours is taken from so many frames, with at most so many pixels along their longer side.
 PROBES, PROBE_PIXELS = 8, 64
@@ -65,10 +65,8 @@ class Shot:
     def picture(self, frame: int) -> Picture:
         """Render one frame."""
         looked_up = None if self.seen_from is None else RayGenerator(self.seen_from, self.near, self.far)
-        subject = self.subject
-        return render_picture(
-            subject.model, self.rays, frame, subject.background, self.tile_points, self.clip, looked_up
-        )
+        model, background = self.subject.model, self.subject.background
+        return render_picture(model, self.rays, frame, background, self.tile_points, self.clip, looked_up)
 
     def normals(self, frame: int, picture: Picture) -> Float[Tensor, "height width 3"]:
         """Return the unit normals of what the picture shows, in the user's axes."""
@@ -100,43 +98,27 @@ def make_shots(
     subjects: list[Subject],
     path: CameraPath,
     tile_points: int,
-    near: float | None = None,
-    crop: tuple[Corner, Corner] | None = None,
-    hold_camera: bool = False,
-    projection: Projection = "perspective",
+    settings: FilmSettings | None = None,
 ) -> list[Shot]:
-    """Return the shot of each model; the path is that of the first one's capture.
-
-    Args:
-        subjects: models of one capture; their working frames may differ.
-        path: where the cameras are.
-        tile_points: most points that go through a field at once.
-        near: where rays begin, in the user's units; None: where the photographs' do.
-        crop: lower and upper corner of a box in the user's frame, outside of which nothing is shown.
-        hold_camera: stay at the first camera, and let only the direction from which colour is looked up move.
-        projection: of the pictures.
-
-    Raises:
-        InputError: a camera stands inside of the box, the path cannot be laid around this capture, or panoramas cannot
-            be made of it.
-    """
-    first = subjects[0].scene
+    """Return the shot of each model of a capture, on a path in the first one's frame; working frames may differ."""
+    settings = settings or FilmSettings()
+    first, near, crop = subjects[0].scene, settings.near, settings.crop
     cameras = lay_path(path, first)
-    if projection == "equirectangular":
+    if settings.projection == "equirectangular":
         cameras = _panoramas(cameras, path, first)
     shots = []
     for subject in subjects:
         scene = replace(subject.scene, metres_per_unit=first.metres_per_unit)
         moved = _in_frame_of(cameras, first, scene)
-        held = replace(moved, c2w=moved.c2w[:1].expand_as(moved.c2w)) if hold_camera else moved
+        held = replace(moved, c2w=moved.c2w[:1].expand_as(moved.c2w)) if settings.hold_camera else moved
         clip = None
         if near is not None or crop is not None:
-            box = None if crop is None else CropBox.from_user(crop[0], crop[1], scene.to_user)
+            box = None if crop is None else CropBox.from_user(*crop, scene.to_user)
             clip = Clip(None if near is None else near / unit_of(scene.to_user), box)
         _check_outside(held, clip)
         shot = shot_of(replace(subject, scene=scene), held, tile_points)
         _check_near(scene, clip, shot.far)
-        shots.append(replace(shot, seen_from=moved if hold_camera else None, clip=clip))
+        shots.append(replace(shot, seen_from=moved if settings.hold_camera else None, clip=clip))
     return shots
 
 
@@ -147,11 +129,7 @@ def shot_of(subject: Subject, cameras: Cameras, tile_points: int) -> Shot:
 
 
 def lay_path(path: CameraPath, scene: SceneRecord) -> Cameras:
-    """Return the cameras of a path around a scene.
-
-    Raises:
-        InputError: the path cannot be laid there: it names a photograph that is not there, or has no up.
-    """
+    """Return the cameras of a path around a scene, or say why it cannot be laid there."""
     return path.cameras(frame_of(scene.cameras, scene.aabb, to_user=scene.to_user, view_names=scene.view_names))
 
 
@@ -185,8 +163,7 @@ def _panoramas(cameras: Cameras, path: CameraPath, scene: SceneRecord) -> Camera
     if scene.cameras.ndc is not None:
         raise InputError(
             f"projection=equirectangular looks to all sides, and {scene.name} was learnt in normalised device "
-            "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted for "
-            "panoramas, or render without projection."
+            "coordinates, which hold only what lies in front of its cameras. Train with scene.space=contracted."
         )
     if path.fov is not None:
         raise InputError(f"path.fov={path.fov:g} with projection=equirectangular: panoramas show all directions.")
@@ -211,14 +188,10 @@ def _bent(cameras: Cameras, scene: SceneRecord) -> Cameras:
     if scene.cameras.ndc is None:
         return cameras
     count = len(cameras.c2w)
-    lost = int((~in_front_of_near_plane(cameras)).sum())
-    if lost:
+    if lost := int((~in_front_of_near_plane(cameras)).sum()):
         log.warning(
-            "%d of %d cameras of the path look aside or stand among the content, where the forward-facing capture "
-            "%s has nothing to show: their pictures mean nothing. Use path=spiral.",
-            lost,
-            count,
-            scene.name,
+            f"{lost} of {count} cameras of the path look aside or stand among the content, where the forward-facing "
+            f"capture {scene.name} has nothing to show: their pictures mean nothing. Use path=spiral."
         )
     return replace(cameras, ndc=scene.cameras.ndc[:1].expand(count, 2))
 
@@ -230,8 +203,7 @@ def _check_outside(cameras: Cameras, clip: Clip | None) -> None:
     if inside:
         raise InputError(
             f"crop: the camera of frame {inside[0]} stands inside the box ({len(inside)} of {len(cameras.c2w)} frames "
-            "do), where it would look at the content from within. Make the box smaller, or move the path away (for "
-            "instance path=orbit path.radius=...)."
+            "do). Make the box smaller, or move the path away (for instance path=orbit path.radius=...)."
         )
 
 
@@ -241,7 +213,4 @@ def _check_near(scene: SceneRecord, clip: Clip | None, far_end: Float[Tensor, "f
     far = float(far_end.max())
     if clip.near >= far:
         unit = unit_of(scene.to_user)
-        raise InputError(
-            f"near={unit * clip.near:g} leaves nothing to see: rays end at {unit * far:g} of the capture's units. Give "
-            "a distance between 0 and that."
-        )
+        raise InputError(f"near={unit * clip.near:g} leaves nothing to see: rays end at {unit * far:g}. Give less.")

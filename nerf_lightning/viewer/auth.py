@@ -26,9 +26,6 @@ class Auth:
     Args:
         host: the address that is listened on.
         hosts: further names by which browsers find the page.
-
-    Raises:
-        InputError: a name that is none.
     """
 
     def __init__(self, host: str, hosts: Sequence[str] | str | None = None):
@@ -39,10 +36,7 @@ class Auth:
     def refusal(self, path: str, values: Callable[[str], list[str]], port: int) -> str | None:
         """Return why a request is refused, in one sentence; None: it may pass.
 
-        Args:
-            path: what is asked for, with the query.
-            values: returns those of a header.
-            port: where the page listens.
+        `path` has the query, `values` returns those of a header, and the page listens at `port`.
         """
         host, origin = (", ".join(values(name)).lower() for name in ("Host", "Origin"))
         name = name_of(host)
@@ -65,11 +59,7 @@ class Auth:
 
 
 def names_of(hosts: Sequence[str] | str | None) -> set[str]:
-    """Return the names in `viewer.hosts`, without their ports.
-
-    Raises:
-        InputError: a name that is none.
-    """
+    """Return the names in `viewer.hosts`, without their ports; what is no name is refused."""
     names = set()
     for each in [hosts] if isinstance(hosts, str | int) else hosts or ():
         name = name_of(str(each).lower())

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.nerf.geometry.cameras import focal_from_fov, pinhole_cameras, resized
 from nerf_lightning.nerf.geometry.clipping import CropBox
-from nerf_lightning.nerf.geometry.near_far import near_and_far_from
+from nerf_lightning.nerf.geometry.near_far_of_new_views import near_and_far_from
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.nerf.types.scene import Cameras, SceneRecord
 
@@ -33,12 +33,9 @@ class CameraState:
 
 
 def fov_that_holds(fov: float, shape: float, window: float) -> float:
-    """Return the vertical field of view (radians) at which a window shows a photograph to its edges.
+    """Return the vertical field of view (radians) at which a window shows a photograph of another to its edges.
 
-    Args:
-        fov: what the photograph takes in from top to bottom, in radians.
-        shape: its width over its height.
-        window: that of the window.
+    `shape` is the photograph's width over its height, `window` that of the window.
 
     >>> round(fov_that_holds(1.0, 1.5, 2.0), 3), round(fov_that_holds(math.pi / 2, 2.0, 1.0), 3)
     (1.0, 2.214)

@@ -19,8 +19,7 @@ COLOR = "colour"
 PAPER, LINE = 237, 255
 # Depths are sent losslessly, with every picture: more pixels (a side) cost time, fewer make ragged edges.
 MOST_DEPTH_SIDE = 320
-# viser sends depths as whole numbers of 1e-5 in three bytes: what is farther cannot be told.
-FARTHEST = 167.0
+FARTHEST = 167.0  # viser sends depths as whole numbers of 1e-5 in three bytes: what is farther cannot be told.
 
 
 def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
@@ -32,17 +31,9 @@ def picture_of(view: View, channel: str) -> UInt8[Tensor, "height width 3"]:
     return to_bytes(CHANNELS[channel](view))
 
 
-def _color(view: View) -> Float[Tensor, "height width 3"]:
-    return view.rgb
-
-
 def _depth(view: View) -> Float[Tensor, "height width 3"]:
     near, far = visible_range(view.depth, view.opacity)
     return faded(color_map(view.depth, low=far, high=near), view.opacity)
-
-
-def _opacity(view: View) -> Float[Tensor, "height width 3"]:
-    return view.opacity[..., None].expand(*view.opacity.shape, 3)
 
 
 def _normals(view: View) -> Float[Tensor, "height width 3"]:
@@ -57,9 +48,9 @@ def _rays(view: View, pixels: PixelIndex) -> RayBundle:
 
 
 CHANNELS: dict[str, Callable[[View], Tensor]] = {
-    COLOR: _color,
+    COLOR: lambda view: view.rgb,
     "depth": _depth,
-    "opacity": _opacity,
+    "opacity": lambda view: view.opacity[..., None].expand(-1, -1, 3),
     "normals": _normals,
 }
 

@@ -18,10 +18,8 @@ from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import View
 from nerf_lightning.viewer.shown_photographs import Photographs
 
-# A window counts as no wider and no higher than this (pixels).
-MOST_SIDE = 4096
-# Coarse pictures are sent often, fine ones once.
-COARSE_QUALITY, FINE_QUALITY = 75, 92
+MOST_SIDE = 4096  # A window counts as no wider and no higher than this (pixels).
+COARSE_QUALITY, FINE_QUALITY = 75, 92  # Coarse pictures are sent often, fine ones once.
 # Cameras lie this many times as far as the photographs were taken, at most: where depths cannot be told so far, nothing
 # is hidden.
 FARTHER = 4
@@ -32,14 +30,8 @@ NEAR, SAME_WAY = 2e-3, 1 - 1e-5
 class ViewerClient:
     """Turn the movements of viser's camera into looks, and views into what the page shows.
 
-    viser calls from threads of its own; pictures come from the thread that renders.
-
-    Args:
-        client: viser's handle.
-        queue: renders.
-        photographs: to compare with.
-        around: the middle of the scene, and how far the photographs were taken.
-        most_height: the finest picture, in pixels.
+    viser calls from threads of its own; pictures come from the thread that renders, the finest `most_height` pixels
+    high.
     """
 
     def __init__(self, client: Any, queue: RenderQueue, photographs: Photographs, around: PathFrame, most_height: int):
@@ -71,19 +63,10 @@ class ViewerClient:
     def look(self) -> None:
         """Wish for what the camera sees now."""
         camera = self.client.camera
-        if self.photograph is not None:
-            self._notice_leaving()
+        self._notice_leaving()
         self.on_move()
-        self.refinement.ask(
-            CameraState(
-                c2w=self.pose(),
-                fov=float(camera.fov),
-                width=min(max(1, int(camera.image_width)), MOST_SIDE),
-                height=min(max(1, int(camera.image_height)), MOST_SIDE),
-                crop=self.crop,
-                photograph=self.photograph,
-            )
-        )
+        width, height = (min(max(1, int(side)), MOST_SIDE) for side in (camera.image_width, camera.image_height))
+        self.refinement.ask(CameraState(self.pose(), float(camera.fov), width, height, self.crop, self.photograph))
         self.queue.wake()
 
     def pose(self) -> Tensor:
@@ -127,8 +110,7 @@ class ViewerClient:
     def present(self) -> None:
         """Send the newest view again, as another channel or with the comparison cut elsewhere.
 
-        A slider asks for it more often than it can be done: a thread that finds another one at it returns, and the
-        other one sends once more.
+        A slider asks for it more often than it can be done: a thread that finds another one at it leaves it to that.
         """
         self._wants_present = True
         while self._wants_present and self._presenting.acquire(blocking=False):
@@ -167,7 +149,8 @@ class ViewerClient:
         self.client.flush()
 
     def _notice_leaving(self) -> None:
-        assert self.photograph is not None
+        if self.photograph is None:
+            return
         there = self.photographs.record.cameras.c2w[self.photograph]
         here = self.pose()
         near = float((here[:, 3] - there[:, 3]).norm()) < NEAR * self.around.radius

@@ -20,20 +20,12 @@ from nerf_lightning.viewer.training_switch import TrainingPanel, TrainingSwitch
 from nerf_lightning.visualization.pictures import save_png
 
 LEAST_DEGREES, MOST_DEGREES = 10.0, 120.0
-# The crop box keeps this share of the scene's box along each axis.
-LEAST_SHARE = 0.01
+LEAST_SHARE = 0.01  # The crop box keeps this share of the scene's box along each axis.
 NO_CROP = "Not here: a forward-facing capture has no box of its own. `nerf render crop=...` cuts its films."
 
 
 class Controls:
-    """The panel of one person.
-
-    Args:
-        session: theirs.
-        folder: where snapshots, camera paths and films are written.
-        fov: the vertical field of view that is shown first, in radians.
-        training: what the panel may ask of the training that is shown; None: none is shown.
-    """
+    """The panel of one person, who first sees a vertical field of `fov` (radians); what they save lies in `folder`."""
 
     def __init__(self, session: ViewerClient, folder: Path, fov: float, training: TrainingSwitch | None = None):
         self.session, self.folder, self.training = session, folder, training

@@ -11,11 +11,7 @@ MOST_LETTERS = 5000
 
 
 class ErrorLog:
-    """Log errors that end one drawing or one click, each once and a bounded number: they may come with every picture.
-
-    Args:
-        log: where the lines go.
-    """
+    """Log errors that end one drawing or one click, each once and not too many: they may come with every picture."""
 
     def __init__(self, log: logging.Logger):
         self.log = log

@@ -2,8 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from contextlib import suppress
-from itertools import count
 from pathlib import Path
 
 import torch
@@ -17,12 +15,11 @@ from nerf_lightning.video.settings import FilmSettings
 from nerf_lightning.video.shots import Subject
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.error_log import as_plain_markdown
-from nerf_lightning.viewer.recorded_path import RecordedPath, told
+from nerf_lightning.viewer.recorded_path import RecordedPath, first_free, told
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 
-# What the queue knows the film by: clients count from 0.
-FILM = -1
+FILM = -1  # What the queue knows the film by: clients count from 0.
 LEAST_WIDTH, USUAL_WIDTH, MOST_WIDTH = 32, 640, 1920
 USUAL_RATE, MOST_RATE = 30, 60
 
@@ -30,10 +27,7 @@ USUAL_RATE, MOST_RATE = 30, 60
 class FilmPanel:
     """The panel's part that lets one person film the camera path; in the queue it stands for the film in the making.
 
-    Args:
-        session: theirs; the film goes on when they leave.
-        path: what is filmed.
-        why_not: returns why no film can be made now (one sentence), or None.
+    It goes on when they leave. `why_not` returns why no film can be made now (one sentence), or None.
     """
 
     is_moving = False  # whoever moves a camera waits for less
@@ -101,7 +95,7 @@ class FilmPanel:
             return
         self._folder, self._steps = None, None  # those of the film before stay
         try:
-            self._folder = new_folder(self.path.folder)
+            self._folder = first_free(self.path.folder, "film", "", make_new_folder)
             self._steps = self._film(self._folder, queue.renderer)
         except (InputError, OSError) as error:
             self._fail(error)
@@ -144,8 +138,8 @@ class FilmPanel:
 
     def _send(self) -> None:
         if self.result is not None:
-            name, content = f"{self.result.parent.name}{self.result.suffix}", self.result.read_bytes()
-            self.session.client.send_file_download(name, content, save_immediately=True)
+            name = f"{self.result.parent.name}{self.result.suffix}"
+            self.session.client.send_file_download(name, self.result.read_bytes(), save_immediately=True)
 
 
 def end_film(queue: RenderQueue) -> None:
@@ -154,17 +148,3 @@ def end_film(queue: RenderQueue) -> None:
     if isinstance(film, FilmPanel):
         film.stop()
         film.work(queue.renderer)
-
-
-def new_folder(folder: Path) -> Path:
-    """Make the folder of a film, with the first number that is free.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    for number in count(1):
-        made = folder / f"film_{number:03d}"
-        with suppress(FileExistsError):
-            make_new_folder(made)
-            break
-    return made

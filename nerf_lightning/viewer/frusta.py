@@ -17,21 +17,13 @@ from nerf_lightning.viewer.recorded_path import RecordedPath
 
 ROOT, CAMERAS, BOX, PATH = "/overlay", "/overlay/cameras", "/overlay/crop", "/overlay/path"
 GREY, BLUE, ORANGE = (90, 90, 90), (40, 110, 220), (240, 120, 20)
-# Size of a frustum as a share of the photographs' distance.
-SCALE = 0.03
-# Pieces of the path's line for each of its legs, and in all.
-PIECES, MOST_PIECES = 24, 2000
-# Who stands within this many sizes of a keyframe's camera has its lines all around: they are not drawn.
-INSIDE = 3.0
+SCALE = 0.03  # Size of a frustum as a share of the photographs' distance.
+PIECES, MOST_PIECES = 24, 2000  # Pieces of the path's line for each of its legs, and in all.
+INSIDE = 3.0  # Who stands within this many sizes of a keyframe's camera has its lines all around: they are not drawn.
 
 
 class Frusta:
-    """Draw cameras, the crop box and the path into what one person sees.
-
-    Args:
-        session: of that person.
-        on_click: called with the view whose camera was clicked.
-    """
+    """Draw cameras, the crop box and the path into what one person sees; `on_click` takes a clicked camera's view."""
 
     def __init__(self, session: ViewerClient, on_click: Callable[[int], None]):
         self.session, self.scene = session, session.client.scene
@@ -116,16 +108,7 @@ class Frusta:
         image: UInt8[np.ndarray, "height width 3"] | None = None,
     ) -> Any:
         """Draw a camera as the pyramid that it sees; `fov` is vertical, `aspect` width over height."""
-        return self.scene.add_camera_frustum(
-            name,
-            fov,
-            aspect,
-            scale=self.size,
-            thickness=0.02 * self.size,
-            color=color,
-            image=image,
-            wxyz=quaternion_of(c2w),
-            position=c2w[:, 3].double().numpy(),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        look = {"scale": self.size, "thickness": 0.02 * self.size, "color": color, "image": image}
+        shadows = {"cast_shadow": False, "receive_shadow": False}
+        place = {"wxyz": quaternion_of(c2w), "position": c2w[:, 3].double().numpy()}
+        return self.scene.add_camera_frustum(name, fov, aspect, **look, **shadows, **place)

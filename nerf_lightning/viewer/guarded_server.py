@@ -7,6 +7,7 @@ that, but no argument of viser's reaches there. So while viser starts, it finds 
 import logging
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from functools import partial
 from http import HTTPStatus
 from io import StringIO
 from typing import Any
@@ -38,18 +39,12 @@ unheard.setLevel(logging.CRITICAL + 1)
 
 
 def guarded_server(auth: Auth, host: str, port: int) -> ViserServer:
-    """Start viser's server behind the guard.
-
-    Raises:
-        InputError: this version of viser serves in a way that cannot be guarded.
-    """
+    """Start viser's server behind the guard, unless this version of it serves in a way that cannot be guarded."""
     guarded = []
 
     def guarded_serve(*where: Any, process_request: Callable[..., Response | None], **options: Any) -> serve:
-        def answer(connection: ServerConnection, request: Request) -> Response | None:
-            return _answer(auth, process_request, connection, request)
-
         guarded.append(where)
+        answer = partial(_answer, auth, process_request)
         return serve(*where, process_request=answer, logger=unheard, server_header=None, **options)
 
     websockets_server.serve = guarded_serve  # type: ignore[misc, assignment]

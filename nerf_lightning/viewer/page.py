@@ -5,14 +5,13 @@ import math
 import warnings
 import webbrowser
 from collections.abc import Sequence
-from contextlib import redirect_stdout
-from importlib import import_module
+from contextlib import redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.errors import require_extra
 from nerf_lightning.nerf.geometry.cameras import vertical_field_of_view
 from nerf_lightning.nerf.types.scene import SceneRecord
 from nerf_lightning.video.paths.base import frame_of
@@ -32,18 +31,8 @@ log = logging.getLogger(__name__)
 
 
 def require_viser() -> Any:
-    """Return viser.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return import_module("viser")
-    except ImportError as error:
-        raise InputError(
-            "The viewer needs viser, which is not installed or does not load here "
-            f"({error}). Install it with: pip install 'nerf-lightning[viewer]'"
-        ) from error
+    """Return viser, or say how it is installed."""
+    return require_extra("viser", "viewer", "The viewer")
 
 
 class Page:
@@ -58,9 +47,6 @@ class Page:
         most_height: the finest picture, in pixels.
         hosts: names by which browsers find the page, besides 127.0.0.1, localhost and [::1].
         training: what the page may ask of the training that it shows; None: it shows none.
-
-    Raises:
-        InputError: no viser, or one that cannot be guarded; no place to listen; a host that is none.
     """
 
     def __init__(
@@ -140,10 +126,9 @@ class Page:
 
 def open_in_browser(address: str) -> None:
     """Open a page in the user's browser, or say why not."""
-    try:
+    opened = False
+    with suppress(webbrowser.Error):
         opened = webbrowser.open(address)
-    except webbrowser.Error:
-        opened = False
     if not opened:
         log.warning(
             "There is no browser here to open. Open %s in one yourself; from another machine, first forward the port: "

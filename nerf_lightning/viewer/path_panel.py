@@ -17,18 +17,11 @@ from nerf_lightning.viewer.recorded_path import USUAL_SECONDS, RecordedPath, key
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600.0
 PLAY, STOP = "Play", "Stop"
 NO_FILES, NOTHING = "none yet", "No keyframes yet."
-# Views a second while a path is played: more than coarse pictures come would only queue.
-PER_SECOND = 12
+PER_SECOND = 12  # Views a second while a path is played: more than coarse pictures come would only queue.
 
 
 class PathPanel:
-    """Let one person make a path, look at it and save it.
-
-    Args:
-        session: theirs.
-        path: what they make.
-        frusta: where it is drawn.
-    """
+    """Let one person make a path, look at it and save it; `frusta` draws it."""
 
     def __init__(self, session: ViewerClient, path: RecordedPath, frusta: Frusta):
         self.session, self.path, self.frusta = session, path, frusta
@@ -37,24 +30,19 @@ class PathPanel:
         self._lock = threading.RLock()
         self._playing: threading.Event | None = None
         """Set to end what is played; None: nothing is."""
-        with session.client.gui.add_folder("Camera path", expand_by_default=False):
-            self._add_controls(session.client.gui)
-        self._refresh()
-
-    def _add_controls(self, gui: Any) -> None:
-        add = gui.add_button("Add keyframe", hint="The camera as it is now, after the chosen keyframe")
-        self.number = gui.add_dropdown("Keyframe", ("1",), initial_value="1", visible=False)
-        self.leg = gui.add_number(
-            "Seconds to it", USUAL_SECONDS, min=LEAST_SECONDS, max=MOST_SECONDS, step=0.1, visible=False
-        )
-        self.delete = gui.add_button("Delete keyframe", visible=False)
-        self.line = gui.add_slider("Time", 0.0, 1.0, 0.01, 0.0, visible=False)
-        self.play = gui.add_button(PLAY, visible=False, hint="Go along the path in this page")
-        self.save = gui.add_button("Save as yaml", visible=False)
-        hint = f"The keyframe files in {self.path.folder}: put others there to load them"
-        self.file = gui.add_dropdown("Saved", (NO_FILES,), hint=hint)
-        load = gui.add_button("Load", hint="In place of the keyframes that are here")
-        self.said = gui.add_markdown(NOTHING)
+        gui, seconds = session.client.gui, {"min": LEAST_SECONDS, "max": MOST_SECONDS, "step": 0.1}
+        with gui.add_folder("Camera path", expand_by_default=False):
+            add = gui.add_button("Add keyframe", hint="The camera as it is now, after the chosen keyframe")
+            self.number = gui.add_dropdown("Keyframe", ("1",), initial_value="1", visible=False)
+            self.leg = gui.add_number("Seconds to it", USUAL_SECONDS, **seconds, visible=False)
+            self.delete = gui.add_button("Delete keyframe", visible=False)
+            self.line = gui.add_slider("Time", 0.0, 1.0, 0.01, 0.0, visible=False)
+            self.play = gui.add_button(PLAY, visible=False, hint="Go along the path in this page")
+            self.save = gui.add_button("Save as yaml", visible=False)
+            hint = f"The keyframe files in {self.path.folder}: put others there to load them"
+            self.file = gui.add_dropdown("Saved", (NO_FILES,), hint=hint)
+            load = gui.add_button("Load", hint="In place of the keyframes that are here")
+            self.said = gui.add_markdown(NOTHING)
         add.on_click(self._act(self._add))
         self.number.on_update(self._act(self._choose))
         self.leg.on_update(self._act(self._set_leg))
@@ -63,6 +51,7 @@ class PathPanel:
         self.play.on_click(self._act(self._play))
         self.save.on_click(self._act(self._save))
         load.on_click(self._act(self._load))
+        self._refresh()
 
     def _act(self, act: Callable[[], None]) -> Callable[[Any], None]:
         """Return an act for viser to call: one after the other, and never for what the program has set itself."""

@@ -1,20 +1,19 @@
 """The panel's part for photographs: one is chosen by its picture, looked through, and compared with its render."""
 
-import base64
 import io
 import threading
 from typing import Any
 
 from PIL import Image
 
+from nerf_lightning.files.html import data_address
 from nerf_lightning.viewer.client import ViewerClient
 from nerf_lightning.viewer.error_log import as_plain_markdown, one_line
 from nerf_lightning.viewer.frusta import Frusta
 
 AT_ONCE = 9
 QUALITY = 80
-# Letters of a name below its picture; all of it is said when it is chosen.
-MOST_LETTERS = 40
+MOST_LETTERS = 40  # Letters of a name below its picture; all of it is said when it is chosen.
 BEFORE, AFTER = "Previous", "Next"
 MARK = "nerf-photograph"
 # viser's buttons are one to a row, and a letter high. Browsers that do not know :has show them so.
@@ -35,12 +34,7 @@ NO_PICTURE = "data:image/gif;base64,R0lGODlhAQABAIAAAN7i5gAAACwAAAAAAQABAAACAkQB
 
 
 class PhotographPanel:
-    """Let one person choose a photograph, and compare it.
-
-    Args:
-        session: theirs.
-        frusta: the cameras over the picture; they are hidden while a photograph is compared.
-    """
+    """Let one person choose a photograph, and compare it; meanwhile the cameras over the picture are hidden."""
 
     def __init__(self, session: ViewerClient, frusta: Frusta):
         self.session, self.frusta = session, frusta
@@ -126,7 +120,7 @@ class PhotographPanel:
             return NO_PICTURE
         file = io.BytesIO()
         Image.fromarray(thumbnail.numpy()).save(file, format="JPEG", quality=QUALITY)
-        return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+        return data_address("image/jpeg", file.getvalue())
 
     def _left(self) -> None:
         self.name.visible = self.leave.visible = self.split.visible = False

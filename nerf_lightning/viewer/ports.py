@@ -11,11 +11,7 @@ log = logging.getLogger(__name__)
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the port, or where another program has it the next free one, and say so.
-
-    Raises:
-        InputError: no such address on this machine, a port that is none or not ours to take, or none is free.
-    """
+    """Return the port, or where another program has it the next free one, and say so."""
     require_address(host, port)
     for candidate in range(port, min(port + TRIED, 65_536)):
         try:
@@ -33,11 +29,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def require_address(host: str, port: int) -> None:
-    """Refuse what nobody can listen on, whether it is in use or not.
-
-    Raises:
-        InputError: no address of this machine, or a number that is no port.
-    """
+    """Refuse an address that is not this machine's, and a number that is no port, whether in use or not."""
     if not 1 <= port <= 65_535:
         raise InputError(f"port={port}: give a number from 1 to 65535; 1024 and more need no special rights.")
     try:

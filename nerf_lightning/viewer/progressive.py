@@ -28,11 +28,8 @@ class ProgressiveRendering:
     A finer picture whose wish has changed is dropped between two slices. A coarse one is finished and shown: it is
     small, and somebody who never stops moving would see nothing otherwise.
 
-    Wishes come from other threads than the one that renders; a wish is one reference, so no lock is needed.
-
-    Args:
-        show: takes each finished view, and whether it is the finest.
-        most_height: no picture is higher, in pixels.
+    Wishes come from other threads than the one that renders; a wish is one reference, so no lock is needed. `show`
+    takes each finished view, and whether it is the finest; none is higher than `most_height` pixels.
     """
 
     def __init__(self, show: Callable[[View, CameraState, bool], None], most_height: int = 720):

@@ -1,7 +1,7 @@
 """A camera path that somebody makes of keyframes: added, changed, read from a file, and saved as one."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import accumulate, count, pairwise
@@ -23,12 +23,7 @@ ENDING = ".yaml"
 
 
 class RecordedPath:
-    """Keyframes in order, and how long the camera takes from each to the next.
-
-    Args:
-        around: the capture that they stand in.
-        folder: where files lie, and are written.
-    """
+    """Keyframes in a capture, in order, and how long the camera takes from each to the next; files lie in `folder`."""
 
     def __init__(self, around: PathFrame, folder: Path):
         self.around, self.folder = around, folder
@@ -47,11 +42,7 @@ class RecordedPath:
         return list(accumulate(self.legs[1:], initial=0.0))
 
     def insert(self, number: int, keyframe: Keyframe) -> None:
-        """Put a keyframe at this place of the list.
-
-        Raises:
-            InputError: its picture has no top.
-        """
+        """Put a keyframe at this place of the list, or say that its picture has no top."""
         keyframe_poses([keyframe], self.around)
         self.keyframes.insert(number, keyframe)
         self.legs.insert(number, USUAL_SECONDS)
@@ -66,11 +57,7 @@ class RecordedPath:
         return list(zip(keyframe_poses(self.keyframes, self.around), map(self._vertical, focals), strict=True))
 
     def curve(self) -> KeyframeCurve | None:
-        """Return the curve through the keyframes; None where there are fewer than two.
-
-        Raises:
-            InputError: no curve passes through them.
-        """
+        """Return the curve through the keyframes; None where there are fewer than two."""
         return KeyframeCurve(self.keyframes, self.around, self.times) if len(self.keyframes) > 1 else None
 
     def view_at(self, curve: KeyframeCurve, seconds: float) -> tuple[Float[Tensor, "3 4"], float]:
@@ -87,11 +74,7 @@ class RecordedPath:
             return []
 
     def load(self, name: str) -> None:
-        """Take the keyframes of a file of the folder in place of these.
-
-        Raises:
-            InputError: there is no such file, or it is no path in this capture; the keyframes stay.
-        """
+        """Take the keyframes of a file of the folder in place of these, which stay where it is no path here."""
         if name not in self.files():
             raise InputError(f"There is no keyframe file of this name in {self.folder} any more.")
         keyframes = read_keyframes(self.folder / name)
@@ -105,11 +88,7 @@ class RecordedPath:
         return [replace(each, time=round(time, 3)) for each, time in zip(self.keyframes, self.times, strict=True)]
 
     def save(self) -> Path:
-        """Write a file of a new name, and return where it is.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write a file of a new name, and return where it is."""
         with new_file(self.folder, "camera_path", ENDING) as path:
             write_keyframes(path, self.timed())
         return path
@@ -133,22 +112,25 @@ def keyframe_of(
     return Keyframe(position=eye, look_at=target, up=top, fov=round(degrees, 3))
 
 
+def first_free(folder: Path, stem: str, ending: str, make: Callable[[Path], None]) -> Path:
+    """Make what has the first number in its name that is free, and return where it is."""
+    for number in count(1):
+        path = folder / f"{stem}_{number:03d}{ending}"
+        with suppress(FileExistsError):
+            make(path)
+            break
+    return path
+
+
 @contextmanager
 def new_file(folder: Path, stem: str, ending: str) -> Iterator[Path]:
     """Lend a path with the first number that no file has; names never come from the page.
 
     An empty file keeps the name, so that of several browsers that save at once each has its own; it goes where the
     block fails.
-
-    Raises:
-        OSError: it cannot be made.
     """
     make_folder(folder)
-    for number in count(1):
-        path = folder / f"{stem}_{number:03d}{ending}"
-        with suppress(FileExistsError):
-            path.touch(exist_ok=False)
-            break
+    path = first_free(folder, stem, ending, lambda path: path.touch(exist_ok=False))
     try:
         yield path
     except BaseException:

@@ -4,7 +4,6 @@ import logging
 import signal
 import threading
 import time
-from types import FrameType
 from typing import Protocol, runtime_checkable
 
 from nerf_lightning.viewer.error_log import ErrorLog
@@ -37,11 +36,7 @@ class Turn(Protocol):
 
 
 class RenderQueue:
-    """All rendering, in the thread that calls `work`: the kernels take no second one.
-
-    Args:
-        renderer: renders for everybody.
-    """
+    """All rendering, in the thread that calls `work`: the kernels take no second one."""
 
     def __init__(self, renderer: SlicedRenderer):
         self.renderer = renderer
@@ -109,10 +104,6 @@ class RenderQueue:
 def received_stop_signals() -> list[int]:
     """Return a list that SIGINT and SIGTERM are put into from now on; the slice that is being rendered ends first."""
     received: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handle)
+        signal.signal(number, lambda number, _: received.append(number))
     return received

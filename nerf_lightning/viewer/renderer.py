@@ -18,14 +18,11 @@ from nerf_lightning.nerf.models.render_image import render_rays, view_rays
 from nerf_lightning.nerf.types.scene import Background, Cameras, SceneRecord
 from nerf_lightning.viewer.camera_state import CameraState, camera_of
 
-# How long a slice takes, about: a person may change the wish between two.
-SLICE_SECONDS = 0.08
-# A picture is never smaller than this (pixels high).
-LEAST_HEIGHT = 32
+SLICE_SECONDS = 0.08  # How long a slice takes, about: a person may change the wish between two.
+LEAST_HEIGHT = 32  # A picture is never smaller than this (pixels high).
 FIRST_RAYS = 512
 WARM_UP_HEIGHT = 64
-# How much a new measurement of the speed counts.
-FRESH = 0.4
+FRESH = 0.4  # How much a new measurement of the speed counts.
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,31 +36,24 @@ class View:
     camera: Cameras
 
 
+@dataclass(eq=False)
 class SlicedRenderer:
     """Render looks with a model, and learn how fast that goes.
 
     Args:
         model: in evaluation mode while it renders.
-        scene: what a checkpoint knows of the capture.
-        background: what lies behind.
-        tile_points: most points at once.
         share: of the time that goes by, so much is spent on rendering; 1 where there is nothing else to do.
         moving_seconds: how long a picture may take while the camera moves.
+        rays_per_second: as it was measured last.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        scene: SceneRecord,
-        background: Background,
-        tile_points: int,
-        share: float = 1.0,
-        moving_seconds: float = 0.1,
-    ):
-        self.model, self.scene, self.background = model, scene, background
-        self.tile_points = tile_points
-        self.share, self.moving_seconds = share, moving_seconds
-        self.rays_per_second: float | None = None
+    model: Model
+    scene: SceneRecord
+    background: Background
+    tile_points: int
+    share: float = 1.0
+    moving_seconds: float = 0.1
+    rays_per_second: float | None = None
 
     def height_while_moving(self, look: CameraState) -> int:
         """Return how high a picture can be so that several come in a second."""
@@ -87,7 +77,9 @@ class SlicedRenderer:
             stop = start + self._rays_in_a_slice(total - start)
             began = time.perf_counter()
             parts.append(self._slice(rays_of, slice(start, stop), clip))
-            self._learn(stop - start, time.perf_counter() - began)
+            measured = (stop - start) / max(time.perf_counter() - began, 1e-6)
+            before = measured if self.rays_per_second is None else self.rays_per_second
+            self.rays_per_second = (1 - FRESH) * before + FRESH * measured
             start = stop
             yield
         rgb, depth, opacity = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -96,16 +88,10 @@ class SlicedRenderer:
     def _slice(self, rays_of: RayGenerator, part: slice, clip: Clip | None) -> tuple[Tensor, Tensor, Tensor]:
         rays, straight = view_rays(rays_of, pixels_between(rays_of.cameras, 0, part), clip)
         seen = render_rays(self.model, rays, self.background, self.tile_points)
-        rgb, depth, opacity = seen.rgb, seen.depth, seen.opacity
-        depth = surface_depth(depth, opacity, rays.far)
-        return rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), opacity
+        depth = surface_depth(seen.depth, seen.opacity, rays.far)
+        return seen.rgb, depth if rays_of.ndc is None else world_distance(straight, depth / rays.far), seen.opacity
 
     def _rays_in_a_slice(self, left: int) -> int:
         rays = max(64, int((self.rays_per_second or FIRST_RAYS) * SLICE_SECONDS))
         # No crumb at the end: it would cost as much as a slice.
         return left if left < 1.5 * rays else rays
-
-    def _learn(self, rays: int, seconds: float) -> None:
-        measured = rays / max(seconds, 1e-6)
-        before = self.rays_per_second
-        self.rays_per_second = measured if before is None else (1 - FRESH) * before + FRESH * measured

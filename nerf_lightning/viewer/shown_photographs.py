@@ -11,23 +11,18 @@ from nerf_lightning.nerf.types.scene import Background, Scene, SceneRecord
 from nerf_lightning.visualization.pictures import to_bytes
 
 THUMBNAIL = 96
-# More frusta hide each other, and the page takes long to build.
-MOST_FRUSTA = 150
+MOST_FRUSTA = 150  # More frusta hide each other, and the page takes long to build.
 
 
 class Photographs:
     """What was photographed from the cameras of a checkpoint.
 
-    Args:
-        record: the cameras.
-        scene: the capture as it was read again, whose views are known by their names; None: there are no pictures.
-        background: what lies behind photographs with alpha.
+    `scene` is the capture as it was read again, whose views are known by their names; None: there are no pictures.
     """
 
     def __init__(self, record: SceneRecord, scene: Scene | None, background: Background):
         self.record, self.scene, self.background = record, scene, background
-        names = () if scene is None else scene.view_names
-        self._views = {name: view for view, name in enumerate(names)}
+        self._views = {} if scene is None else {name: view for view, name in enumerate(scene.view_names)}
 
     @property
     def shown(self) -> list[int]:

@@ -5,12 +5,10 @@ from collections.abc import Callable
 
 from nerf_lightning.viewer.client import ViewerClient
 
-# A page that is loaded again is away for a moment; whoever is away for longer has left.
-AWAY_SECONDS = 15.0
+AWAY_SECONDS = 15.0  # A page that is loaded again is away for a moment; whoever is away for longer has left.
 PAUSE, GO_ON = "Pause", "Go on"
 STOP, SURE = "Stop training", "Really stop: press again"
-# How long the second press is waited for.
-SURE_SECONDS = 8.0
+SURE_SECONDS = 8.0  # How long the second press is waited for.
 WHAT_STOP_IS = "The checkpoint is written, and the run evaluated."
 
 
@@ -49,10 +47,7 @@ class TrainingSwitch:
     ) -> float:
         """Do other work until somebody lets the training go on, or nobody is left; return for how many seconds.
 
-        Args:
-            work: a slice of the other work, which takes at least a moment.
-            is_anybody_here: whether somebody could still let it go on.
-            ends: whether it must not wait any longer.
+        Each call of `work` takes at least a moment; `ends` says that the training must not wait any longer.
         """
         began = seen = time.monotonic()
         while self.wants_pause and not ends():

@@ -1,6 +1,6 @@
 """Where the cameras of a capture stand: from above and from the side, and from where the scene was seen."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 COLOURS = {"train": "#2f6db3", "held out": "#e07b39"}
 CONTENT, BOX, GAP = "#8a8f98", "#3c9d6b", "#f3d9d6"
-# Degrees of a cell of the coverage map; it counts as seen within this angle of a camera.
-CELL, NEAR_ENOUGH = 3, 15.0
+CELL, NEAR_ENOUGH = 3, 15.0  # Degrees of a cell of the coverage map; it counts as seen within this angle of a camera.
 MOST_POINTS = 4000
 
 
@@ -56,29 +55,18 @@ def draw_coverage(axes: "Axes", scene: SceneRecord) -> None:
     rows = torch.arange(-90 + CELL / 2, 90, CELL)
     cells = _unit(*torch.meshgrid(columns, rows, indexing="xy"))
     angle = (cells @ _unit(azimuth, elevation).T).clamp(-1, 1).amax(dim=-1).acos().rad2deg()
-    axes.imshow(
-        (angle > NEAR_ENOUGH).numpy(),
-        extent=(-180, 180, -90, 90),
-        origin="lower",
-        cmap=ListedColormap(["#dcebdf", GAP]),
-        vmin=0,
-        vmax=1,
-        aspect="auto",
-        interpolation="nearest",
-    )
+    missing, colors = (angle > NEAR_ENOUGH).numpy(), ListedColormap(["#dcebdf", GAP])
+    placed: dict[str, Any] = {"extent": (-180, 180, -90, 90), "origin": "lower", "aspect": "auto"}
+    axes.imshow(missing, cmap=colors, vmin=0, vmax=1, interpolation="nearest", **placed)
     for split, views in _splits(scene).items():
         at = list(views)
         axes.scatter(azimuth[at].numpy(), elevation[at].numpy(), s=16, color=COLOURS[split], edgecolors="white", lw=0.4)
     axes.axhline(0, color="0.6", linewidth=0.7)
     axes.text(176, 3, "horizon", fontsize=7, color="0.4", ha="right")
-    axes.set_title(
-        f"coverage: green lies within {NEAR_ENOUGH:.0f} degrees of a photograph, red is missing", fontsize=11
-    )
-    axes.set_xlabel("azimuth around the middle (degrees)", fontsize=9)
-    axes.set_ylabel("elevation (degrees)", fontsize=9)
+    title = f"coverage: green lies within {NEAR_ENOUGH:.0f} degrees of a photograph, red is missing"
     axes.set_xticks(range(-180, 181, 45))
     axes.set_yticks(range(-90, 91, 30))
-    _style(axes)
+    _style(axes, title, "azimuth around the middle (degrees)", "elevation (degrees)")
 
 
 def _draw_cameras(
@@ -113,12 +101,8 @@ def _draw_cameras(
     if shown == (0, 2) and scene.space == "ndc":
         axes.invert_yaxis()
     axes.set_aspect("equal", adjustable="box")
-    names = ("x", "y", "z")
-    axes.set_xlabel(f"{names[shown[0]]} (scene units)", fontsize=9)
-    axes.set_ylabel(names[shown[1]], fontsize=9)
-    axes.set_title(title, fontsize=11)
     axes.grid(True, color="0.93", linewidth=0.8, zorder=0)
-    _style(axes)
+    _style(axes, title, f"{'xyz'[shown[0]]} (scene units)", "xyz"[shown[1]])
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
 
 
@@ -145,12 +129,9 @@ def _draw_directions(axes: "Axes", scene: SceneRecord) -> None:
         axes.scatter(x[at].numpy(), y[at].numpy(), s=30, color=COLOURS[split], edgecolors="white", lw=0.5)
     axes.set_aspect("equal", adjustable="box")
     axes.margins(0.2)
-    axes.set_title("coverage: where the cameras stood, seen from behind them", fontsize=11)
-    axes.set_xlabel("x (scene units)", fontsize=9)
-    axes.set_ylabel("y", fontsize=9)
     axes.grid(True, color="0.93", linewidth=0.8)
     axes.set_axisbelow(True)
-    _style(axes)
+    _style(axes, "coverage: where the cameras stood, seen from behind them", "x (scene units)", "y")
 
 
 def _splits(scene: SceneRecord) -> dict[str, list[int]]:
@@ -163,6 +144,9 @@ def _unit(azimuth: Tensor, elevation: Tensor) -> Tensor:
     return torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], dim=-1)
 
 
-def _style(axes: "Axes") -> None:
+def _style(axes: "Axes", title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=11)
+    axes.set_xlabel(x, fontsize=9)
+    axes.set_ylabel(y, fontsize=9)
     axes.tick_params(labelsize=8, color="0.7")
     axes.spines[:].set_color("0.8")

@@ -18,19 +18,16 @@ from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.bands import bands
 
-ENOUGH_PIXELS = 1 << 18
-"""For the range of what is visible."""
-ERROR_SCALE = 0.25
-"""Absolute error that gets the brightest colour: always the same, so that two runs can be compared."""
+ENOUGH_PIXELS = 1 << 18  # For the range of what is visible.
+ERROR_SCALE = 0.25  # Absolute error that gets the brightest colour: always the same, so that two runs can be compared.
 
 LONGEST_PANEL = 1600
 """Pixels along the longer side of a panel of the validation picture, about, at most: a row of four photographs would
 be more than anything shows."""
 
-_PAPER = 255
+PAPER = 255
 _INK = (64, 64, 64)
-_BACKDROP = 0.93
-"""Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far."""
+_BACKDROP = 0.93  # Grey of what no ray hits: no colour of the map is grey, so it reads as neither near nor far.
 
 
 def to_bytes(rgb: Float[Tensor, "*h w c"]) -> UInt8[Tensor, "*h w c"]:
@@ -79,7 +76,7 @@ def side_by_side(pictures: Sequence[UInt8[Tensor, "_ _ 3"]], gap: int = 4) -> UI
     """Return pictures in one row, `gap` white pixels between them; shorter ones stand at the bottom."""
     height = max(picture.shape[0] for picture in pictures)
     width = sum(picture.shape[1] for picture in pictures) + gap * (len(pictures) - 1)
-    row = torch.full((height, width, 3), _PAPER, dtype=torch.uint8)
+    row = torch.full((height, width, 3), PAPER, dtype=torch.uint8)
     left = 0
     for picture in pictures:
         row[height - picture.shape[0] :, left : left + picture.shape[1]] = picture
@@ -155,8 +152,12 @@ def mosaic(named: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> UInt8[Tensor,
     """Return panels in a row, a caption above each; large ones are shrunk (`at_most`)."""
     small = [(name, at_most(panel)) for name, panel in named]
     size = letter_size(small[0][1].shape[0])
-    row = side_by_side([with_caption(panel, name, size) for name, panel in small], gap=size)
-    return torch.nn.functional.pad(row, (0, 0, *(2 * [size // 2]), *(2 * [size // 2])), value=_PAPER)
+    return framed(side_by_side([with_caption(panel, name, size) for name, panel in small], gap=size), size)
+
+
+def framed(picture: UInt8[Tensor, "height width 3"], size: int) -> UInt8[Tensor, "taller wider 3"]:
+    """Return the picture with half of `size` of white around it."""
+    return torch.nn.functional.pad(picture, (0, 0, *(4 * [size // 2])), value=PAPER)
 
 
 def at_most(
@@ -187,10 +188,10 @@ def with_caption(picture: UInt8[Tensor, "height width 3"], text: str, size: int)
     font, text = ImageFont.load_default(size), for_terminal(text)
     height, width, _ = picture.shape
     top = round(1.5 * size)
-    page = Image.new("RGB", (max(width, _length(font, text)), top + height), (_PAPER,) * 3)
+    page = Image.new("RGB", (max(width, round(font.getlength(text) + 0.5)), top + height), (PAPER,) * 3)
     page.paste(Image.fromarray(picture.numpy()), (0, top))
     ImageDraw.Draw(page).text((0, round(1.1 * size)), text, fill=_INK, font=font, anchor="ls")
-    return _as_picture(page)
+    return torch.from_numpy(np.array(page))
 
 
 def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: float) -> UInt8[Tensor, "height wider 3"]:
@@ -200,18 +201,11 @@ def _with_scale(picture: UInt8[Tensor, "height width 3"], top: float, bottom: fl
     font = ImageFont.load_default(size)
     texts = (f"{top:.3g}", f"{bottom:.3g}")
     thick, space = max(4, size // 2), max(3, size // 3)
-    page = Image.new("RGB", (3 * space + thick + max(_length(font, text) for text in texts), height), (_PAPER,) * 3)
+    longest = max(round(font.getlength(text) + 0.5) for text in texts)
+    page = Image.new("RGB", (3 * space + thick + longest, height), (PAPER,) * 3)
     ramp = color_map(torch.linspace(1, 0, height)[:, None].expand(height, thick), 0.0, 1.0)
     page.paste(Image.fromarray(to_bytes(ramp).numpy()), (space, 0))
     draw, left = ImageDraw.Draw(page), 2 * space + thick
     draw.text((left, 0), texts[0], fill=_INK, font=font, anchor="lt")
     draw.text((left, height), texts[1], fill=_INK, font=font, anchor="ls")
-    return torch.cat([picture, _as_picture(page)], dim=1)
-
-
-def _length(font: ImageFont.FreeTypeFont | ImageFont.ImageFont, text: str) -> int:
-    return round(font.getlength(text) + 0.5)
-
-
-def _as_picture(page: Image.Image) -> UInt8[Tensor, "height width 3"]:
-    return torch.from_numpy(np.array(page))
+    return torch.cat([picture, torch.from_numpy(np.array(page))], dim=1)

@@ -1,28 +1,14 @@
 """From a model to bytes in blocks: densities, who sees them, and their colours."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 from numpy import ndarray
-from torch import Tensor
 
 from nerf_lightning.export.baking.baked_field import BakedField, to_bytes_of_density
 from nerf_lightning.export.baking.density import LEAST_OPTICAL, DensityGrid, density_grid, dilated
 from nerf_lightning.export.baking.marcher import STEP
-from nerf_lightning.export.baking.seen_colors import (
-    LOOKS,
-    LOOKS_AROUND,
-    RANGES,
-    TRIES,
-    TRIES_AROUND,
-    camera_views,
-    fitted_colors,
-    in_world,
-    sharpened,
-    to_bytes_of_colors,
-)
+from nerf_lightning.export.baking.seen_colors import RANGES, SeenVoxels, fitted_colors, to_bytes_of_colors, who_sees
 from nerf_lightning.export.density_grid import Report
 from nerf_lightning.export.voxel_kernels.layout import SIDE, any_in_blocks, kernels
 from nerf_lightning.messages.errors import InputError
@@ -38,49 +24,26 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 SHARE_LEFT_OUT = 0.035
 # Rays through the training views that are followed, at most: every other pixel tells as much.
 FOLLOWED_RAYS = 1_000_000
-# A scene that stops so much of their light is one that none comes from behind of.
-CLOSED = 0.98
+CLOSED = 0.98  # A scene that stops so much of their light is one that none comes from behind of.
 # Values at which all but so much of it is stopped are kept, and their neighbours: where the scene is closed, and where
 # what is left out would let the background through.
 LEFT_OUT_OF_CLOSED, LEFT_OUT = 0.01, 0.002
 
 
-@dataclass(frozen=True)
-class SeenVoxels:
-    """Voxels at which light from the scene's things may be stopped, and who sees them."""
-
-    voxels: Int[ndarray, "voxels 3"]
-    world: Float[Tensor, "voxels 3"]
-    """Where they lie in the world."""
-    cameras: Int[ndarray, "voxels looks"]
-    """Numbers of training cameras that see each; -1: no more."""
-    light: Float[ndarray, "voxels looks"]
-    """How much of its light arrives there."""
-
-    def only(self, which: Bool[ndarray, "voxels"]) -> "SeenVoxels":
-        """Return some of them."""
-        world = self.world[torch.from_numpy(which)]
-        return SeenVoxels(self.voxels[which], world, self.cameras[which], self.light[which])
-
-
 def bake(
     model: Model, record: SceneRecord, resolution: int, num_harmonics: int, tile_points: int, report: Report
 ) -> BakedField:
-    """Return what is dense and seen of a model's field.
-
-    Raises:
-        InputError: nothing is, or it does not fit into memory.
-    """
+    """Return what is dense and seen of a model's field."""
     grid = density_grid(model, record, resolution, tile_points, report)
     closed = False
     if grid.contraction is None:
         voxels = np.argwhere(dilated(grid.optical > LEAST_OPTICAL)).astype(np.int32)
-        around = _who_sees(grid, voxels, record, LOOKS[num_harmonics], report)
+        around = who_sees(grid, voxels, record, num_harmonics, report)
         kept = _stopping(grid, around)
     else:
         kept, closed = _lit(grid, record)
         report("lit", 1.0)
-        around = _who_sees(grid, np.argwhere(kept).astype(np.int32), record, LOOKS_AROUND, report)
+        around = who_sees(grid, np.argwhere(kept).astype(np.int32), record, num_harmonics, report)
     if not (kept.any() and (around.cameras[:, 0] >= 0).any()):
         raise InputError(
             f"Nothing of {for_terminal(record.name)} is seen: no training camera looks at what has density. Correct "
@@ -88,33 +51,8 @@ def bake(
         )
     grid.optical[~kept] = 0.0
     colored = around.only((around.cameras[:, 0] >= 0) & kept[tuple(around.voxels.T)])
-    centers = record.cameras.c2w[list(record.splits["train"]), :, 3]
-    seen = (colored.world, colored.cameras, colored.light)
-    fitted = fitted_colors(model, grid.places(colored.voxels), *seen, centers, num_harmonics, tile_points, report)
-    fitted = sharpened(fitted, colored.voxels, grid.optical.shape)
+    fitted = fitted_colors(model, record, grid, colored, num_harmonics, tile_points, report)
     return _in_blocks(grid, colored.voxels, to_bytes_of_colors(fitted).numpy().T, closed)
-
-
-def _who_sees(
-    grid: DensityGrid, voxels: Int[ndarray, "voxels 3"], record: SceneRecord, looks: int, report: Report
-) -> SeenVoxels:
-    """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
-    world = in_world(grid.places(voxels), record)
-    eyes, views = camera_views(record)
-    contraction, spacing = grid.contraction, grid.spacing.numpy()
-    given = (grid.optical, voxels, world.numpy())
-    if contraction is not None:
-        units, eyes_of = contraction.unit(world).numpy(), contraction.unit(torch.from_numpy(eyes[:, :3])).numpy()
-        asked = (units, eyes_of, views, contraction.near / contraction.half)
-        cameras, light = kernels("contracted").seeing_cameras(*given, *asked, looks, TRIES_AROUND)
-    else:
-        in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / spacing, eyes[:, 3:]], axis=1)
-        sides = (spacing / spacing.max()).astype(np.float32)
-        cameras, light = kernels("bounded").seeing_cameras(
-            *given, in_grid.astype(np.float32), views, sides, looks, TRIES
-        )
-    report("seen", 1.0)
-    return SeenVoxels(voxels, world, cameras, light)
 
 
 def _stopping(grid: DensityGrid, around: SeenVoxels) -> Bool[ndarray, "x y z"]:

@@ -15,14 +15,9 @@ from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE
 LEAST_EXPONENT, MOST_EXPONENT = -8.0, 4.0
 """Powers of two between which optical depths per voxel are kept: below is nothing, above is solid."""
 EXPONENT_STEP = (MOST_EXPONENT - LEAST_EXPONENT) / 255.0
-
-LEAST_MET = 0.3
-"""Where no light comes from behind: rays that meet less than this do not end in the scene."""
-
-NO_CHANGE = 128
-"""The byte of a coefficient that is nothing."""
-LEVEL = 6
-"""Of gzip; higher ones take many times as long, for one part in a hundred."""
+LEAST_MET = 0.3  # Where no light comes from behind: rays that meet less than this do not end in the scene.
+NO_CHANGE = 128  # The byte of a coefficient that is nothing.
+LEVEL = 6  # Of gzip; higher ones take many times as long, for one part in a hundred.
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,9 @@ from torch import Tensor
 
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# Blocks have to end where the inner cube does, at a quarter of the grid.
-EVEN = 16
-# Of the voxels that a scene in a box would have along its side: as many again lie around it.
-SHARE = 0.75
-EDGE = 1e-4
-"""Rounding, in places of the cube."""
+EVEN = 16  # Blocks have to end where the inner cube does, at a quarter of the grid.
+SHARE = 0.75  # Of the voxels that a scene in a box would have along its side: as many again lie around it.
+EDGE = 1e-4  # Rounding, in places of the cube.
 
 
 @dataclass(frozen=True)

@@ -19,18 +19,13 @@ from nerf_lightning.nerf.models.base import Model, point_field
 from nerf_lightning.nerf.models.tiles import tiles
 from nerf_lightning.nerf.types.scene import SceneRecord
 
-# Cells along the longest side of the first look.
-FIRST = 96
-# The second look is at every fourth voxel.
-STRIDE = 4
-# Of voxels in normalised device coordinates, in sides of a pixel.
-DEEPEST = 4.0
-# A voxel that stops less of the light holds nothing.
-LEAST_OPTICAL = 0.01
+FIRST = 96  # Cells along the longest side of the first look.
+STRIDE = 4  # The second look is at every fourth voxel.
+DEEPEST = 4.0  # Of voxels in normalised device coordinates, in sides of a pixel.
+LEAST_OPTICAL = 0.01  # A voxel that stops less of the light holds nothing.
 # The optical depths and three masks; and about a hundred bytes for each voxel near a surface, of which there are few.
 BYTES_PER_VOXEL = 20
-# Without bounds the light that is stopped, too: of each half of the rays, together, and in order.
-MORE_BYTES = 16
+MORE_BYTES = 16  # Without bounds the light that is stopped, too: of each half of the rays, together, and in order.
 
 
 @dataclass(frozen=True)
@@ -63,11 +58,7 @@ class DensityGrid:
 
 
 def density_grid(model: Model, record: SceneRecord, resolution: int, tile_points: int, report: Report) -> DensityGrid:
-    """Return the densities over what there is in a scene's box, `resolution` voxels along its longest side.
-
-    Raises:
-        InputError: there is nothing, or the grid does not fit into memory.
-    """
+    """Return the densities over what there is in a scene's box, `resolution` voxels along its longest side."""
     contraction = Contraction.of(record) if record.space == "contracted" else None
     box = None if contraction is not None else _box_of_content(model, record, tile_points, report)
 
@@ -147,11 +138,7 @@ def _fill(model: Model, grid: DensityGrid, tile_points: int, report: Report) -> 
 
 
 def _asked(
-    model: Model,
-    grid: DensityGrid,
-    voxels: Int[ndarray, "voxels 3"],
-    tile_points: int,
-    report: Report | None = None,
+    model: Model, grid: DensityGrid, voxels: Int[ndarray, "voxels 3"], tile_points: int, report: Report | None = None
 ) -> Float[ndarray, "voxels"]:
     device = next(model.parameters()).device
     optical = np.empty(len(voxels), np.float32)

@@ -24,15 +24,11 @@ from nerf_lightning.nerf.randomness import RayRandom, fold
 from nerf_lightning.nerf.rendering.blending import background_colors, blend
 from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 
-RAYS = 8192
-"""Of one step."""
-# Bytes by which Adam moves a value in the first step, and in the last.
-RATE, LAST_RATE = 2.0, 0.3
+RAYS = 8192  # Of one step.
+RATE, LAST_RATE = 2.0, 0.3  # Bytes by which Adam moves a value in the first step, and in the last.
 BETAS, EPS = (0.8, 0.95), 1e-6
-# Each step's pixels lie between those of the steps before it.
-GOLDEN = 0.6180339887
-# The values, their moments, the gradient of either half of the rays; each of four bytes.
-BYTES_PER_VALUE = 20
+GOLDEN = 0.6180339887  # Each step's pixels lie between those of the steps before it.
+BYTES_PER_VALUE = 20  # The values, their moments, the gradient of either half of the rays; each of four bytes.
 
 
 def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, report: Report) -> BakedField:
@@ -40,17 +36,8 @@ def fitted(baked: BakedField, scene: Scene, record: SceneRecord, steps: int, rep
 
     Each step marches some rays through the bytes as they are (`Marcher`: what is shown is what is fitted), and moves
     numbers, of which the bytes are the nearest, against the gradient (straight-through, arXiv 1308.3432). Which
-    voxels have a colour stays as it was, and so do the densities of all others.
-
-    Args:
-        baked: the field.
-        scene: the photographs, in the frame of the model.
-        record: what it was trained on; to nothing else it is fitted.
-        steps: how many; 0 leaves the field as it is.
-        report: told how much is done.
-
-    Raises:
-        InputError: the gradients do not fit into memory.
+    voxels have a colour stays as it was, and so do the densities of all others. The photographs are in the frame of
+    the model; to those that it was not trained on, by its record, nothing is fitted.
     """
     known = {record.view_names[view] for view in record.splits["train"]}
     views = [view for view in scene.splits["train"] if scene.view_names[view] in known]

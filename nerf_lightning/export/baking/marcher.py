@@ -14,8 +14,7 @@ from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.types.rays import RayBundle
 
-STEP = 0.5
-"""Voxels between two samples."""
+STEP = 0.5  # Voxels between two samples.
 
 
 @dataclass(frozen=True)

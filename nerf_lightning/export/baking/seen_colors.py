@@ -1,17 +1,19 @@
 """The colours of voxels as spherical harmonics, fitted to what the field says in the directions they are seen from."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional
 
 from nerf_lightning.export.baking.baked_field import NO_CHANGE
+from nerf_lightning.export.baking.density import DensityGrid
 from nerf_lightning.export.density_grid import Report
+from nerf_lightning.export.voxel_kernels.layout import kernels
 from nerf_lightning.nerf.encoders.spherical_harmonics import DEGREE_1, SphericalHarmonicsEncoder
 from nerf_lightning.nerf.geometry.cameras import coarse_pixels, rays_through_pixels
 from nerf_lightning.nerf.models.base import Model, point_field
@@ -23,21 +25,54 @@ from nerf_lightning.nerf.types.scene import SceneRecord
 LOOKS, TRIES = {1: 4, 4: 10, 9: 12}, 48
 # Without bounds, where most voxels lie behind walls and all are asked in vain, and where more looks change little.
 TRIES_AROUND, LOOKS_AROUND = 24, 4
-# What holds back coefficients of degree 1 and 2, as a share of a voxel's light.
-RIDGE = 0.02
-# Half range of the bytes of coefficients, of degree 1 and of degree 2.
-RANGES = (0.6, 0.6)
+RIDGE = 0.02  # What holds back coefficients of degree 1 and 2, as a share of a voxel's light.
+RANGES = (0.6, 0.6)  # Half range of the bytes of coefficients, of degree 1 and of degree 2.
 # Their bytes are multiples of this: such small changes are not seen, and few different bytes are packed well.
 COARSE = 8
-# The part of a view's cone that a grid of pixels over it may miss.
-MARGIN = 0.02
-# How much more colours differ from their neighbours' than the field's.
-SHARPER = 0.5
-# In normalised device coordinates, from the far end.
-LEAST_DISPARITY = 1e-3
+MARGIN = 0.02  # The part of a view's cone that a grid of pixels over it may miss.
+SHARPER = 0.5  # How much more colours differ from their neighbours' than the field's.
+LEAST_DISPARITY = 1e-3  # In normalised device coordinates, from the far end.
 
 
-def camera_views(record: SceneRecord) -> tuple[Float[ndarray, "cameras 4"], Float[ndarray, "cameras 7"]]:
+@dataclass(frozen=True)
+class SeenVoxels:
+    """Voxels at which light from the scene's things may be stopped, and who sees them."""
+
+    voxels: Int[ndarray, "voxels 3"]
+    world: Float[Tensor, "voxels 3"]
+    """Where they lie in the world."""
+    cameras: Int[ndarray, "voxels looks"]
+    """Numbers of training cameras that see each; -1: no more."""
+    light: Float[ndarray, "voxels looks"]
+    """How much of its light arrives there."""
+
+    def only(self, which: Bool[ndarray, "voxels"]) -> "SeenVoxels":
+        """Return some of them."""
+        world = self.world[torch.from_numpy(which)]
+        return SeenVoxels(self.voxels[which], world, self.cameras[which], self.light[which])
+
+
+def who_sees(
+    grid: DensityGrid, voxels: Int[ndarray, "voxels 3"], record: SceneRecord, num_harmonics: int, report: Report
+) -> SeenVoxels:
+    """Ask which cameras see what is dense, and the air next to it, whose colours are mixed in."""
+    world = _in_world(grid.places(voxels), record)
+    eyes, views = _camera_views(record)
+    contraction, spacing = grid.contraction, grid.spacing.numpy()
+    given = (grid.optical, voxels, world.numpy())
+    if contraction is not None:
+        units, eyes_of = contraction.unit(world).numpy(), contraction.unit(torch.from_numpy(eyes[:, :3])).numpy()
+        asked = (units, eyes_of, views, contraction.near / contraction.half, LOOKS_AROUND, TRIES_AROUND)
+        cameras, light = kernels("contracted").seeing_cameras(*given, *asked)
+    else:
+        in_grid = np.concatenate([(eyes[:, :3] - eyes[:, 3:] * grid.lower.numpy()) / spacing, eyes[:, 3:]], axis=1)
+        seen_in = (in_grid.astype(np.float32), views, (spacing / spacing.max()).astype(np.float32))
+        cameras, light = kernels("bounded").seeing_cameras(*given, *seen_in, LOOKS[num_harmonics], TRIES)
+    report("seen", 1.0)
+    return SeenVoxels(voxels, world, cameras, light)
+
+
+def _camera_views(record: SceneRecord) -> tuple[Float[ndarray, "cameras 4"], Float[ndarray, "cameras 7"]]:
     """Return where the training cameras are in the field's space, homogeneous, and their cones in the world.
 
     A cone is a centre, an axis and the cosine of the widest angle. The way from a place p to a camera is xyz - w p:
@@ -57,7 +92,7 @@ def camera_views(record: SceneRecord) -> tuple[Float[ndarray, "cameras 4"], Floa
     return eyes.float().numpy(), torch.cat([centers, axis, cosine], dim=1).float().numpy()
 
 
-def in_world(places: Float[Tensor, "voxels 3"], record: SceneRecord) -> Float[Tensor, "voxels 3"]:
+def _in_world(places: Float[Tensor, "voxels 3"], record: SceneRecord) -> Float[Tensor, "voxels 3"]:
     """Return where places of the field's space lie in the world; what is at infinity, far away."""
     if record.cameras.ndc is None:
         return places
@@ -67,41 +102,30 @@ def in_world(places: Float[Tensor, "voxels 3"], record: SceneRecord) -> Float[Te
 
 def fitted_colors(
     model: Model,
-    places: Float[Tensor, "voxels 3"],
-    world: Float[Tensor, "voxels 3"],
-    cameras: Int[ndarray, "voxels looks"],
-    light: Float[ndarray, "voxels looks"],
-    centers: Float[Tensor, "cameras 3"],
+    record: SceneRecord,
+    grid: DensityGrid,
+    seen: SeenVoxels,
     num_harmonics: int,
     tile_points: int,
     report: Report,
 ) -> Float[Tensor, "voxels harmonics 3"]:
-    """Return the coefficients that fit the field's colours best, weighted by the light that arrives.
+    """Return the coefficients (1, 4 or 9) that fit the last level's colours best, weighted by the light that arrives.
 
-    min_c sum_k w_k |Y(d_k) c - rgb(d_k)|^2 + ridge |c_{l > 0}|^2 sum_k w_k, for each voxel and channel.
-
-    Args:
-        model: its last level is asked.
-        places: of the voxels, in the field's space.
-        world: and in the world, where directions are those of cameras.
-        cameras: numbers of some that see each; -1: no more.
-        light: how much arrives there.
-        centers: where the cameras stand, in the world.
-        num_harmonics: 1, 4 or 9.
-        tile_points: most points at once.
-        report: told how much is done.
+    min_c sum_k w_k |Y(d_k) c - rgb(d_k)|^2 + ridge |c_{l > 0}|^2 sum_k w_k, for each voxel and channel; then
+    `sharpened`.
     """
     device = next(model.parameters()).device
     harmonics = SphericalHarmonicsEncoder(math.isqrt(num_harmonics))
-    looks = cameras.shape[1]
+    places, centers = grid.places(seen.voxels), record.cameras.c2w[list(record.splits["train"]), :, 3]
+    looks = seen.cameras.shape[1]
     ridge = RIDGE * torch.eye(num_harmonics)
     ridge[0, 0] = 1e-6
     fitted = torch.empty(len(places), num_harmonics, 3)
     for part in tiles(len(places), max(1, tile_points // looks)):
-        chosen = torch.from_numpy(cameras[part]).long()
-        weight = torch.from_numpy(light[part]) * (chosen >= 0)
+        chosen = torch.from_numpy(seen.cameras[part]).long()
+        weight = torch.from_numpy(seen.light[part]) * (chosen >= 0)
         at = places[part, None].expand(-1, looks, -1)
-        directions = functional.normalize(world[part, None] - centers[chosen], dim=-1)
+        directions = functional.normalize(seen.world[part, None] - centers[chosen], dim=-1)
         asked = (chosen >= 0).flatten()
         points = Points(at.flatten(0, 1)[asked].to(device), directions.flatten(0, 1)[asked].to(device))
         rgb = torch.zeros(len(asked), 3)
@@ -111,7 +135,7 @@ def fitted_colors(
         left = weighted @ basis + ridge * weight.sum(dim=1)[:, None, None]
         fitted[part] = torch.linalg.solve(left, weighted @ rgb.view(*chosen.shape, 3))
         report("colours", part.stop / len(places))
-    return fitted
+    return sharpened(fitted, seen.voxels, grid.optical.shape)
 
 
 def sharpened(

@@ -13,10 +13,8 @@ from numpy import ndarray
 from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import over_rows
 
-OPAQUE_DEPTH = np.float32(6.0)
-"""A way as opaque as this lets nothing through."""
-LEAST_LIGHT = np.float32(0.005)
-"""A camera sees a voxel from which so much of its light arrives."""
+OPAQUE_DEPTH = np.float32(6.0)  # A way as opaque as this lets nothing through.
+LEAST_LIGHT = np.float32(0.005)  # A camera sees a voxel from which so much of its light arrives.
 LEAST_ALPHA, LEAST_TRANSMITTANCE = np.float32(0.002), np.float32(0.004)
 SAMPLE, MOST_SAMPLES = 8, 2760
 """Numbers of one; after so many of the least opacity no light is left: log(0.004) / log(1 - 0.002)."""

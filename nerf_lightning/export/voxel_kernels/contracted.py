@@ -34,12 +34,9 @@ from nerf_lightning.export.voxel_kernels.layout import SIDE, TILE, any_in_blocks
 from nerf_lightning.nerf.kernels.threads import in_parallel, over_rows
 
 MOST_STEPS = 4096
-FARTHEST = np.float32(1e4)
-"""Halves of the inner cube: beyond, places in the grid are no longer told apart."""
-INTO_NEXT = np.float32(0.01)
-"""Voxels beyond the end of an empty block, so that the next one is found."""
-LEAST_STOPPED = np.float32(1e-4)
-"""Less of a ray's light is not worth noting."""
+FARTHEST = np.float32(1e4)  # Halves of the inner cube: beyond, places in the grid are no longer told apart.
+INTO_NEXT = np.float32(0.01)  # Voxels beyond the end of an empty block, so that the next one is found.
+LEAST_STOPPED = np.float32(1e-4)  # Less of a ray's light is not worth noting.
 TWO, NEVER = np.float32(2.0), np.float32(-1.0)
 
 
@@ -54,18 +51,9 @@ def seeing_cameras(
     most: int,
     tries: int,
 ) -> tuple[Int[ndarray, "voxels most"], Float[ndarray, "voxels most"]]:
-    """Return some of the cameras that see each voxel (-1: no more), and how much of its light arrives there.
+    """Return what `bounded.seeing_cameras` does; `places` are in the world, `units` and `eyes` in u.
 
-    Args:
-        optical: optical depth of each voxel.
-        voxels: the numbers of those that are asked about.
-        places: where they lie in the world.
-        units: and in u.
-        eyes: where the cameras are, in u.
-        views: a camera's centre and unit axis in the world, and the cosine of the widest angle that it sees.
-        near: nothing is so close to a camera, in u.
-        most: cameras for each voxel.
-        tries: so many are asked, other ones for each voxel.
+    Nothing is as close to a camera as `near`, in u.
     """
     cameras = np.full((len(voxels), most), -1, np.int32)
     light = np.zeros((len(voxels), most), np.float32)
@@ -132,12 +120,7 @@ def stopped_light(
 ) -> Float[ndarray, "x y z"]:
     """Return how much of the light of rays is stopped at each value, shared out among the eight around a sample.
 
-    Args:
-        optical: optical depth of each voxel.
-        origins: in u.
-        directions: unit.
-        near: distance at which rays begin, in u.
-        step: voxels between samples.
+    Rays have unit directions and begin at `near`; it and `origins` are in u, and `step` voxels lie between samples.
     """
     filled = any_in_blocks(_with_border(optical > 0), SIDE)
     given = (np.float32(near), np.float32(step))
@@ -248,19 +231,7 @@ def march_tiles(
     step: float,
     near: float,
 ) -> Float[ndarray, "rays 7"]:
-    """Return what `bounded.march_tiles` does, distances in u.
-
-    Args:
-        origins: in u.
-        directions: unit.
-        looks: spherical harmonics of the direction in the world.
-        index: the number of each block's tile, -1 where it is empty.
-        density: bytes.
-        colors: bytes, three for each harmonic.
-        scale: the exponents of density 0 and of one more, and the half range of each degree's coefficients.
-        step: voxels between samples.
-        near: distance at which rays begin, in u.
-    """
+    """Return what `bounded.march_tiles` does; origins, distances, and `near`, where rays begin, are in u."""
     out = np.zeros((len(origins), 7), np.float32)
     arrays = (origins, directions, looks, index, density, colors, scale, np.float32(step), np.float32(near), out)
     over_rows(_march, len(origins), *arrays)

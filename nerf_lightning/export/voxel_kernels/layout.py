@@ -11,8 +11,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.kernels.backends import backend, why_not
 
 ROOM = "nerf_lightning.export.voxel_kernels"
-SIDE = 8
-"""Values along a side of a block."""
+SIDE = 8  # Values along a side of a block.
 TILE = SIDE + 1
 """And with the border that the next blocks lend, so that every place of a block lies between values of its tile."""
 
@@ -48,11 +47,7 @@ class Wanted:
 
 
 def kernels(module: str, asked_by: str = "Baking", cure: str = "Reinstall numba.") -> ModuleType:
-    """Return a module of this folder; without these kernels the work would take hours.
-
-    Raises:
-        InputError: they cannot be compiled here.
-    """
+    """Return a module of this folder, which must compile here: without these kernels the work would take hours."""
     name = f"{ROOM}.{module}"
     found = backend(name)
     if found is None:

@@ -13,9 +13,7 @@ def covered_texels(
 ) -> tuple[Int[ndarray, "size size"], Float[ndarray, "size size 3"]]:
     """Return the number of the face that covers each texel's centre (-1: none), and the shares of its corners there.
 
-    Args:
-        corners: x to the right and y down, in texels from the upper left corner of the picture.
-        size: of the picture.
+    `corners` are x to the right and y down, in texels from the upper left corner of the picture.
     """
     face, shares = np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
     _cover(corners.astype(np.float32), face, shares)

@@ -16,18 +16,12 @@ from nerf_lightning.video.paths.keyframes import Keyframe, Point
 
 MOST = 24
 """Keyframes that stand for a path which has none of its own: on a circle, the curve through them is one to 1e-4."""
-NEAREST_TARGET = 0.1
-"""What a camera looks at is ahead of it by this share of the scene's radius at least."""
-# A path whose last camera is so near its first one, in steps of its first frame, goes on in a circle.
-CLOSED = 1.5
+NEAREST_TARGET = 0.1  # What a camera looks at is ahead of it by this share of the scene's radius at least.
+CLOSED = 1.5  # A path whose last camera is so near its first one, in steps of its first frame, goes on in a circle.
 
 
 def as_keyframes(path: CameraPath, around: PathFrame) -> list[Keyframe]:
-    """Return keyframes, each with all that a camera needs, through which a curve follows a path; of one camera, none.
-
-    Raises:
-        InputError: the path cannot be laid around this capture.
-    """
+    """Return keyframes, each with all that a camera needs, whose curve follows a path; of one camera, none."""
     if isinstance(path, KeyframePath):
         return _of_file(path, around) if path.times or path.seconds else []
     cameras = path.cameras(around)

@@ -11,8 +11,7 @@ from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting
 from nerf_lightning.video.paths.spiral import Spiral
 from nerf_lightning.video.paths.sweep import Sweep
 
-FACING = 0.7
-"""Least cosine between where most photographs look and the centre."""
+FACING = 0.7  # Least cosine between where most photographs look and the centre.
 
 
 @final

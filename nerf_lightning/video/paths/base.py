@@ -22,10 +22,8 @@ from nerf_lightning.nerf.geometry.poses import is_rigid
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
 
-# What a camera in front of a scene looks at, in units of the near plane's distance.
-NDC_FOCUS = 5.0
-# Larger numbers overflow when they are squared.
-LARGEST = 1e15
+NDC_FOCUS = 5.0  # What a camera in front of a scene looks at, in units of the near plane's distance.
+LARGEST = 1e15  # Larger numbers overflow when they are squared.
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,7 @@ class PathFrame:
     def point(
         self, name: str, given: Sequence[int | float] | None, otherwise: Float[Tensor, "3"] | None = None
     ) -> Float[Tensor, "3"]:
-        """Return a point that the user gave, in scene coordinates; where none was given, another (the centre).
-
-        Raises:
-            InputError: it is not three finite numbers; `name` is the setting.
-        """
+        """Return a point that the user gave as setting `name`, in scene coordinates; None: another (the centre)."""
         if given is None:
             return self.center if otherwise is None else otherwise
         check_setting(name, given, is_point(given), "three finite numbers, [x, y, z], in the capture's own frame")
@@ -79,9 +73,7 @@ class PathFrame:
     def size(self, width: int | None, height: int | None) -> tuple[int, int, float]:
         """Return a picture's width, height, and how much longer its focal length is in pixels.
 
-        Args:
-            width: in pixels; None: it follows the height, or is the frame's own.
-            height: in pixels; None: it follows the width, or is the frame's own.
+        A side that is None follows the other; where both are, they are the frame's own.
         """
         if width is None and height is not None:
             scale = height / self.height
@@ -106,31 +98,28 @@ def is_number(given: object) -> bool:
 
 
 def check_setting(name: str, value: object, good: bool, rule: str) -> None:
-    """Refuse a setting of a path.
-
-    Raises:
-        InputError: it is not good.
-    """
+    """Refuse a setting of a path that is not good."""
     if not good:
         raise InputError(f"path.{name} is {value}, but must be {rule}")
 
 
 def check_turns(turns: float, start: float = 0.0) -> None:
-    """Refuse a number of circles, or the angle in degrees at which they begin.
-
-    Raises:
-        InputError: one of them is not good.
-    """
+    """Refuse a number of circles, or the angle in degrees at which they begin, that is not good."""
     check_setting("turns", turns, math.isfinite(turns) and turns != 0, "a finite number of circles, not 0")
     check_setting("start", start, math.isfinite(start), "a finite angle in degrees")
 
 
 @disable_autocast
-def horizontal(up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Return where azimuth 0 lies: the x axis brought to the horizon, or the y axis where x is nearly up."""
+def level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return the unit vectors up, where azimuth 0 lies, and where 90 degrees do.
+
+    Azimuth 0 is the x axis brought to the horizon, or the y axis where x is nearly up.
+    """
+    up = normalize(up, dim=0)
     axis = torch.zeros_like(up)
     axis[0 if abs(float(up[0])) < 0.9 else 1] = 1.0
-    return normalize(axis - (axis @ up) * up, dim=0)
+    east = normalize(axis - (axis @ up) * up, dim=0)
+    return up, east, torch.linalg.cross(up, east)
 
 
 @dataclass
@@ -143,9 +132,6 @@ class CameraPath(ABC):
         height: picture's height in pixels; None: it follows the width, or is the photographs'.
         fov: degrees that the picture's width takes in; None: as the photographs.
         fps: frames per second at which the path is meant to be played.
-
-    Raises:
-        InputError: a number out of its range.
     """
 
     num_frames: int = 120
@@ -171,17 +157,12 @@ class CameraPath(ABC):
         """Return one camera per frame, all of one size, in order of time."""
 
     def pinholes(self, c2w: Float[Tensor, "frames 3 4"], around: PathFrame) -> Cameras:
-        """Return cameras at these poses. A picture of another size keeps the horizontal field of view.
-
-        Raises:
-            InputError: a camera looks straight up or down, or stands where it looks: its picture has no up.
-        """
+        """Return cameras at these poses. A picture of another size keeps the horizontal field of view."""
         lost = (~is_rigid(c2w)).nonzero().flatten().tolist()
         if lost:
             raise InputError(
                 f"The camera of frame {lost[0]} of the path looks along its own up axis, or at the very point where it "
-                f"stands ({len(lost)} of {len(c2w)} frames do), so its picture has no top. Move the camera, or what "
-                "it looks at, or give another up."
+                f"stands ({len(lost)} of {len(c2w)} frames do), so its picture has no top. Move it, or give another up."
             )
         width, height, scale = around.size(self.width, self.height)
         focal = around.focal * scale if self.fov is None else focal_from_fov(width, math.radians(self.fov))

@@ -8,16 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.frames import focus_point
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
-from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, level_axes
 
-# So finely the ellipse is measured, to go around it at one speed.
-STEPS = 2048
+STEPS = 2048  # So finely the ellipse is measured, to go around it at one speed.
 
 
 @final
@@ -53,9 +51,8 @@ class Ellipse(CameraPath):
         """Return the cameras of the ellipse."""
         focus = focus_point(around.poses)
         target = around.point("target", self.target, focus)
-        up = normalize(around.up, dim=0)
-        east = horizontal(up)
-        level = torch.stack([east, torch.linalg.cross(up, east)])
+        up, *flat_axes = level_axes(around.up)
+        level = torch.stack(flat_axes)
         offsets = around.poses[:, :, 3] - focus
         axes = _axes(offsets @ level.mT)
         reach = self.scale * torch.quantile((offsets @ level.mT @ axes).abs(), 0.9, dim=0)

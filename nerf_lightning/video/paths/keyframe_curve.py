@@ -15,15 +15,11 @@ from nerf_lightning.video.paths.base import PathFrame
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.video.paths.spline import along, even_speed, poses_along
 
-# Of the angle between where a keyframe looks and its up: less is rounding.
-LEAST_SINE = 1e-6
+LEAST_SINE = 1e-6  # Of the angle between where a keyframe looks and its up: less is rounding.
 
 
 class KeyframeCurve:
-    """Pass through keyframes (`video.paths.spline`).
-
-    Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
-    stays in the middle.
+    """Pass through keyframes (`video.paths.spline`), as `KeyframePath` says.
 
     Args:
         keyframes: two or more.
@@ -31,9 +27,6 @@ class KeyframeCurve:
         times: when each is passed, and for a closed curve when the first one is again (seconds); empty: at about one
             speed, from 0 to 1.
         closed: go back to the first keyframe.
-
-    Raises:
-        InputError: a keyframe that looks straight along its up.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], around: PathFrame, times: Sequence[float], closed: bool = False):
@@ -57,26 +50,18 @@ class KeyframeCurve:
         return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
 
     def focal(self, at: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
-        """Return the focal lengths at some times, between keyframes even in ratio (pixels, of the photographs' width).
-
-        Raises:
-            InputError: the curve leaves all that is a focal length.
-        """
+        """Return the focal lengths at times (pixels, of the photographs' width), even in ratio between keyframes."""
         focal = along(self.knots, self._log_focal, at).exp()[:, 0].float()
         if not bool(((focal > 0) & torch.isfinite(focal)).all()):
             raise InputError(
-                "path.file: the curve through the keyframes' fields of view swings beyond all cameras, since their "
-                "times are very uneven. Give times that are more alike, or leave them out."
+                "path.file: the curve through the keyframes' fields of view swings beyond all cameras. Give times that "
+                "are more even, or leave them out."
             )
         return focal
 
 
 def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Tensor, "keys 3 4"]:
-    """Return the cameras to world of keyframes.
-
-    Raises:
-        InputError: one of them looks straight along its up.
-    """
+    """Return the cameras to world of keyframes, none of which may look straight along its up."""
     poses = [torch.zeros(0, 3, 4).to(around.center)]
     for number, each in enumerate(keyframes, start=1):
         eye = around.point("file", each.position)
@@ -84,8 +69,7 @@ def keyframe_poses(keyframes: Sequence[Keyframe], around: PathFrame) -> Float[Te
         ahead = around.direction(each.ahead)
         if float(torch.linalg.cross(ahead, up).norm()) < LEAST_SINE:
             raise InputError(
-                f"path.file: keyframe {number} looks straight along its up, so its picture has no top. Give it another "
-                "`up`, for instance one that is horizontal."
+                f"path.file: keyframe {number} looks straight along its up, so its picture has no top. Give it another."
             )
         poses.append(look_at(eye, eye + ahead, up)[None])
     return torch.cat(poses)

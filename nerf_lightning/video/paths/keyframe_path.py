@@ -18,7 +18,7 @@ FRAMES_WITHOUT_TIMES = 120
 
 @final
 class KeyframePath(CameraPath):
-    """Go through the keyframes of a file (`geometry.paths.keyframes`) on a smooth curve.
+    """Go through the keyframes of a file (`video.paths.keyframes`) on a smooth curve.
 
     Where all of them have a look_at, what the camera looks at moves on such a curve too, so one point that they share
     stays in the middle.
@@ -31,9 +31,6 @@ class KeyframePath(CameraPath):
         height: picture's height in pixels; None: it follows the width, or is the photographs'.
         fov: degrees that the picture's width takes in, for all frames; None: as the keyframes, else as the photographs.
         fps: frames per second.
-
-    Raises:
-        InputError: a number out of its range, or a file that is no keyframe file.
     """
 
     def __init__(
@@ -50,8 +47,12 @@ class KeyframePath(CameraPath):
         self.asked_frames, self.closed = num_frames, closed
         self.keyframes = read_keyframes(Path(file).expanduser())
         self.times = _times(self.keyframes, closed)
-        if num_frames is None:
-            self._check_length(file)
+        if num_frames is None and self._count() > limits().film_frames:
+            raise InputError(
+                f"{file}: the times of its keyframes last {self.times[-1]:,.6g} seconds, which makes {self._count():,} "
+                f"frames at path.fps={self.fps}, more than {limits().film_frames:,}. Give times in seconds, or "
+                "path.num_frames."
+            )
 
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras between the keyframes."""
@@ -74,14 +75,6 @@ class KeyframePath(CameraPath):
         if not self.times:
             return FRAMES_WITHOUT_TIMES
         return max(1, round(self.times[-1] * self.fps) + (not self.closed))
-
-    def _check_length(self, file: str) -> None:
-        if self._count() > limits().film_frames:
-            raise InputError(
-                f"{file}: the times of its keyframes last {self.times[-1]:,.6g} seconds, which makes {self._count():,} "
-                f"frames at path.fps={self.fps}; more than {limits().film_frames:,} are not taken from times. "
-                "Give them in seconds, or the number of frames with path.num_frames."
-            )
 
 
 def _times(keyframes: Sequence[Keyframe], closed: bool) -> list[float]:

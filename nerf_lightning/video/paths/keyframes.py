@@ -63,19 +63,15 @@ def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
 
 
 def read_keyframes(path: Path) -> list[Keyframe]:
-    """Read a keyframe file.
-
-    Raises:
-        InputError: it cannot be read, is not yaml, has fewer than two keyframes, or one that is no camera.
-    """
+    """Read a keyframe file of two keyframes or more."""
     try:
         keyframes = _keyframes(read_plain_yaml(path, CURE), path)
     except ValueError as error:  # Python writes down no whole number of thousands of digits
         raise InputError(f"{path} holds a number that cannot be read ({error}). {CURE}") from error
     if len(keyframes) < 2:
         raise InputError(
-            f"{path} has {len(keyframes)} keyframe(s), and a path needs two to lie between. Add more, or use "
-            "path=look_at for a camera that stays."
+            f"{path} has {len(keyframes)} keyframe(s), and a path needs two. Add more, or use path=look_at for a "
+            "camera that stays."
         )
     _check_times(path, keyframes)
     return keyframes

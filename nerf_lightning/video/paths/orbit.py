@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from typing import final
 
 import torch
-from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.types.scene import Cameras
-from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, horizontal
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, check_turns, level_axes
 
 
 @final
@@ -33,10 +32,9 @@ class Orbit(CameraPath):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        rule = "between -90 and 90 degrees, both excluded"
+        check_setting("elevation", self.elevation, -90 < self.elevation < 90, rule)
         good = self.radius is None or 0 < self.radius < math.inf
-        check_setting(
-            "elevation", self.elevation, -90 < self.elevation < 90, "between -90 and 90 degrees, both excluded"
-        )
         check_setting("radius", self.radius, good, "a positive distance, or null")
         check_turns(self.turns, self.start)
 
@@ -44,9 +42,7 @@ class Orbit(CameraPath):
         """Return the cameras of the circle."""
         center = around.point("center", self.center)
         radius = around.radius if self.radius is None else self.radius / around.unit
-        up = normalize(around.up, dim=0)
-        east = horizontal(up)
-        north = torch.linalg.cross(up, east)
+        up, east, north = level_axes(around.up)
         steps = torch.arange(self.num_frames, dtype=up.dtype, device=up.device) / self.num_frames
         azimuth = (math.radians(self.start) + 2 * math.pi * self.turns * steps)[:, None]
         level = torch.cos(azimuth) * east + torch.sin(azimuth) * north

@@ -32,10 +32,8 @@ class PhotographPath(CameraPath):
         chosen = list(range(count)) if self.views is None else self.views
         numbers = find_views("views", chosen, around.view_names, count)
         if len(numbers) < 2:
-            raise InputError(
-                f"path.views={self.views} names {len(numbers)} photograph(s), and a path needs two to lie between. "
-                "Name more of them, or use path=pan for a camera that stays."
-            )
+            named = f"path.views={self.views} names {len(numbers)} photograph(s)"
+            raise InputError(f"{named}, and a path needs two. Name more, or use path=pan for a camera that stays.")
         keys = around.poses[numbers]
         knots = even_speed(keys, around.radius, self.closed)
         at = frame_times(knots, self.num_frames, self.closed)
@@ -47,9 +45,6 @@ def find_views(setting: str, chosen: Sequence[str | int], names: Sequence[str], 
 
     >>> find_views("views", [2, "b", "*"], ["a", "b", "c"], 3)
     [2, 1, 0, 1, 2]
-
-    Raises:
-        InputError: there is no such photograph; near names are told.
     """
     found: list[int] = []
     for each in [chosen] if isinstance(chosen, str) else chosen:

@@ -14,8 +14,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.nerf.geometry.poses import quaternion_from_rotation, rotation_from_quaternion
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 
-# The shortest leg as a share of the mean one: keys that coincide are a pause.
-SHORTEST_LEG = 1e-2
+SHORTEST_LEG = 1e-2  # The shortest leg as a share of the mean one: keys that coincide are a pause.
 
 
 def hermite(
@@ -65,14 +64,16 @@ def along(
     knots: Float[Tensor, "knots"], values: Float[Tensor, "keys channels"], at: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames channels"]:
     """Return the curve at `at`; with a knot more than values it is closed, and smooth where it closes."""
+    return hermite(*_continued(knots, values), at)
+
+
+def _continued(knots: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return knots and values of the curve; of a closed one with a leg more at either end."""
     if len(knots) == len(values):
-        return hermite(knots, values, at)
+        return knots, values
     period = knots[-1] - knots[0]
-    return hermite(
-        torch.cat([knots[-2:-1] - period, knots, knots[1:2] + period]),
-        torch.cat([values[-1:], values, values[:1], values[1:2]]),
-        at,
-    )
+    knots = torch.cat([knots[-2:-1] - period, knots, knots[1:2] + period])
+    return knots, torch.cat([values[-1:], values, values[:1], values[1:2]])
 
 
 @disable_autocast
@@ -80,17 +81,11 @@ def rotations_along(
     knots: Float[Tensor, "knots"], rotations: Float[Tensor, "keys 3 3"], at: Float[Tensor, "frames"]
 ) -> Float[Tensor, "frames 3 3"]:
     """Return rotations between those of the keys, each leg the shorter way round."""
-    quaternions = quaternion_from_rotation(rotations)
-    closed = len(knots) > len(rotations)
+    knots, quaternions = _continued(knots, quaternion_from_rotation(rotations))
     # A quaternion and its negative are one rotation: each takes the sign that is nearer to the one before.
-    if closed:
-        quaternions = torch.cat([quaternions[-1:], quaternions, quaternions[:1], quaternions[1:2]])
     turned = [quaternions[0]]
     for _, following in pairwise(quaternions):
         turned.append(following if turned[-1] @ following >= 0 else -following)
-    if closed:
-        period = knots[-1] - knots[0]
-        knots = torch.cat([knots[-2:-1] - period, knots, knots[1:2] + period])
     return rotation_from_quaternion(normalize(hermite(knots, torch.stack(turned), at), dim=-1))
 
 

@@ -7,22 +7,18 @@ from typing import final
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerf_lightning.nerf.geometry.frames import gaps_around
 from nerf_lightning.nerf.geometry.poses import look_at
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.types.scene import Cameras
-from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, horizontal
+from nerf_lightning.video.paths.base import CameraPath, PathFrame, check_setting, level_axes
 
 CROSSED_BY_A_CIRCLE, CROSSED_BY_AN_ARC = 75.0, 40.0
 """Degrees between neighbouring photographs, seen from above, over which a path may lead."""
-OF_AN_ARC = 0.9
-"""That a path to and fro covers: at its ends few photographs see the same."""
-NEAREST = 0.1
-"""Quantile of the photographs' distances; nearer, content leaves the picture."""
-HIGHEST = 80.0
-"""Degrees; straight above the content a picture has no up."""
+OF_AN_ARC = 0.9  # That a path to and fro covers: at its ends few photographs see the same.
+NEAREST = 0.1  # Quantile of the photographs' distances; nearer, content leaves the picture.
+HIGHEST = 80.0  # Degrees; straight above the content a picture has no up.
 
 
 @final
@@ -47,9 +43,7 @@ class Sweep(CameraPath):
     @disable_autocast
     def cameras(self, around: PathFrame) -> Cameras:
         """Return the cameras of the loop; the last frame precedes the first."""
-        up = normalize(around.up, dim=0)
-        east = horizontal(up)
-        north = torch.linalg.cross(up, east)
+        up, east, north = level_axes(around.up)
         offsets = around.poses[:, :, 3] - around.center
         taken = torch.atan2(offsets @ north, offsets @ east).rad2deg()
         distances = offsets.norm(dim=-1).clamp(min=1e-6)
