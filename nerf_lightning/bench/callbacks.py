@@ -22,38 +22,23 @@ LONG_SECONDS = 5.0
 
 
 def watching_seconds(
-    watchers: Iterable[Watcher],
-    step: TrainStep,
-    optimizer: Optimizer,
-    data: RayDataModule,
-    batch: Batch,
+    watchers: Iterable[Watcher], step: TrainStep, optimizer: Optimizer, data: RayDataModule, batch: Batch
 ) -> dict[str, float]:
     """Return the seconds that each watcher adds to a step: those of one look, spread over the steps between two.
 
-    Args:
-        watchers: those of a run's callbacks that look every few steps.
-        step: of the model in training; one is taken, so that there is something to look at.
-        optimizer: its own.
-        data: its scene and rays.
-        batch: the rays of a step.
+    One step is taken, so that there is something to look at.
     """
     seconds = {}
     outputs = {"step": step(batch, optimizer, measure_gradients=True)}
     with _trainer(data) as trainer:
-        system = _system(step, optimizer)
+        system = RadianceFieldSystem(step, {})
+        setattr(system, "optimizers", lambda: optimizer)  # noqa: B010  Lightning's are its trainer's
         for watcher in watchers:
             look = partial(watcher.watch, trainer, system, outputs)
             first = seconds_of(look)
-            seconds[type(watcher).__name__] = (
-                first if first > LONG_SECONDS else seconds_of(look)
-            ) / watcher.every_steps
+            taken = first if first > LONG_SECONDS else seconds_of(look)
+            seconds[type(watcher).__name__] = taken / watcher.every_steps
     return seconds
-
-
-def _system(step: TrainStep, optimizer: Optimizer) -> RadianceFieldSystem:
-    system = RadianceFieldSystem(step, {})
-    setattr(system, "optimizers", lambda: optimizer)  # noqa: B010  Lightning's are its trainer's
-    return system
 
 
 @contextmanager
@@ -62,11 +47,6 @@ def _trainer(data: RayDataModule) -> Iterator[Any]:
     with tempfile.TemporaryDirectory() as folder:
         logger = TensorBoardLogger(folder)
         yield SimpleNamespace(
-            global_step=1,
-            max_steps=1,
-            is_global_zero=True,
-            default_root_dir=folder,
-            datamodule=data,
-            loggers=[logger],
+            global_step=1, max_steps=1, is_global_zero=True, default_root_dir=folder, datamodule=data, loggers=[logger]
         )
         logger.finalize("success")

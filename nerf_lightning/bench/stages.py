@@ -62,13 +62,7 @@ def _psnr(training: TrainStep, rays: FixedRays) -> float:
 
 
 class LoadedSteps:
-    """Take steps whose batches come from the loader, as in training, and note how long each was waited for.
-
-    Args:
-        batches: the loader.
-        train_on: takes one step.
-        steps: how many at a time.
-    """
+    """Take steps, so many at a time, whose batches come from the loader, and note how long each was waited for."""
 
     def __init__(self, batches: RayBatches, train_on: Callable[[Batch], None], steps: int):
         self.batches, self.train_on, self.steps = batches, train_on, steps

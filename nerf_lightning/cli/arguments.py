@@ -26,13 +26,8 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     unasked = vars(parser.parse_args([]))
     asked = vars(parser.parse_intermixed_args(arguments))
     overrides: list[str] = asked.pop("overrides")
-    options = [_as_word(name, value) for name, value in asked.items() if value != unasked[name]]
-    return [*options, *overrides]
-
-
-def _as_word(name: str, value: str | bool) -> str:
-    option = f"--{name.replace('_', '-')}"
-    return option if value is True else f"{option}={value}"
+    given = {f"--{name.replace('_', '-')}": value for name, value in asked.items() if value != unasked[name]}
+    return [*(name if value is True else f"{name}={value}" for name, value in given.items()), *overrides]
 
 
 def _refuse(message: str) -> NoReturn:
@@ -42,15 +37,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def require_settings(words: Sequence[str], or_paths: bool) -> None:
-    """Refuse words that are no setting, as spaces around a `=` leave them.
-
-    Args:
-        words: as typed.
-        or_paths: a word without a `=` is a path.
-
-    Raises:
-        InputError: with the first of them.
-    """
+    """Refuse words that are no setting, as spaces around a `=` leave them; `or_paths`: one without a `=` is a path."""
     bare = ["=" not in word and not word.startswith(("-", "~")) for word in words]
     for word, is_bare, before_bare in zip(words, bare, [*bare, False][1:], strict=True):
         if word.startswith("=") or (is_bare and not or_paths) or (word.endswith("=") and before_bare):
@@ -64,9 +51,6 @@ def named_paths(arguments: list[str], key: str, several: bool) -> list[str]:
     """Return the arguments with those that are paths gathered into `key=...`.
 
     A path is what has no `=`, or what is there: the folders of a sweep's jobs are named `0_seed=0`.
-
-    Raises:
-        InputError: there are several where one is wanted.
     """
     paths = [
         word for word in arguments if not word.startswith(("-", "+", "~")) and ("=" not in word or Path(word).exists())

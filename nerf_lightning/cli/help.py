@@ -1,7 +1,13 @@
-"""`nerf help`, `nerf COMMAND --help`, and the words behind them: answered from conf/ and docstrings, without Hydra."""
+"""`nerf help`, `nerf COMMAND --help` and `nerf completion`: answered from conf/ and docstrings, without Hydra.
+
+Hydra has scripts for completion, too. They compose the config at each press of the key, which takes seconds, and know
+neither our commands nor what a setting takes.
+"""
 
 import shutil
+from pathlib import Path
 
+from nerf_lightning.config.manual.candidates import SHELLS, candidates
 from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
 from nerf_lightning.config.manual.pages import command_page, page_of
 from nerf_lightning.config.manual.suggestions import did_you_mean
@@ -9,14 +15,12 @@ from nerf_lightning.messages.errors import InputError
 
 FLAGS = ("-h", "--help")
 NARROWEST, WIDEST = 60, 120
+SCRIPTS = Path(__file__).parent / "completions"
+CANDIDATES = "candidates"  # What the scripts ask for, with the words that have been typed
 
 
 def help_on(name: str, arguments: list[str]) -> str:
-    """Return the help of a command; with words such as `scene=colmap` or `trainer.max_steps` behind --help, of these.
-
-    Raises:
-        InputError: there is nothing of such a name.
-    """
+    """Return the help of a command; with words such as `scene=colmap` or `trainer.max_steps` behind --help, theirs."""
     asked = max((place for place, word in enumerate(arguments) if word in FLAGS), default=-1)
     words = [word for word in arguments[asked + 1 :] if not word.startswith("-")]
     if not words:
@@ -25,11 +29,7 @@ def help_on(name: str, arguments: list[str]) -> str:
 
 
 def help_on_anything(words: list[str], commands: list[str]) -> str:
-    """Return the help of what words name: a command, or parts and settings of the first command that has them.
-
-    Raises:
-        InputError: there is nothing of such a name.
-    """
+    """Return the help of what words name: a command, or parts and settings of the first command that has them."""
     if words[0] in commands:
         return help_on(words[0], words[1:])
     # Most are of training; what only others have is found there.
@@ -55,3 +55,14 @@ def _command(name: str) -> Command:
 
 def _width() -> int:
     return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
+
+
+def completion(arguments: list[str], commands: list[str]) -> str:
+    """Return the script of a shell; or, as the scripts ask for it, what the last of some words may become."""
+    if arguments[:1] == [CANDIDATES]:
+        return "\n".join(candidates(arguments[1:], commands))
+    shell = arguments[0] if arguments else ""
+    if shell not in SHELLS:
+        told = f"There is no completion for '{shell}'." if shell else "Completion of which shell?"
+        raise InputError(f"{told}{did_you_mean(shell, SHELLS)} nerf completion bash, zsh or fish prints its script.")
+    return (SCRIPTS / f"nerf.{shell}").read_text(encoding="utf-8").rstrip()

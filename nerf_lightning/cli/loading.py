@@ -15,8 +15,7 @@ from typing import Any
 SIGNALS = "scipy.signal"
 MAY_SET_A_MODE = ("hydra.mode", "hydra/mode", "hydra.searchpath")
 """Settings, after any sign of Hydra's, that set the mode or name folders of the user's whose files may."""
-OTHER_FILES = "--config-"
-"""How Hydra's options for such folders and files begin."""
+OTHER_FILES = "--config-"  # How Hydra's options for such folders and files begin
 
 
 def announce_start(command: str, arguments: list[str]) -> None:
@@ -86,10 +85,9 @@ def compose_once() -> None:
         return
 
     def get_mode(hydra: Hydra, *given: Any, **named: Any) -> Any:
-        return composed(hydra, *given, **named) if any(map(_may_set_a_mode, sys.argv[1:])) else None
+        may_set_a_mode = any(
+            word.startswith(OTHER_FILES) or word.lstrip("+~").startswith(MAY_SET_A_MODE) for word in sys.argv[1:]
+        )
+        return composed(hydra, *given, **named) if may_set_a_mode else None
 
     Hydra.get_mode = get_mode  # type: ignore[assignment, method-assign]
-
-
-def _may_set_a_mode(argument: str) -> bool:
-    return argument.startswith(OTHER_FILES) or argument.lstrip("+~").startswith(MAY_SET_A_MODE)

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from nerf_lightning.cli.loading import announce_start, quick_imports
 from nerf_lightning.cli.prepare import PATHS_ALONE, prepared
-from nerf_lightning.cli.process import ends_quietly
+from nerf_lightning.cli.process import ends_quietly, require_no_settings_here
 from nerf_lightning.cli.quoting import quoted_paths
 from nerf_lightning.cli.sweep_arguments import is_sweep, sweep_arguments
-from nerf_lightning.cli.working_directory import require_no_settings_here
 from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.files.budgets import Budgets, allow_as_typed, set_limits
 from nerf_lightning.files.folders import PACKAGE, conf_file, conf_folder
@@ -36,6 +35,15 @@ OF_ITSELF = {
 VERBOSE = ("-v", "--verbose")
 DETAILS = "hydra.verbose=[nerf_lightning]"
 """What they stand for: the details that our own modules log."""
+HELP = """nerf: learn a radiance field from photographs with known cameras, and render new views.
+
+usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details
+
+{}
+
+nerf COMMAND --help lists the groups, the settings and examples of a command.
+nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene, nerf help scene=colmap.
+python -m nerf_lightning is the same."""
 USAGE_ERROR = 2
 MOST_LETTERS = 5000
 
@@ -64,7 +72,7 @@ def _answer(arguments: list[str]) -> None:
         print(help_on_anything(rest, list(commands)) if rest else _help(commands))
         return
     if command == "completion":
-        from nerf_lightning.cli.completion import completion
+        from nerf_lightning.cli.help import completion
 
         print(completion(rest, [*commands, *OF_ITSELF]))
         return
@@ -106,19 +114,7 @@ def _summary(file: Path) -> str:
 def _help(commands: dict[str, str]) -> str:
     width = max(map(len, [*commands, *OF_ITSELF]))
     lines = [f"  {name:<{width}}  {summary}" for name, summary in (commands | OF_ITSELF).items()]
-    return "\n".join(
-        [
-            "nerf: learn a radiance field from photographs with known cameras, and render new views.",
-            "",
-            "usage: nerf COMMAND [-m] [-v] [key=value ...]          -m: sweep, -v: details",
-            "",
-            *lines,
-            "",
-            "nerf COMMAND --help lists the groups, the settings and examples of a command.",
-            "nerf help WHAT tells all of one: nerf help trainer.max_steps, nerf help scene, nerf help scene=colmap.",
-            "python -m nerf_lightning is the same.",
-        ]
-    )
+    return HELP.format("\n".join(lines))
 
 
 def _run(command: str, arguments: list[str]) -> None:
@@ -146,7 +142,9 @@ def _run(command: str, arguments: list[str]) -> None:
             return run_job(ends_quietly()(module.run), config, command)
         # Caught inside the job as well: Hydra would print the overrides first.
         with explained(command):
-            _require_sections(config, command)
+            from nerf_lightning.config.instantiate import require_sections
+
+            require_sections(config, command)
             return module.run(config)
 
     with explained(command):
@@ -168,14 +166,6 @@ def _run(command: str, arguments: list[str]) -> None:
             watched(run)
         else:
             run()
-
-
-def _require_sections(config: "DictConfig", command: str) -> None:
-    from omegaconf import OmegaConf
-
-    from nerf_lightning.config.instantiate import require_sections
-
-    require_sections(config, OmegaConf.load(conf_file(command)))  # type: ignore[arg-type]
 
 
 @contextmanager

@@ -5,6 +5,7 @@ Everything heavy is imported late: `--help` needs none of it.
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from nerf_lightning.cli.arguments import named_paths
@@ -17,11 +18,7 @@ log = logging.getLogger(__name__)
 
 
 def prepared(command: str, arguments: list[str]) -> list[str]:
-    """Return a command's arguments with what belongs before them; the user's own come last, and win.
-
-    Raises:
-        InputError: what they name cannot be read, or a sweep would begin where one has been.
-    """
+    """Return a command's arguments with what belongs before them; the user's own come last, and win."""
     prepare = PREPARED.get(command)
     return arguments if prepare is None else prepare(arguments)
 
@@ -110,11 +107,6 @@ def _eval_or_without(arguments: list[str], without: list[str], said: str) -> lis
         return [*without, *arguments]
 
 
-def _table(arguments: list[str]) -> list[str]:
-    """Take paths that stand alone for the runs."""
-    return named_paths(arguments, "runs", several=True)
-
-
 def _report(arguments: list[str]) -> list[str]:
     """Take a path that stands alone for the run, and name the run's own scene where the user names none."""
     arguments = named_paths(arguments, "run", several=False)
@@ -135,9 +127,8 @@ PREPARED: dict[str, Callable[[list[str]], list[str]]] = {
     "eval": _eval,
     "view": _view,
     "export": _export,
-    "table": _table,
+    "table": partial(named_paths, key="runs", several=True),
     "report": _report,
 }
 
-PATHS_ALONE = ("table", "report")
-"""Commands that take paths without a key."""
+PATHS_ALONE = ("table", "report")  # Commands that take paths without a key

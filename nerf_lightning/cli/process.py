@@ -1,4 +1,10 @@
-"""How `nerf` ends: without taking apart what it has loaded, which takes a second, and quietly if its reader left."""
+"""How `nerf` starts and ends.
+
+What lies in the working directory is data: `nerf` may be called in a folder that somebody else made. Python looks for
+modules there first when it is started with `-m` or `-c`, as launchers, pools of processes and compilers start it.
+
+At the end nothing that was loaded is taken apart, which takes a second, and nothing is said if the reader left.
+"""
 
 import atexit
 import os
@@ -8,17 +14,23 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from nerf_lightning.messages.errors import InputError
+
 FAILED = 1
 READER_LEFT = 141
 """128 + SIGPIPE, what a shell says of `yes` too; a sweep takes it for a stop, not for a job that failed."""
 STDOUT, STDERR = 1, 2
+SETTINGS = {
+    ".numba_config.yaml": "numba, whose settings can be given as variables (NUMBA_...)",
+    "matplotlibrc": "matplotlib, which also reads ~/.config/matplotlib/matplotlibrc",
+}
+"""Files that libraries look for in the working directory, and no variable of theirs keeps them from it."""
 
 
 def main() -> None:
     """Run the command line, and end."""
     with quick_end():
         from nerf_lightning.cli.main import main as answer
-        from nerf_lightning.cli.working_directory import keep_from_subprocesses
 
         keep_from_subprocesses()
         answer()
@@ -83,7 +95,10 @@ def ends_quietly() -> Iterator[None]:
             _silence(descriptor)
         sys.exit(READER_LEFT)
     except OSError:
-        _silence_if_full()
+        try:
+            _flush()
+        except OSError:
+            _silence(STDOUT)
         raise
 
 
@@ -102,15 +117,29 @@ def _without_reader() -> list[int]:
     return [descriptor for descriptor, event in poll.poll(0) if event & (select.POLLERR | select.POLLHUP)]
 
 
-def _silence_if_full() -> None:
-    try:
-        _flush()
-    except OSError:
-        _silence(STDOUT)
-
-
 def _silence(descriptor: int) -> None:
     """Let what is still buffered go nowhere: Python flushes at its end again, and would complain."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)
+
+
+def keep_from_subprocesses() -> None:
+    """Let the Python processes that this one starts, directly or through libraries, import nothing from there."""
+    os.environ["PYTHONSAFEPATH"] = "1"
+    # A clone that is not installed was found there itself.
+    clone = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    if clone not in sys.path:
+        sys.path.append(clone)
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), clone]))
+
+
+def require_no_settings_here() -> None:
+    """Refuse to start where a library would obey a file of the working directory."""
+    for name, library in SETTINGS.items():
+        if os.path.lexists(name):
+            raise InputError(
+                f"The working directory has a file {name}, which would be obeyed by {library}; with it, whoever made "
+                "this folder could change what is computed, or have programs run. Rename the file, or start nerf in "
+                "another folder."
+            )

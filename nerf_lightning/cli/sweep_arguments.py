@@ -27,9 +27,6 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     `paths.output_dir` names the folder of the whole sweep, and each job's folder says the values that are swept.
     With `sweep.resume=true` what the sweep was started with comes first.
 
-    Raises:
-        InputError: it is not said which sweep to go on with, or its folder holds what is not taken from files.
-
     >>> sweep_arguments(["-m", "seed=0,1", "paths.output_dir=out"])
     ['-m', 'seed=0,1', 'hydra.sweep.dir=out', "hydra.sweep.subdir='${hydra.job.num}_seed=${seed}'"]
     """
@@ -45,7 +42,8 @@ def sweep_arguments(arguments: list[str]) -> list[str]:
     renamed = [argument.replace("paths.output_dir=", "hydra.sweep.dir=", 1) for argument in arguments]
     if any(argument.startswith("hydra.sweep.subdir=") for argument in arguments):
         return renamed
-    parts = [JOB_NUMBER, *(f"{key}={_current_value(key)}" for key in _swept(arguments))]
+    current = {key: f"hydra.runtime.choices.{key}" if option_names(key) else key for key in _swept(arguments)}
+    parts = [JOB_NUMBER, *(f"{key}=${{{value}}}" for key, value in current.items())]
     return [*renamed, f"hydra.sweep.subdir='{'_'.join(parts)}'"]
 
 
@@ -117,8 +115,3 @@ def _swept(arguments: list[str]) -> list[str]:
         for key, _, values in pairs
         if ("," in values or "(" in values) and not set("/[{@~+") & set(key + values) and unquoted(values) == values
     ]
-
-
-def _current_value(key: str) -> str:
-    is_group = bool(option_names(key))
-    return f"${{hydra.runtime.choices.{key}}}" if is_group else f"${{{key}}}"

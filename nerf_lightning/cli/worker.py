@@ -15,9 +15,8 @@ from nerf_lightning.files.budgets import Budgets, set_limits
 
 def main() -> None:
     """Join the other workers and run the command."""
-    command, folder, launcher = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
-    with quick_end(), explained(command):
-        _run(command, folder, launcher)
+    with quick_end(), explained(sys.argv[1]):
+        _run(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))
 
 
 def _run(command: str, folder: Path, launcher: int) -> None:

@@ -23,7 +23,7 @@ from nerf_lightning.messages.escaping import for_terminal, listed
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.visualization.pictures import save_png
 
-STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red"}
+STYLES = {"ok": "green", "look": "yellow", "wrong": "bold red", "not judged": "dim"}
 
 
 def run(config: DictConfig) -> int:
@@ -65,10 +65,11 @@ def summary(checks: Sequence[Check]) -> str:
     """Return one line.
 
     >>> summary([Check("lens", "ok", "none"), Check("blur", "look", "2 of 50", "Remove them.")])
-    '1 ok, 1 to look at, 0 wrong'
+    '1 ok, 0 not judged, 1 to look at, 0 wrong'
     """
     counts = Counter(check.verdict for check in checks)
-    return f"{counts['ok']} ok, {counts['look']} to look at, {counts['wrong']} wrong"
+    judged = f"{counts['look']} to look at, {counts['wrong']} wrong"
+    return f"{counts['ok']} ok, {counts['not judged']} not judged, {judged}"
 
 
 def print_checks(checks: Sequence[Check]) -> None:
@@ -76,9 +77,8 @@ def print_checks(checks: Sequence[Check]) -> None:
     console = StdoutConsole(highlight=False, soft_wrap=True)
     width = max(len(check.name) for check in checks)
     for check in checks:
-        line = Text.assemble(
-            (f"{check.verdict:<5}", STYLES[check.verdict]), f"  {check.name:<{width}}  {for_terminal(check.message)}"
-        )
-        console.print(line)
+        verdict, found = f"{check.verdict:<10}", f"  {check.name:<{width}}  {for_terminal(check.message)}"
+        console.print(Text.assemble((verdict, STYLES[check.verdict]), found))
         if check.cure:
-            console.print(Text(f"{'':<{width + 9}}cure: {for_terminal(check.cure)}"))
+            label = "needs" if check.verdict == "not judged" else "cure"
+            console.print(Text(f"{'':<{width + 14}}{label}: {for_terminal(check.cure)}"))

@@ -18,11 +18,7 @@ def run(config: DictConfig) -> float:
 
 
 def evaluate(config: DictConfig) -> float:
-    """Measure a checkpoint on a split of a scene; return the PSNR (dB).
-
-    Raises:
-        InputError: the checkpoint or the scene cannot be read, or they do not belong together.
-    """
+    """Measure a checkpoint on a split of a scene; return the PSNR (dB)."""
     opened = open_checkpoint(config)
     settings, checkpoint, model = opened.settings, opened.checkpoint, opened.model
     with filled_folder(config.paths.output_dir, beside_checkpoint(checkpoint.path, "evaluation")) as folder:

@@ -1,23 +1,36 @@
 """Write what a checkpoint has learnt as a mesh, points, grids, depth maps, cameras or a page."""
 
+import logging
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
 import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.checkpoints.reading import Checkpoint, scene_record
-from nerf_lightning.commands.page_path import page_path
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.open_checkpoint import open_checkpoint, read_photographs, scene_to_look_at
 from nerf_lightning.export.base import Export, PageExtras
 from nerf_lightning.files.json_files import read_json_object
 from nerf_lightning.messages.console import say
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.models.base import point_field
-from nerf_lightning.nerf.types.scene import Scene
+from nerf_lightning.nerf.types.scene import Scene, SceneRecord
 from nerf_lightning.report.metrics import facts
 from nerf_lightning.runs.output_folder import beside_checkpoint, filled_folder
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.launch.processes import on_all_processes
-from nerf_lightning.video.paths.base import CameraPath
+from nerf_lightning.video.paths.as_keyframes import as_keyframes
+from nerf_lightning.video.paths.auto import AutoPath
+from nerf_lightning.video.paths.base import CameraPath, frame_of
+from nerf_lightning.video.paths.keyframe_path import KeyframePath
+from nerf_lightning.viewer.recorded_path import RecordedPath
+
+Keyframes = tuple[dict[str, Any], ...]
+
+log = logging.getLogger(__name__)
 
 
 def run(config: DictConfig) -> None:
@@ -49,11 +62,7 @@ def export(config: DictConfig) -> None:
 
 
 def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath | None) -> PageExtras:
-    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene.
-
-    Raises:
-        InputError: the path cannot be laid around the scene.
-    """
+    """Return what belongs to a checkpoint: photographs, the numbers of its run, and a camera path around its scene."""
     run = beside_checkpoint(checkpoint.path, "metrics.json").parent
     known = [
         ("model", checkpoint.choices.get("model", "")),
@@ -63,3 +72,24 @@ def beside(checkpoint: Checkpoint, photographs: Scene | None, path: CameraPath |
     corrected = checkpoint.choices.get("correction", "none") != "none"
     keyframes = () if path is None else page_path(path, checkpoint.scene, run)
     return PageExtras(photographs, corrected, tuple(known), keyframes)
+
+
+def page_path(path: CameraPath, record: SceneRecord, run: Path) -> Keyframes:
+    """Return the keyframes of a path; of path=auto, those that `nerf view` saved last in the run's folder, if any."""
+    around = frame_of(record.cameras, record.aabb, to_user=record.to_user, view_names=record.view_names)
+    if not isinstance(path, AutoPath):
+        return tuple(map(asdict, as_keyframes(path, around)))
+    folder = run / "viewer"
+    recorded = [] if folder.is_symlink() else RecordedPath(around, folder).files()
+    for name in recorded[:1]:
+        try:
+            found = as_keyframes(KeyframePath(str(folder / name)), around)
+            log.info("the page plays %s", folder / name)
+            return tuple(map(asdict, found))
+        except InputError as error:
+            log.warning("The page does not play what was recorded last: %s", error)
+    try:
+        return tuple(map(asdict, as_keyframes(path, around)))
+    except InputError as error:
+        log.warning("The page is without a camera path: %s", error)
+        return ()

@@ -1,7 +1,6 @@
 """Make a video of a checkpoint along a camera path."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -59,21 +58,13 @@ def _scene(opened: LoadedModel, scene: DictConfig | None) -> SceneRecord:
 
 
 def labels_of(checkpoints: list[Checkpoint], given: Any) -> list[str]:
-    """Return what checkpoints are called beside each other: as given, else after their run folders.
-
-    Raises:
-        InputError: there are more or fewer names than checkpoints.
-    """
+    """Return what checkpoints are called beside each other: as given, else after their run folders."""
     if given is None:
-        names = [_run_name(checkpoint.path) for checkpoint in checkpoints]
+        paths = [checkpoint.path.absolute() for checkpoint in checkpoints]
+        names = [path.parents[1].name if path.parent.name == "checkpoints" else path.stem for path in paths]
         twice = len(set(names)) < len(names)
         return [f"{name} {each.path.stem}" if twice else name for name, each in zip(names, checkpoints, strict=True)]
     labels = list(map(str, as_list(given)))
     if len(labels) != len(checkpoints):
         raise InputError(f"labels={labels}: give one for each of the {len(checkpoints)} checkpoints, or null.")
     return labels
-
-
-def _run_name(path: Path) -> str:
-    parent = path.absolute().parent
-    return parent.parent.name if parent.name == "checkpoints" else path.stem

@@ -12,7 +12,7 @@ from nerf_lightning.doctor.examine import examine
 from nerf_lightning.files.links import require_nothing_from_outside
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import InputError, require_one_of
-from nerf_lightning.report.page import write_page
+from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES
@@ -32,7 +32,7 @@ def run(config: DictConfig) -> str:
     most_video_bytes = int(config.max_megabytes * 1e6)
     doctor = partial(_examine_capture, config) if config.doctor else None
     report = read_run(run, run / FILES[config.measured], most_video_bytes, doctor, target.parent)
-    write_page(report, target)
+    write_report(report, target)
     lines = [f"left out     {line}" for line in report.missing]
     say(*lines, f"report       {target} ({target.stat().st_size / 1e6:.1f} MB)")
     return str(target)

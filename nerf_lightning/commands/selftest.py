@@ -1,12 +1,17 @@
 """Say whether this machine computes right: kernels, precisions, trainings, files; a table for a bug report."""
 
+import os
+import re
 import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import torch
 from omegaconf import DictConfig
 from rich.progress import track
+from torch.utils import collect_env
 
 from nerf_lightning import __version__
 from nerf_lightning.compute.devices import has_tf32
@@ -20,10 +25,10 @@ from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.selftest import command_line, kernels, training
 from nerf_lightning.selftest.check import Row, carried_out, remarks, result_table
-from nerf_lightning.selftest.machine import machine
 from nerf_lightning.training.launch.trainer import TrainerSettings
 
 TRAINERS = {"cpu": "cpu", "cuda": "gpu"}
+FLAGS = re.compile(r"\b(sse4_2|avx|avx2|fma|avx512\w*|avx_\w+|amx\w*|asimd\w*|bf16|i8mm|sve\w*)\b")
 
 
 def run(config: DictConfig) -> None:
@@ -79,3 +84,34 @@ def _in_words(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {part}" for key, part in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """Return what a bug report should say of this machine, beside the versions of libraries."""
+    known: dict[str, Any] = {
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "cpu_flags": _cpu_flags(),
+        "threads": {"torch": torch.get_num_threads(), "of the machine": os.cpu_count()},
+    }
+    if device.type == "cuda":
+        free, total = (round(size / 1e9, 1) for size in torch.cuda.mem_get_info(device))
+        known |= {
+            "gpu": str(torch.cuda.get_device_properties(device)),
+            "gpu_memory_gigabytes": {"total": total, "free": free},
+            "driver": collect_env.get_nvidia_driver_version(collect_env.run),
+            "cudnn": torch.backends.cudnn.version(),
+            "allow_tf32": {
+                "matrices": torch.get_float32_matmul_precision(),
+                "convolutions": torch.backends.cudnn.allow_tf32,
+            },
+        }
+    return known
+
+
+def _cpu_flags() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "unknown"
+    line = re.search(r"^(?:flags|Features)\s*:(.*)$", text, re.MULTILINE)
+    return " ".join(sorted(set(FLAGS.findall(line[1])))) if line else "unknown"

@@ -5,17 +5,19 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
+from nerf_lightning.files.folders import PACKAGE
+from nerf_lightning.files.html import write_page
 from nerf_lightning.messages.console import say
 from nerf_lightning.messages.errors import require_one_of
 from nerf_lightning.report.curves import psnr_curve
-from nerf_lightning.report.table_page import write_table_page
 from nerf_lightning.runs.output_folder import output_folder
 from nerf_lightning.runs.results import FILES, find_results
 from nerf_lightning.runs.table import ORDERS, result_table
-from nerf_lightning.runs.table_files import Row, write_csv, write_markdown
+from nerf_lightning.runs.table_files import DECIMALS, Row, shown_columns, write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 
 ENDINGS = (".md", ".csv", ".html")
+TEMPLATE = PACKAGE / "report" / "table.html"
 
 
 def run(config: DictConfig) -> int:
@@ -50,6 +52,12 @@ def _write(rows: list[Row], notes: list[str], title: str, out: Path) -> list[Pat
         else:
             write_table_page(rows, title, notes, path)
     return paths
+
+
+def write_table_page(rows: list[Row], title: str, notes: list[str], target: Path) -> None:
+    """Write the rows as one page, sorted by a click on a column and filtered by a word, with the notes below."""
+    columns, numbers = shown_columns(rows), [*DECIMALS]
+    write_page(TEMPLATE, target, title=title, columns=columns, numbers=numbers, rows=rows, notes=notes)
 
 
 def _names(value: Any) -> list[str]:

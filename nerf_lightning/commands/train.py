@@ -41,5 +41,5 @@ def train(config: DictConfig) -> Trained:
         folder.trained(job.clock.seconds)
         psnr = job.post_training(job.settings, job.scene, job.system.model, trainer, folder.path)
         show(job, folder.path, trainer, psnr)
-        folder.finish(trainer.global_step, psnr)
+        folder.note(finished_at_step=trainer.global_step, psnr=psnr)
     return Trained(folder.path, psnr)

@@ -31,11 +31,7 @@ def resolve_auto(
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config in which nothing is left open, and the names picked from each group.
 
-    Args:
-        config: as composed.
-        choices: the names picked from each group.
-        overrides: what it was composed with.
-        scene: what the model is to learn.
+    `choices` are those picked so far, and `overrides` what the config was composed with.
 
     Raises:
         InputError: a setting that is neither a value nor auto.
@@ -85,14 +81,8 @@ def resolve_correction(
 ) -> tuple[DictConfig, dict[str, str]]:
     """Return the config and the names picked from each group, with the correction that the photographs want.
 
-    A run that is gone on with keeps the one that was chosen for it.
-
-    Args:
-        config: with its model chosen.
-        choices: the names picked from each group.
-        overrides: what it was composed with.
-        finding: what the doctor says of the photographs' exposure; None: nothing.
-        former: the config of the run that is gone on with; None: it is a new one.
+    `finding` is what the doctor says of their exposure, None: nothing. A run that is gone on with (`former`: its
+    config) keeps the one that was chosen for it.
     """
     picked = chosen(choices)
     if picked.get("correction") != AUTO:

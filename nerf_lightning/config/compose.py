@@ -8,12 +8,12 @@ from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.initialize import initialize_config_dir
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from nerf_lightning.config.instantiate import require_sections
 from nerf_lightning.config.messages import in_words
 from nerf_lightning.config.search_path import search_extensions
-from nerf_lightning.files.folders import conf_file, conf_folder
+from nerf_lightning.files.folders import conf_folder
 
 
 def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
@@ -31,11 +31,7 @@ def compose_config(command: str, overrides: Sequence[str]) -> tuple[DictConfig, 
 
 @contextmanager
 def composed_job(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
-    """Let a command's work be done here: its config, and Hydra's own where the command looks for it.
-
-    Raises:
-        InputError: as `compose_config`.
-    """
+    """Let a command's work be done here: its config, and Hydra's own where the command looks for it."""
     config = _composed(command, overrides)
     job = HydraConfig.instance()
     former = job.cfg
@@ -52,9 +48,7 @@ def _composed(command: str, overrides: Sequence[str]) -> DictConfig:
     """Return a command's config with Hydra's own."""
     with in_words(command), _hydra():
         config = compose(command, overrides=list(overrides), return_hydra_config=True)
-        primary = OmegaConf.load(conf_file(command))
-        assert isinstance(primary, DictConfig)
-        require_sections(config, primary)
+        require_sections(config, command)
     return config
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.files.folders import conf_file
 from nerf_lightning.messages.errors import InputError
 
 OURS = "nerf_lightning."
@@ -14,11 +15,7 @@ PLAIN = (bool, int, float, str, type(None))
 
 
 def require_fitting_values(node: Any, path: str = "") -> None:
-    """Hold a config against the signatures of the classes that it names, nested ones included.
-
-    Raises:
-        InputError: a number, word or switch where the signature wants another.
-    """
+    """Hold a config against the signatures of the classes that it names, nested ones included."""
     if OmegaConf.is_config(node):
         node = OmegaConf.to_container(node, resolve=True)
     if isinstance(node, list):
@@ -34,27 +31,15 @@ def require_fitting_values(node: Any, path: str = "") -> None:
 
 
 def required_path(key: str, value: object) -> str:
-    """Return a setting that names a file or folder.
-
-    Raises:
-        InputError: it is no text.
-    """
+    """Return a setting that names a file or folder."""
     if not isinstance(value, str) or not value:
         raise InputError(f"{key}={value} does not fit: it must be a path.")
     return value
 
 
-def require_sections(config: DictConfig, primary: DictConfig) -> None:
-    """Refuse a word or number in the place of a whole section of settings.
-
-    Args:
-        config: as composed.
-        primary: the command's own yaml, whose sections are meant.
-
-    Raises:
-        InputError: with the first of them.
-    """
-    sections = OmegaConf.to_container(primary, resolve=False)
+def require_sections(config: DictConfig, command: str) -> None:
+    """Refuse a word or number in the place of a whole section of settings of the command's own yaml."""
+    sections = OmegaConf.to_container(OmegaConf.load(conf_file(command)), resolve=False)
     assert isinstance(sections, dict)
     for key, section in ((str(key), section) for key, section in sections.items()):
         if isinstance(section, dict) and key in config and not isinstance(config[key], DictConfig):
@@ -71,11 +56,7 @@ def _parameters(target: object) -> dict[str, inspect.Parameter]:
 
 
 def require_fitting(value: Any, annotation: Any, path: str) -> None:
-    """Hold a value against an annotation, where that is made of plain types and classes of ours.
-
-    Raises:
-        InputError: a number, word or switch where the annotation wants another.
-    """
+    """Hold a value against an annotation, where that is made of plain types and classes of ours."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     known = [option for option in options if option in PLAIN or get_origin(option) in (Literal, list)]
     ours = [option for option in options if inspect.isclass(option) and option.__module__.startswith(OURS)]
@@ -112,10 +93,6 @@ def _words(option: Any) -> str:
 
 
 def build(node: DictConfig) -> Any:
-    """Build one node of the user's own config.
-
-    Raises:
-        InputError: a value of the wrong kind.
-    """
+    """Build one node of the user's own config."""
     require_fitting_values(node, node._get_full_key(None))
     return instantiate(node, _convert_="all")

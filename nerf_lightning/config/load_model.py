@@ -23,19 +23,15 @@ CURE = (
     "Use another one, or give the model, field and encoder settings that it was trained with (.hydra/overrides.yaml of "
     "that run)."
 )
-SPARE_NUMBERS = 1 << 24
-"""What a model may hold beside its weights."""
+SPARE_NUMBERS = 1 << 24  # What a model may hold beside its weights
 
 
 def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     """Build the model that a checkpoint describes, with its weights, in evaluation mode.
 
     The config in a checkpoint is data from a stranger: only its `model` part is read, and only classes that are
-    defined in our own rooms, or in modules that a person trusts, and follow one of our contracts are built.
-
-    Args:
-        checkpoint: as read.
-        trusted: modules of the person's own, with all below them.
+    defined in our own rooms, or in modules that a person trusts (`trusted`, with all below them), and follow one of our
+    contracts are built.
 
     Raises:
         InputError: the config names anything else, or the weights do not fit.
@@ -58,19 +54,18 @@ def load_model(checkpoint: Checkpoint, trusted: Sequence[str] = ()) -> Model:
     model = build_model(config, checkpoint)
     load_weights(model, checkpoint)
     hold_to_budgets(model, f"The model of {checkpoint.path}")
-    require_within("layer_width", _widest(model), f"The model of {checkpoint.path}", "features of one point in a layer")
+    # Of a point, in any layer or at the end of any encoder.
+    sides = [max(matrix.shape) for matrix in matrices_of(model)]
+    encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
+    widest = max([*sides, *encoded], default=0)
+    require_within("layer_width", widest, f"The model of {checkpoint.path}", "features of one point in a layer")
     return model.eval()
 
 
 def hold_to_budgets(model: Model, where: str) -> None:
     """Refuse a model that asks about more points of a ray at once than a person has agreed to; bound its marches.
 
-    Args:
-        model: the model.
-        where: it comes from, for the message.
-
-    Raises:
-        InputError: it has no level, or more samples than `budgets.samples_per_ray`.
+    `where` it comes from is for the message.
     """
     for part in model.modules():
         if isinstance(part, Sampler):
@@ -80,19 +75,8 @@ def hold_to_budgets(model: Model, where: str) -> None:
     require_within("samples_per_ray", math.ceil(model.points_per_ray(training=True)), where, "samples along a ray")
 
 
-def _widest(model: Model) -> int:
-    """Return how many features of a point there are at most, in any layer or at the end of any encoder."""
-    sides = [max(matrix.shape) for matrix in matrices_of(model)]
-    encoded = [part.out_dim for part in model.modules() if isinstance(part, Encoder)]
-    return max([*sides, *encoded], default=0)
-
-
 def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
-    """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`).
-
-    Raises:
-        InputError: it cannot be built, or is no model.
-    """
+    """Build what the model part of a checkpoint's config says, which has been looked through (`require_trusted`)."""
     try:
         require_fitting_values(config, "model")
         model = instantiate(config, _convert_="all")
@@ -105,11 +89,7 @@ def build_model(config: dict[str, Any], checkpoint: Checkpoint) -> Model:
 
 
 def load_weights(model: Model, checkpoint: Checkpoint) -> None:
-    """Put a checkpoint's weights into a model.
-
-    Raises:
-        InputError: the model has another shape than the checkpoint's.
-    """
+    """Put a checkpoint's weights into a model."""
     with reading(checkpoint.path, CURE):
         model.load_state_dict(checkpoint.weights)  # keys and shapes, which some parts take from the file
         require_like(checkpoint.weights, model.state_dict(), "weights")

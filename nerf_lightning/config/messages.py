@@ -10,25 +10,24 @@ from traceback import extract_tb
 from hydra.errors import HydraException, InstantiationException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerf_lightning.config.overrides import to_type
-from nerf_lightning.config.unknown_names import unknown_name
+from nerf_lightning.config.manual.catalogue import Command, command_named, known_names
+from nerf_lightning.config.manual.suggestions import did_you_mean, near
+from nerf_lightning.config.overrides import PLAIN, to_type
+from nerf_lightning.files.folders import option_names
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import listed
 
 ALL_OF = "nerf {0} --help lists the groups and their options, nerf {0} --cfg job the settings."
 OF_OPTIONS = ("Only one of --run, --multirun", "The --resolve flag")
 """How Hydra's complaints about its own options begin: plain ValueErrors."""
+KEY = re.compile(r"Could not override '(?P<key>[^']+)'(?:.* use \+(?P=key)=(?P<value>.*))?")
+DELETED = re.compile(r"Could not delete(?: from config\.)? '(?P<key>[^']+)'(?P<value>)")
+OPTION = re.compile(r"Could not find '([^']+)/([^'/]+)'")
 
 
 @contextmanager
 def in_words(command: str) -> Iterator[None]:
-    """Let whatever bad input causes leave as an InputError with its one paragraph.
-
-    Args:
-        command: whose settings these are, for the hints.
-
-    Raises:
-        InputError: in the place of what was raised; any other error passes.
-    """
+    """Let whatever bad input causes leave as an InputError with one paragraph, whose hints name the command."""
     try:
         yield
     except Exception as error:
@@ -46,7 +45,9 @@ def paragraph(error: BaseException, command: str) -> str | None:
         return _missing_plugin(str(error)) or explain(error, command)
     if isinstance(error, ValueError) and str(error).startswith(OF_OPTIONS):
         return str(error)
-    if isinstance(error, (ValueError, TypeError)) and _while_choosing(error):
+    # Hydra looks at what groups are given without asking first whether it is text.
+    while_choosing = any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
+    if isinstance(error, (ValueError, TypeError)) and while_choosing:
         return (
             f"A group was given something else than the name of one of its options: {error}. {ALL_OF.format(command)}"
         )
@@ -64,11 +65,6 @@ def paragraph(error: BaseException, command: str) -> str | None:
         where = f"{os.fsdecode(error.filename)}: " if error.filename else ""
         return f"{where}{error.strerror or error}. See that the place exists, can be written, and has space left."
     return None
-
-
-def _while_choosing(error: BaseException) -> bool:
-    # Hydra looks at what groups are given without asking first whether it is text.
-    return any(Path(frame.filename).name == "defaults_list.py" for frame in extract_tb(error.__traceback__))
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:
@@ -125,3 +121,37 @@ def _chain(error: BaseException | None) -> list[BaseException]:
         links.append(error)
         error = error.__cause__ or error.__context__
     return links
+
+
+def unknown_name(message: str, command: str) -> str | None:
+    """Return what to say instead of Hydra's message, in one line, to a command; None where it is of something else."""
+    asked = command_named(command)
+    if asked is None:
+        return None
+    option, key = OPTION.search(message), KEY.search(message) or DELETED.search(message)
+    if option is not None:
+        return _no_option(*option.groups())
+    return None if key is None else _no_setting(key["key"], key["value"], asked)
+
+
+def _no_option(group: str, name: str) -> str | None:
+    options = option_names(group)
+    if not options:  # not ours: of a folder that hydra.searchpath names, or of a plugin
+        return None
+    cure = did_you_mean(name, options, f"{group}=") or f" Its options are {', '.join(options)}."
+    return f"There is no {group}={name}.{cure} nerf help {group} tells of each."
+
+
+def _no_setting(name: str, value: str | None, asked: Command) -> str:
+    having = listed(dict.fromkeys(each.source for each in asked.settings if each.key == name), cap=4)
+    if having:
+        return f"{name} is a setting of {having}, and something else is chosen. nerf help {name} tells of it."
+    close = near(name, known_names(asked))
+    told = f"nerf {asked.name} has no setting {name}."
+    if close:
+        given = f"={value}" if value and PLAIN.fullmatch(value) else ""
+        return f"{told} Did you mean {' or '.join(f'{each}{given}' for each in close)}?"
+    training = command_named("train")
+    if training is not None and name in known_names(training):
+        return f"{told} It belongs to training: nerf help {name}. nerf {asked.name} --help lists what {asked.name} has."
+    return f"{told} nerf {asked.name} --help lists what it has; +{name}=VALUE adds one of your own."

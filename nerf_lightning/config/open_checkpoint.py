@@ -38,11 +38,7 @@ class LoadedModel:
 
 
 def open_checkpoint(config: DictConfig, float32: bool = False) -> LoadedModel:
-    """Open `ckpt` as the config's trainer says.
-
-    Args:
-        config: of a command, with `ckpt`, `trainer` and `trust`.
-        float32: multiply so, whatever the run was trained in.
+    """Open `ckpt` as the config's `trainer` and `trust` say; `float32`: multiply so, whatever the run was trained in.
 
     Raises:
         InputError: it cannot be read, or is no checkpoint of this program.
@@ -57,15 +53,13 @@ def open_checkpoints(config: DictConfig, paths: Sequence[Any], float32: bool = F
     trusted = trusted_modules(config.trust)
     checkpoints = [read_checkpoint(required_path("ckpt", path)) for path in paths]
     settings.keep_tile(checkpoints[0].tile_points)
-    return [LoadedModel(settings, each, _model(settings, each, trusted, float32)) for each in checkpoints]
+    models = (load_model(each, trusted) for each in checkpoints)
+    ready = [model.to(settings.device) if float32 else settings.prepare(model) for model in models]
+    return [LoadedModel(settings, *each) for each in zip(checkpoints, ready, strict=True)]
 
 
 def trusted_modules(trust: Any) -> list[str]:
-    """Return the modules that `trust` names.
-
-    Raises:
-        InputError: no name of a module.
-    """
+    """Return the modules that `trust` names."""
     named = [] if trust is None else [trust] if isinstance(trust, str) else list(trust)
     for name in named:
         if not isinstance(name, str) or not all(word.isidentifier() for word in name.split(".")):
@@ -73,21 +67,8 @@ def trusted_modules(trust: Any) -> list[str]:
     return named
 
 
-def _model(settings: ComputeSettings, checkpoint: Checkpoint, trusted: Sequence[str], float32: bool) -> Model:
-    model = load_model(checkpoint, trusted)
-    return model.to(settings.device) if float32 else settings.prepare(model)
-
-
 def scene_to_look_at(opened: LoadedModel, scene: DictConfig | None) -> Scene:
-    """Show an opened model that looks at photographs those of a scene, and return the scene.
-
-    Args:
-        opened: the checkpoint.
-        scene: the config of the scene to be rendered; None: that of the run is read again.
-
-    Raises:
-        InputError: the scene cannot be read, or not be looked at.
-    """
+    """Show an opened model that looks at photographs those of a scene (None: of its run), and return the scene."""
     if scene is None:
         path = str(opened.checkpoint.path)
         scene = compose_config("eval", [f"ckpt={quoted(path)}", *scene_overrides(path)])[0].scene
@@ -112,8 +93,6 @@ def read_photographs(config: DictConfig, opened: LoadedModel) -> Scene | None:
     """
     try:
         return as_known(build(config.scene).read(), opened)
-    except InputError as error:
+    except (InputError, OSError) as error:
         log.warning("The cameras are shown without their photographs: %s", error)
-    except OSError as error:
-        log.warning("The cameras are shown without their photographs, which cannot be read: %s", error)
-    return None
+        return None

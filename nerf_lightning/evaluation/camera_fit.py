@@ -29,14 +29,10 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-4
 @torch.enable_grad()
 @disable_autocast
 def fitted_camera(model: Model, scene: Scene, view: int, background: Background, tile_points: int) -> Cameras:
-    """Return the scene's cameras, of which one has been fitted to its photograph.
+    """Return the scene's cameras (refined ones), of which that of `view` has been fitted to its photograph.
 
-    Args:
-        model: in evaluation mode; its weights and counts stay as they are.
-        scene: refined cameras, photographs, masks.
-        view: whose camera is fitted.
-        background: what lies behind the photograph.
-        tile_points: most points that go through a field at once.
+    The model is in evaluation mode, and its weights and counts stay as they are; at most `tile_points` points go
+    through a field at once.
     """
     device = next(model.parameters()).device
     motion = SE3Delta(weight=0.0)

@@ -9,8 +9,8 @@ from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.rendering.blending import in_other_light
 from nerf_lightning.nerf.rendering.linear_light import scale_light
 
-FEWEST = 8
-"""Pixels from which twelve numbers are not fitted."""
+FEWEST = 8  # Pixels from which twelve numbers are not fitted
+HALF_A_LEVEL = 0.5 / 255
 
 
 @disable_autocast
@@ -36,9 +36,8 @@ def color_corrected(
     if count < FEWEST:
         return render
     parts = list(bands(*render.shape[:2]))
-    at, to = (
-        torch.stack([counted(each, rows).sum(dim=0) for rows in parts]).sum(0) / count for each in (render, truth)
-    )
+    sums = (torch.stack([counted(each, rows).sum(dim=0) for rows in parts]).sum(0) for each in (render, truth))
+    at, to = (total / count for total in sums)
     # About the means, and by the pseudoinverse: of a picture of one colour nothing but its mean is fitted.
     squares, products = torch.zeros(2, 3, 3, dtype=torch.float64, device=render.device)
     for rows in parts:
@@ -50,6 +49,12 @@ def color_corrected(
     for rows in parts:
         corrected[rows] = (render[rows].double() - at) @ matrix + to
     return corrected
+
+
+def is_one_color(picture: Float[Tensor, "height width 3"], kept: Bool[Tensor, "height width"] | None = None) -> bool:
+    """Tell whether the pixels that count, if any, differ by less than half a level of 255 in every channel."""
+    colors = picture.reshape(-1, 3) if kept is None else picture[kept]
+    return not len(colors) or bool((colors.amax(dim=0) - colors.amin(dim=0) < HALF_A_LEVEL).all())
 
 
 def exposure_fitted(

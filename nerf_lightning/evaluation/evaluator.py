@@ -112,10 +112,11 @@ class Scoring:
                     kept.save(row["name"], shown)
             rows = ranks.in_turn(rows)
             worst = kept.finish(rows)
+        lpips = None if self.lpips is None else self.lpips.net
         result = summary(rows) | {
             "pictures": [scene.view_names[view] for view in shown_views],
             "worst_views": worst,
-            "protocol": self.protocol(scene, views, background),
+            "protocol": measured_how(scene, self.split, views, background, self.quantize, lpips, self.colors),
             "origin": origin or {},
             "environment": environment(),
         }
@@ -128,11 +129,6 @@ class Scoring:
         if ranks.is_first():
             write_metrics(folder, result)
         return result
-
-    def protocol(self, scene: Scene, views: list[int], background: Background) -> dict[str, Any]:
-        """Return how these views are measured."""
-        lpips = None if self.lpips is None else self.lpips.net
-        return measured_how(scene, self.split, views, background, self.quantize, lpips, self.colors)
 
     def _views(self, scene: Scene) -> list[int]:
         views = scene.splits.get(self.split, ())

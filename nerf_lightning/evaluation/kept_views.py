@@ -35,17 +35,6 @@ class ScoredView:
         return panels(self.truth, self.render, self.depth, self.opacity)
 
 
-def save_view(parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]], row: Path, folder: Path) -> None:
-    """Write each part (`truth.png`, ...) to a folder, and all in a row to a file."""
-
-    def saved() -> Iterator[tuple[str, Tensor]]:
-        for name, picture in parts:
-            save_png(folder / f"{name}.png", picture)
-            yield name, picture
-
-    save_png(row, mosaic(saved()))
-
-
 @dataclass
 class KeptViews:
     """The pictures that one process keeps while it scores its views."""
@@ -92,7 +81,15 @@ class KeptViews:
             file.close()
 
     def _write(self, name: str, parts: Iterable[tuple[str, UInt8[Tensor, "_ _ 3"]]]) -> None:
-        save_view(parts, self.folder / "images" / f"{name}.png", make_folder(self.folder, "images", "views", name))
+        """Write each part (`truth.png`, ...) to a folder, and all in a row to a file."""
+        folder = make_folder(self.folder, "images", "views", name)
+
+        def saved() -> Iterator[tuple[str, Tensor]]:
+            for part, picture in parts:
+                save_png(folder / f"{part}.png", picture)
+                yield part, picture
+
+        save_png(self.folder / "images" / f"{name}.png", mosaic(saved()))
 
 
 def picture_name(split: str, view_name: str) -> str:

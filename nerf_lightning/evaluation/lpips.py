@@ -82,9 +82,6 @@ def load_lpips(weights: str | None, net: Net = "alex") -> LPIPS | None:
     """Return LPIPS on the backbone in the file `weights`, a state dict as torchvision's; None for None.
 
     Only the convolutions (`features.*`) are read. The file is read as data: nothing in it is run.
-
-    Raises:
-        InputError: there is no such file, or it does not hold this backbone.
     """
     if weights is None:
         return None

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from nerf_lightning.compute import ranks
-from nerf_lightning.evaluation.color_fit import color_corrected
+from nerf_lightning.evaluation.color_fit import color_corrected, is_one_color
 from nerf_lightning.nerf.bands import bands
 from nerf_lightning.nerf.matmul_precision import disable_autocast
 from nerf_lightning.nerf.psnr import LEAST_MSE, picture_psnr, psnr
@@ -42,7 +42,7 @@ def image_metrics(
     """Return `psnr` (dB), `cc_psnr` and `ssim` of one image; the render is clamped to [0, 1] first.
 
     `cc_psnr` is the PSNR after an affine fit of the render's colours to the photograph's (`color_fit`), so that neither
-    exposure nor white balance counts.
+    exposure nor white balance counts. It is None where either is of one colour: a fit then says nothing.
 
     SSIM is torchmetrics' (Gaussian window, data range 1), off scikit-image's in the third digit. It
     is None where the image is smaller than the window: with another window it would be another metric.
@@ -54,9 +54,10 @@ def image_metrics(
             neighbours, the others take the photograph's colours.
     """
     render = masked_out(render.clamp(0, 1), truth, kept)
+    fits = not (is_one_color(render, kept) or is_one_color(truth, kept))
     return {
         "psnr": picture_psnr(render, truth, kept),
-        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp_(0, 1), truth, kept),
+        "cc_psnr": picture_psnr(color_corrected(render, truth, kept).clamp_(0, 1), truth, kept) if fits else None,
         "ssim": _similarity(render, truth) if min(render.shape[:2]) >= SSIM_WINDOW else None,
     }
 

@@ -45,10 +45,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def of_captures(rows: list[dict[str, Any]], capture_of: Mapping[str, str], trained: Collection[str]) -> dict[str, Any]:
     """Return the means of each capture's views, by its name, and whether it was trained on.
 
-    Args:
-        rows: of all scored views.
-        capture_of: the capture's name by the view's.
-        trained: names of the captures that were trained on.
+    `capture_of` has the capture's name by the view's, `trained` the names of those that were trained on.
     """
     by_name: dict[str, list[dict[str, Any]]] = {}
     for row in rows:

@@ -18,8 +18,7 @@ from torch import nn
 
 from nerf_lightning import __version__
 from nerf_lightning.compute.cores import num_cores
-from nerf_lightning.config.identity import fingerprint
-from nerf_lightning.config.key_meanings import meaning_of
+from nerf_lightning.config.key_meanings import fingerprint, meaning_of
 from nerf_lightning.config.overrides import leaves
 from nerf_lightning.files.yaml_files import plain_yaml
 from nerf_lightning.nerf.rendering.blending import at_evaluation
@@ -29,8 +28,7 @@ REPOSITORY = Path(__file__).parents[2]
 GIT_SECONDS = 10
 EVERYWHERE = ("split", "pixels", "psnr", "ssim", "lpips", "cameras", "colors")
 """What must agree between results of different scenes, too."""
-MAY_LACK = ("lpips", "cc_psnr")
-"""What one result may have and another not."""
+MAY_LACK = ("lpips", "cc_psnr")  # What one result may have and another not
 Colors = Literal["raw", "half_fit"]
 """Whether a render is compared as it is; or on its right half alone, with exposure and white balance of the left."""
 COLORS = {"raw": "raw", "half_fit": "exposure and white balance fitted on the left half, scored on the right"}
@@ -47,14 +45,8 @@ def measured_how(
 ) -> dict[str, Any]:
     """Return the protocol of a measurement.
 
-    Args:
-        scene: what was measured on.
-        split: train, val or test.
-        views: which views of it.
-        background: what the pictures were composited over; what is drawn in training means its colour at evaluation.
-        quantize: the render was rounded to 8 bits.
-        lpips: the backbone, None where LPIPS is not computed.
-        colors: whether exposure and white balance were fitted first.
+    A background that is drawn in training means its colour at evaluation; `quantize`: the render was rounded to 8 bits;
+    `lpips` is the backbone, None where LPIPS is not computed.
     """
     sizes = sorted({(int(scene.cameras.width[v]), int(scene.cameras.height[v])) for v in views})
     return {
@@ -95,16 +87,7 @@ def measured_of(
     precision: str,
     step: int | None = None,
 ) -> dict[str, Any]:
-    """Return what was measured, with what.
-
-    Args:
-        model: with its weights.
-        config: the run's resolved config, as yaml.
-        choices: the names picked from each config group.
-        device: where it is rendered.
-        precision: of the products.
-        step: how long it was trained.
-    """
+    """Return what was measured, with what; `config` is resolved yaml, `choices` the names picked from each group."""
     settings = plain_yaml(config, "The run's config")
     weights = model.state_dict()
     on_gpu = device.type == "cuda"

@@ -61,10 +61,7 @@ def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
 class StageProgress:
     """One bar over stages of unequal cost, with the time left; one stage at a time goes from 0 to 1.
 
-    Where there is no terminal, a line now and then says the same.
-
-    Args:
-        costs: each stage's expected cost in any one unit, in the order of the stages.
+    Where there is no terminal, a line now and then says the same. `costs` are in any one unit, in the stages' order.
     """
 
     def __init__(self, costs: Mapping[str, float]):

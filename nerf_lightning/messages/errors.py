@@ -1,6 +1,8 @@
 """The one error that is meant for a person: bad input, said in one paragraph with its cure."""
 
 from collections.abc import Iterable
+from importlib import import_module
+from typing import Any
 
 ANOTHER = "The checkpoint is damaged, or made by somebody else: use another one."
 """The cure of a state that no run can have left."""
@@ -15,22 +17,26 @@ class InputError(Exception):
 
 
 def require_positive(**counts: int) -> None:
-    """Refuse intervals that never come.
-
-    Raises:
-        InputError: a count below 1.
-    """
+    """Refuse intervals that never come."""
     for name, count in counts.items():
         if count < 1:
             raise InputError(f"{name}={count}: give 1 or more.")
 
 
-def require_one_of(options: Iterable[str], **settings: object) -> None:
-    """Refuse a setting that is none of the options.
+def require_extra(module: str, extra: str, asked_by: str) -> Any:
+    """Return a module that one of this package's extras installs, or say how."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0].replace("skimage", "scikit-image")
+        raise InputError(
+            f"{asked_by} needs {package}, which is not installed or does not load here ({error}). Install it with: "
+            f"pip install 'nerf-lightning[{extra}]'"
+        ) from error
 
-    Raises:
-        InputError: with all of them.
-    """
+
+def require_one_of(options: Iterable[str], **settings: object) -> None:
+    """Refuse a setting that is none of the options."""
     options = tuple(options)
     for name, value in settings.items():
         if value not in options:

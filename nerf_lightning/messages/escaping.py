@@ -22,8 +22,7 @@ ADDRESS = re.compile(r"(?<=:)/(?=/)|(?<=www)\.", re.IGNORECASE)
 UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, lone surrogates (bytes that are not UTF-8), and ends of lines."""
 JOINERS = "\u200c\u200d"
-LONGEST_FILE_NAME = 200
-"""In bytes; file systems take 255, and endings are added."""
+LONGEST_FILE_NAME = 200  # In bytes; file systems take 255, and endings are added
 
 
 def for_terminal(text: str) -> str:
@@ -55,7 +54,7 @@ def for_markdown(text: str) -> str:
     """
     text = html.escape(for_terminal(text).strip(), quote=False)
     # Of an underscore between letters, of which there are many in our names, nothing is made.
-    text = MARKUP.sub(_after_backslash, text)
+    text = MARKUP.sub(lambda found: f"{found[0][:-1]}\\{found[0][-1]}", text)
     # Addresses are made links without any markup.
     return ADDRESS.sub(lambda found: f"&#{ord(found[0])};", text)
 
@@ -97,15 +96,7 @@ def is_plain(name: str) -> bool:
 
 
 def require_printable(name: str, where: str) -> None:
-    """Refuse a name that is not UTF-8 or holds control characters, before anything is called by it.
-
-    Args:
-        name: as the file, or the folder, has it.
-        where: what has this name, and where it stands, for the message.
-
-    Raises:
-        InputError: with the name, escaped.
-    """
+    """Refuse a name that is not UTF-8 or holds control characters, before anything (`where`) is called by it."""
     if not is_plain(name):
         raise InputError(
             f"{where} has the name '{for_terminal(name[:200])}', which holds control characters or is not UTF-8. "
@@ -139,10 +130,6 @@ def _as_in_python(letter: str) -> str:
 
 def _is_unprintable(letter: str) -> bool:
     return not letter.isprintable() and unicodedata.category(letter) in UNPRINTABLE
-
-
-def _after_backslash(found: re.Match[str]) -> str:
-    return f"{found[0][:-1]}\\{found[0][-1]}"
 
 
 def listed(items: Iterable[object], cap: int = 10) -> str:

@@ -55,11 +55,9 @@ def train(*overrides: str) -> TrainedRun:
         except SystemExit as stop:
             raise KeyboardInterrupt(f"The training was stopped (exit code {stop.code}).") from None
     metrics = read_json_object(done.folder / FILES["run"]) if config.final.evaluate else {}
-    return TrainedRun(done.folder, done.psnr, metrics, load(done.folder, *_of_the_machine(overrides)))
-
-
-def _of_the_machine(overrides: tuple[str, ...]) -> list[str]:
-    return [each for each in overrides if each.startswith(("trainer=", "trainer.accelerator=", "trainer.num_threads="))]
+    of_the_machine = ("trainer=", "trainer.accelerator=", "trainer.num_threads=")
+    model = load(done.folder, *(each for each in overrides if each.startswith(of_the_machine)))
+    return TrainedRun(done.folder, done.psnr, metrics, model)
 
 
 def _require_one_process(trainer: Any) -> None:

@@ -17,8 +17,7 @@ from nerf_lightning.files.regular import read_bytes
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.visualization.figures import new_figure
 
-Curve = tuple[Sequence[int], Sequence[float]]
-"""Steps and values."""
+Curve = tuple[Sequence[int], Sequence[float]]  # Steps and values
 WIDTH, HEIGHT = 560, 320
 MOST_CURVES = 12
 """In one chart; more are not told apart, and a stranger's file may have thousands."""
@@ -113,9 +112,8 @@ def psnr_curve(run: Path) -> Sequence[float]:
     except (InputError, OSError):
         return []
     validated = next((curves[tag][1] for tag in VALIDATION if tag in curves), [])
-    of_levels = [
-        values for tag, (_, values) in curves.items() if CHARTS[0].tags.fullmatch(tag) and tag not in VALIDATION
-    ]
+    training = [tag for tag in curves if CHARTS[0].tags.fullmatch(tag) and tag not in VALIDATION]
+    of_levels = [curves[tag][1] for tag in training]
     # The last level is the picture.
     values = validated if len(validated) >= FEWEST_VALIDATIONS or not of_levels else of_levels[-1]
     finite = [value for value in values if math.isfinite(value)]
@@ -123,11 +121,7 @@ def psnr_curve(run: Path) -> Sequence[float]:
 
 
 def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:
-    """Return steps and values of every scalar, thinned out where there are more than a drawing shows.
-
-    Raises:
-        InputError: there are none, or more than is read, or the files are damaged.
-    """
+    """Return steps and values of every scalar, thinned out where there are more than a drawing shows."""
     files = [file for file in folder.glob("*tfevents*") if not file.is_dir()]
     if not files:
         raise InputError("there are no TensorBoard files (logger=none)")
@@ -141,9 +135,8 @@ def read_curves(folder: Path) -> dict[str, tuple[list[int], list[float]]]:
         _copy(files, Path(copies))
         try:
             log = EventAccumulator(copies, size_guidance=kinds | {"scalars": MOST_POINTS}).Reload()
-            curves = {
-                tag: [(event.step, float(event.value)) for event in log.Scalars(tag)] for tag in log.Tags()["scalars"]
-            }
+            tags = log.Tags()["scalars"]
+            curves = {tag: [(event.step, float(event.value)) for event in log.Scalars(tag)] for tag in tags}
         except Exception as error:  # a stranger's records can fail in any way
             raise InputError(f"the TensorBoard files cannot be read ({type(error).__name__})") from error
     return {tag: ([step for step, _ in points], [value for _, value in points]) for tag, points in curves.items()}

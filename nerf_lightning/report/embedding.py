@@ -34,11 +34,7 @@ class Embedded:
 
 
 def embedded_file(path: Path) -> Embedded:
-    """Return a picture file, decoded and encoded anew: nothing of the file but its pixels comes into the page.
-
-    Raises:
-        InputError: it is no picture that can be read.
-    """
+    """Return a picture file, decoded and encoded anew: nothing of the file but its pixels comes into the page."""
     return embedded(read_rgba(path)[..., :3])
 
 
@@ -55,11 +51,7 @@ def embedded(picture: UInt8[np.ndarray, "height width 3"]) -> Embedded:
 
 
 def embedded_video(path: Path, most_bytes: int) -> str:
-    """Return an mp4 as an address.
-
-    Raises:
-        InputError: it is larger, no mp4, or cannot be read.
-    """
+    """Return an mp4 as an address."""
     content = read_bytes(path, most_bytes, "Larger films need a larger max_megabytes.")
     if content[4:8] != b"ftyp":
         raise InputError(f"{path.name} is not an mp4")

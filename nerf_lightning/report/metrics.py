@@ -5,7 +5,7 @@ from typing import Any
 
 from nerf_lightning.evaluation.kept_views import PARTS, picture_name
 from nerf_lightning.evaluation.metrics_files import COLUMNS
-from nerf_lightning.files.json_files import number
+from nerf_lightning.files.json_files import mapping, number
 from nerf_lightning.messages.console import spoken
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.report.embedding import embedded_file
@@ -35,14 +35,14 @@ MOST_PAIRS = 60
 
 def facts(metrics: dict[str, Any], note: dict[str, Any]) -> Pairs:
     """Return the numbers on top of a page."""
-    median, worst = _mapping(metrics.get("median")), _mapping(_mapping(metrics.get("worst")).get("psnr"))
+    median, worst = mapping(metrics.get("median")), mapping(mapping(metrics.get("worst")).get("psnr"))
     shown = [
         ("PSNR, mean", _shown("psnr", metrics.get("psnr"))),
         ("PSNR, median", _shown("psnr", median.get("psnr"))),
         ("PSNR, worst", _shown("psnr", worst.get("value"))),
         *((label, _shown(metric, metrics.get(metric))) for metric, label in LABELS.items()),
     ]
-    origin = _mapping(metrics.get("origin"))
+    origin = mapping(metrics.get("origin"))
     trained = number(note.get("training_seconds"))
     shown.append(("training", "" if trained is None else spoken(trained)))
     for label, value, form in (
@@ -68,7 +68,8 @@ def per_image(metrics: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 def tables(metrics: dict[str, Any]) -> list[tuple[str, Pairs]]:
     """Return protocol, origin and environment as pairs of texts."""
     titles = {"protocol": "Protocol", "origin": "Whose numbers these are", "environment": "Environment"}
-    pairs = {key: _pairs(_mapping(metrics.get(key))) for key in titles}
+    told = {key: list(mapping(metrics.get(key)).items())[:MOST_PAIRS] for key in titles}
+    pairs = {key: [(name.replace("_", " ")[:80], _said(value)) for name, value in found] for key, found in told.items()}
     if pairs["protocol"] and metrics.get("lpips") is None:
         pairs["protocol"] = [*pairs["protocol"], ("LPIPS", WITHOUT_LPIPS)]
     return [(title, pairs[key]) for key, title in titles.items()]
@@ -79,7 +80,7 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
     rows = {str(row.get("name")): row for row in _sequence(metrics.get("per_image")) if isinstance(row, dict)}
     worst = [str(name) for name in _sequence(metrics.get("worst_views"))][:MOST_VIEWS]
     named = [(f"worst_{place}", name) for place, name in enumerate(worst, start=1)]
-    split = str(_mapping(metrics.get("protocol")).get("split"))
+    split = str(mapping(metrics.get("protocol")).get("split"))
     spread = [(picture_name(split, name), name) for name in map(str, _sequence(metrics.get("pictures")))][:MOST_VIEWS]
     missing: list[str] = []
     pages: list[list[ViewOnPage]] = []
@@ -97,9 +98,8 @@ def views_on_page(metrics: dict[str, Any], images: Path) -> tuple[list[ViewOnPag
 
 def _view(folder: Path, name: str, row: dict[str, Any]) -> ViewOnPage:
     parts = {part: embedded_file(folder / f"{part}.png") for part in PARTS}
-    numbers = ", ".join(
-        f"{metric.upper()} {text}" for metric in ("psnr", "ssim") if (text := _shown(metric, row.get(metric)))
-    )
+    known = {metric: _shown(metric, row.get(metric)) for metric in ("psnr", "ssim")}
+    numbers = ", ".join(f"{metric.upper()} {text}" for metric, text in known.items() if text)
     return ViewOnPage(name=name[:200], numbers=numbers, **parts)
 
 
@@ -114,18 +114,10 @@ def _shown(metric: str, value: Any) -> str:
     return "" if known is None else FORMATS[metric].format(known)
 
 
-def _pairs(values: dict[str, Any]) -> Pairs:
-    return [(str(key).replace("_", " ")[:80], _said(value)) for key, value in list(values.items())[:MOST_PAIRS]]
-
-
 def _said(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(" x ".join(map(str, part)) if isinstance(part, list) else str(part) for part in value)[:300]
     return "none" if value is None else str(value)[:300]
-
-
-def _mapping(value: object) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
 
 
 def _sequence(value: object) -> list[Any]:

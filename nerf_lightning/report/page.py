@@ -7,11 +7,8 @@ and nothing be fetched.
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from markupsafe import Markup
-
 from nerf_lightning.doctor.check import Check
-from nerf_lightning.files.atomic import whole_file
-from nerf_lightning.files.html import own_policy, rendered
+from nerf_lightning.files.html import write_page
 from nerf_lightning.report.curves import Drawing
 from nerf_lightning.report.embedding import Embedded
 
@@ -60,15 +57,6 @@ class Report:
     config: str = ""
 
 
-def write_page(report: Report, target: Path) -> None:
+def write_report(report: Report, target: Path) -> None:
     """Write the report as one file of HTML."""
-    with whole_file(target) as part:
-        part.write_text(page(report), encoding="utf-8")
-
-
-def page(report: Report) -> str:
-    """Return the report as HTML."""
-    script, style = ((FOLDER / f"page.{ending}").read_text(encoding="utf-8") for ending in ("js", "css"))
-    policy = own_policy(script, style)
-    # Ours alone are put in as they are.
-    return rendered(FOLDER / "page.html", report=report, policy=policy, script=Markup(script), style=Markup(style))
+    write_page(FOLDER / "page.html", target, report=report)

@@ -1,9 +1,9 @@
 """From a run folder to what its page shows. What cannot be read is left out, and the page says so."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from nerf_lightning.checkpoints.reading import newest_checkpoint
@@ -51,10 +51,11 @@ def read_run(
         newest = max(pages, key=lambda file: file.stat().st_mtime)
         report.scene_page = address_from(newest.absolute(), (folder or run).absolute())
 
-    def attempt(what: str, add: Callable[..., None], *given: Any) -> None:
+    @contextmanager
+    def attempt(what: str) -> Iterator[None]:
         """Leave out what cannot be read, and say why."""
         try:
-            add(report, run, *given)
+            yield
         except InputError as error:
             report.missing.append(f"{what}: {error}")
         except OSError as error:
@@ -64,18 +65,24 @@ def read_run(
         progress("views", 0.0)
         _add_measured(report, run, metrics)
         for step in _validation_pictures(run):
-            attempt("A picture of the validation", _add_step, step)
-        attempt("Config", _add_config)
+            with attempt("A picture of the validation"):
+                report.steps.append((f"step {step.stem.partition('_')[2].lstrip('0')}", embedded_file(step)))
+        with attempt("Config"):
+            _add_config(report, run)
         progress("curves", 0.0)
-        attempt("Curves", _add_curves)
+        with attempt("Curves"):
+            report.curves = curve_drawings(read_curves(run / "tensorboard"))
         progress("films", 0.0)
         for name, label in VIDEOS.items():
             if (run / name).is_file():
-                attempt("Film", _add_film, name, label, most_video_bytes)
+                with attempt("Film"):
+                    report.videos.append((label, embedded_video(run / name, most_video_bytes)))
         progress("capture", 0.0)
-        attempt("Coverage", _add_coverage)
+        with attempt("Coverage"):
+            _add_coverage(report, run)
         if examine is not None:
-            attempt("The doctor", _add_checks, examine)
+            with attempt("The doctor"):
+                report.checks = examine()
     return report
 
 
@@ -109,10 +116,6 @@ def _validation_pictures(run: Path) -> list[Path]:
     return sorted(files[-1 - i * len(files) // MOST_STEPS] for i in range(MOST_STEPS))
 
 
-def _add_step(report: Report, run: Path, file: Path) -> None:
-    report.steps.append((f"step {file.stem.partition('_')[2].lstrip('0')}", embedded_file(file)))
-
-
 def _add_config(report: Report, run: Path) -> None:
     config = run / ".hydra" / "config.yaml"
     text = read_text(config, 4 * limits().yaml_characters)
@@ -122,21 +125,9 @@ def _add_config(report: Report, run: Path) -> None:
     report.overrides = "\n".join(map(str, overrides)) if isinstance(overrides, list) else ""
 
 
-def _add_curves(report: Report, run: Path) -> None:
-    report.curves = curve_drawings(read_curves(run / "tensorboard"))
-
-
-def _add_film(report: Report, run: Path, name: str, label: str, most_bytes: int) -> None:
-    report.videos.append((label, embedded_video(run / name, most_bytes)))
-
-
 def _add_coverage(report: Report, run: Path) -> None:
     checkpoint = newest_checkpoint(run / "checkpoints")
     if checkpoint is None:
         raise InputError(f"{run} has no checkpoint")
     report.title = f"{checkpoint.scene.name}, {checkpoint.choices.get('model', '')}: {report.title}"
     report.coverage = embedded(coverage_picture(checkpoint.scene).numpy())
-
-
-def _add_checks(report: Report, run: Path, examine: Callable[[], list[Check]]) -> None:
-    report.checks = examine()

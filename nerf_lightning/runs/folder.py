@@ -5,11 +5,13 @@ A run folder has `run.json` (its config's fingerprint, and what it came to), `.h
 """
 
 import contextlib
+import io
 import itertools
 import logging
 import os
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -24,22 +26,22 @@ from omegaconf.errors import OmegaConfBaseException
 from nerf_lightning.checkpoints.reading import DAMAGED, LAST, PREVIOUS, newest_checkpoint, read_checkpoint
 from nerf_lightning.checkpoints.writing import sweep_leftovers
 from nerf_lightning.compute.slurm import slurm_job, was_requeued
-from nerf_lightning.config.identity import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.instantiate import required_path
+from nerf_lightning.config.key_meanings import fingerprint, run_identity, settings_digest
 from nerf_lightning.config.overrides import key_of, to_type
 from nerf_lightning.files.atomic import whole_file
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.links import require_no_way_out
-from nerf_lightning.files.made_folders import make_folder, make_new_folder
-from nerf_lightning.files.run_marker import require_run
+from nerf_lightning.files.made_folders import make_folder, make_new_folder, require_run
+from nerf_lightning.files.regular import open_to_append
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import EscapingFormatter
 from nerf_lightning.runs.summary import folders_of_runs, read_note
 
 log = logging.getLogger(__name__)
 
-UNKNOWN = "unknown"
-"""What stands for the value of a setting where a config does not have it."""
+UNKNOWN = "unknown"  # What stands for the value of a setting where a config does not have it
 
 
 @dataclass(frozen=True)
@@ -83,49 +85,31 @@ class RunFolder:
         planned = int(number(read_note(self.path).get("num_steps")) or 0)
         return ResumePoint(path, found.step, found.precision, found.tile_points, max(found.step, planned))
 
-    def plan(self, num_steps: int) -> None:
-        """Note how long the run is to be.
-
-        Raises:
-            InputError: the folder is gone.
-        """
-        self._note(num_steps=num_steps)
-
     def trained(self, seconds: float) -> None:
         """Note how long this start has trained, from its first step to its last, and how long all else took before now.
 
         A run that is gone on with counts on.
-
-        Raises:
-            InputError: the folder is gone.
         """
         note, here = read_note(self.path), time.monotonic() - self.began
         spent = {"training_seconds": seconds, "setup_seconds": here - seconds}
-        self._note(**{key: round((number(note.get(key)) or 0.0) + value, 1) for key, value in spent.items()})
+        self.note(**{key: round((number(note.get(key)) or 0.0) + value, 1) for key, value in spent.items()})
 
-    def finish(self, step: int, psnr: float | None = None) -> None:
-        """Note that the run is complete.
+    def note(self, **values: Any) -> None:
+        """Add values to `run.json`: `num_steps`, how long the run is to be; `finished_at_step`, once it is complete.
 
         Raises:
             InputError: the folder is gone.
         """
-        self._note(finished_at_step=step, psnr=psnr)
-
-    def stop(self, restarted: bool) -> None:
-        """Note that the run was stopped; a `restarted` one is started again by its scheduler, and then goes on."""
-        self._note(**({"preempted": True} if restarted else {}))
-
-    def release(self) -> None:
-        """Let others have the folder."""
-        self.lock.release()
-
-    def _note(self, **values: Any) -> None:
         require_run(self.path)
         note = read_note(self.path)
         now = time.monotonic()
         seconds: float = round((number(note.get("seconds")) or 0.0) + now - self.began, 1)
         self.began = now
         write_json(self.path / "run.json", note | {"seconds": seconds} | values)
+
+    def release(self) -> None:
+        """Let others have the folder."""
+        self.lock.release()
 
 
 def open_run(
@@ -141,8 +125,7 @@ def open_run(
         config: the run's config.
         num_steps: its length; a run that finished earlier counts as unfinished.
         job_folder: the folder that a sweep gives this job, or None for a single run.
-        asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand;
-            None: nothing was.
+        asked: the config before anything was chosen for the scene, which is what a sweep knows of a job beforehand.
         typed: the overrides of the command line.
 
     Raises:
@@ -166,18 +149,11 @@ def open_run(
             f"The run folder {folder} cannot be written: {error}. Give another one with paths.output_dir=DIR."
         ) from error
     note = read_note(folder)
-    kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0} | {
-        key: note[key]
-        for key in ("started", "seconds", "training_seconds", "setup_seconds", "num_steps")
-        if key in note
-    }
+    kept = {"started": datetime.now().isoformat(timespec="seconds"), "seconds": 0.0}
+    kept |= {key: note[key] for key in (*kept, "training_seconds", "setup_seconds", "num_steps") if key in note}
     job = {} if slurm_job() is None else {"slurm_job": slurm_job()}
-    write_json(
-        folder / "run.json",
-        {"fingerprint": fingerprint(identity), "settings": settings_digest(config if asked is None else asked)}
-        | kept
-        | job,
-    )
+    settings = settings_digest(config if asked is None else asked)
+    write_json(folder / "run.json", {"fingerprint": fingerprint(identity), "settings": settings} | kept | job)
     sweep_leftovers(folder / "checkpoints")
     named = str(config.resume).endswith(".ckpt")
     return RunFolder(folder, lock, Path(config.resume) if named else None)
@@ -304,17 +280,14 @@ def _difference(identity: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _newest_unfinished(root: Path, digest: str, num_steps: int, of_job: str | None) -> Path | None:
-    for folder in sorted(folders_of_runs(root), key=_time_of_note, reverse=True):
+    folders = folders_of_runs(root)
+    for folder in sorted(folders, key=lambda folder: (folder / "run.json").stat().st_mtime, reverse=True):
         note = read_note(folder)
         ours = note.get("fingerprint") == digest and (of_job is None or note.get("slurm_job") == of_job)
         finished = number(note.get("finished_at_step"))
         if ours and (finished is None or finished < num_steps):
             return folder
     return None
-
-
-def _time_of_note(folder: Path) -> float:
-    return (folder / "run.json").stat().st_mtime
 
 
 def _fresh(parent: Path) -> Path:
@@ -324,3 +297,30 @@ def _fresh(parent: Path) -> Path:
             make_new_folder(parent / name)
             return parent / name
     raise AssertionError("unreachable: the names never end")
+
+
+@contextlib.contextmanager
+def log_file(folder: Path) -> Iterator[None]:
+    """Append all that is logged to `train.log` in a run folder.
+
+    Raises:
+        InputError: what has this name is no regular file.
+        OSError: it cannot be opened.
+    """
+    with open_to_append(folder / "train.log", "Remove it.") as file:
+        # Written as it comes: nothing waits for the end, where a full disk would be an error once more.
+        unbuffered: Any = file.raw
+        handler = _Handler(io.TextIOWrapper(unbuffered, "utf-8", write_through=True))
+        handler.setFormatter(EscapingFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(handler)
+        try:
+            yield
+        finally:
+            logging.getLogger().removeHandler(handler)
+
+
+class _Handler(logging.StreamHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Lose a line that the disk has no room for: the console has it, and what matters is told by who writes it."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)

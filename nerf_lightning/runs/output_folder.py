@@ -33,11 +33,7 @@ def chosen_folder(given: str | None, default: Path) -> Path:
 
 
 def output_folder(given: str | None, default: Path) -> Path:
-    """Return the folder that `chosen_folder` names, made and tried.
-
-    Raises:
-        InputError: the folder cannot be made or written, or links lead out of it.
-    """
+    """Return the folder that `chosen_folder` names, made and tried."""
     folder = chosen_folder(given, default)
     try:
         make_folder(folder)
@@ -53,11 +49,7 @@ def output_folder(given: str | None, default: Path) -> Path:
 
 @contextmanager
 def filled_folder(given: str | None, default: Path) -> Iterator[Path]:
-    """Lend the folder that `output_folder` returns; what was made of it and is empty at the end is removed again.
-
-    Raises:
-        InputError: as `output_folder`.
-    """
+    """Lend the folder that `output_folder` returns; what was made of it and is empty at the end is removed again."""
     wanted = chosen_folder(given, default).absolute()
     made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
     try:

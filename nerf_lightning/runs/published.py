@@ -30,16 +30,14 @@ class Published:
 
 
 def published_for(scene: str, reader: str) -> list[Published]:
-    """Return what is known of a scene, the best first.
+    """Return what is known of a scene (its name, or one that begins with it), the best first.
 
     >>> [found.psnr for found in published_for("lego_200", "blender")][-1]
     32.54
     >>> published_for("bricks", "bricks")
     []
 
-    Args:
-        scene: its name, or one that begins with it.
-        reader: the format that it was read by: a chair of one's own is none of the benchmark's.
+    A chair of one's own is none of the benchmark's: the format that it was read by must be the same.
     """
     names = {scene.lower(), re.split(r"[\W_]", scene.lower())[0]}
     found = [result for result in _all() if result.scene in names and reader in result.readers]
@@ -49,20 +47,12 @@ def published_for(scene: str, reader: str) -> list[Published]:
 @cache
 def _all() -> tuple[Published, ...]:
     benchmarks = yaml.safe_load(FILE.read_text(encoding="utf-8"))["benchmarks"]
+    results = [(benchmark, result) for benchmark in benchmarks for result in benchmark["results"]]
     return tuple(
         Published(
-            benchmark=benchmark["name"],
-            scene=scene,
-            method=result["method"],
-            psnr=float(psnr),
-            resolution=benchmark["resolution"],
-            steps=result.get("steps"),
-            time=result["time"],
-            source=result["source"],
-            measured=benchmark["measured"],
-            readers=tuple(benchmark["readers"]),
+            *(benchmark["name"], scene, result["method"], float(psnr), benchmark["resolution"], result.get("steps")),
+            *(result["time"], result["source"], benchmark["measured"], tuple(benchmark["readers"])),
         )
-        for benchmark in benchmarks
-        for result in benchmark["results"]
+        for benchmark, result in results
         for scene, psnr in result["psnr"].items()
     )

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from nerf_lightning.config.key_meanings import PLACES, meaning_of
 from nerf_lightning.evaluation.metrics_files import METRICS
 from nerf_lightning.files.budgets import limits
-from nerf_lightning.files.json_files import number, read_json_object
+from nerf_lightning.files.json_files import mapping, number, read_json_object
 from nerf_lightning.files.walk import walk
 from nerf_lightning.files.yaml_files import read_plain_yaml
 from nerf_lightning.messages.errors import InputError
@@ -57,11 +57,7 @@ class FoundResults:
 def find_results(
     folders: Sequence[Path], measured: Measured, scenes: Sequence[str] | None, models: Sequence[str] | None
 ) -> FoundResults:
-    """Return the results of the runs in these folders whose scene and model fit a pattern ("lego*"; None: all).
-
-    Raises:
-        InputError: a folder is not there, there is no run in them, none was measured, or none fits.
-    """
+    """Return the results of the runs in these folders whose scene and model fit a pattern ("lego*"; None: all)."""
     read = {run: read_result(run, measured) for run in find_runs(folders)}
     results = [result for result in read.values() if result is not None]
     if not results:
@@ -89,11 +85,7 @@ def _as_given(patterns: Sequence[str] | None) -> str:
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Return the run folders in these folders, and what `nerf eval` wrote on its own; nothing is followed out of them.
-
-    Raises:
-        InputError: a folder is not there, or there is no run in them.
-    """
+    """Return the run folders in these folders, and what `nerf eval` wrote on its own, below each of these folders."""
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"runs={folder}: there is no such folder. Give run folders, or folders that hold some.")
@@ -124,29 +116,27 @@ def read_result(folder: Path, measured: Measured) -> RunResult | None:
     if number(metrics.get("psnr")) is None:
         return None
     run, note = read_run(folder), read_note(folder)
-    protocol = _mapping(metrics.get("protocol"))
-    origin = _choices(folder) | _mapping(metrics.get("origin"))
+    protocol = mapping(metrics.get("protocol"))
+    origin = _choices(folder) | mapping(metrics.get("origin"))
     seed = str(origin.get("seed", run.overrides.get("seed", "0")))
     values = {metric: number(metrics.get(metric)) for metric in METRICS}
     values["frames_per_second"] = number(metrics.get("frames_per_second"))
     values |= {key: number(origin.get(key)) for key in ("parameters", "megabytes")}
     values["steps"] = number(origin.get("step")) if run.steps is None else run.steps
-    values["minutes"] = _minutes(number(note.get("training_seconds")))
+    seconds = number(note.get("training_seconds"))
+    values["minutes"] = None if seconds is None else seconds / 60
+    # `scene@PACKAGE` picks from the group that `scene` picks from.
+    settings = {k: v for k, v in run.overrides.items() if meaning_of(k.lstrip("+~").partition("@")[0]).shown}
     return RunResult(
         summary=run,
         scene=_scene_name(protocol, origin, run.overrides),
         model=str(origin.get("model") or run.overrides.get("model", "")) or "not said",
         seed=int(seed) if SEED.fullmatch(seed) else None,
         values=values,
-        settings=told_settings({key: value for key, value in run.overrides.items() if _is_shown(key.lstrip("+~"))}),
+        settings=told_settings(settings),
         protocol=protocol,
         origin=origin,
     )
-
-
-def _is_shown(key: str) -> bool:
-    # `scene@PACKAGE` picks from the group that `scene` picks from.
-    return meaning_of(key.partition("@")[0]).shown
 
 
 def _scene_name(protocol: dict[str, Any], origin: dict[str, Any], overrides: dict[str, str]) -> str:
@@ -165,11 +155,3 @@ def _choices(folder: Path) -> dict[str, Any]:
         return {key: choices[key] for key in ("scene", "model")}
     except (InputError, LookupError, TypeError):
         return {}
-
-
-def _mapping(value: object) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _minutes(seconds: float | None) -> float | None:
-    return None if seconds is None else seconds / 60

@@ -26,11 +26,7 @@ KEY = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
 def former_overrides(run_folder: Path, arguments: Sequence[str]) -> list[str]:
-    """Return what a run was started with, but for what belongs to one start and what the user gives again.
-
-    Raises:
-        InputError: the file is no list of overrides, or holds one that is not repeated from files.
-    """
+    """Return what a run was started with, but for what belongs to one start and what the user gives again."""
     saved = run_folder / ".hydra" / "overrides.yaml"
     if not saved.is_file():
         return []
@@ -136,14 +132,11 @@ def _is_harmless_alone(override: Override, of_sweep: bool) -> bool:
         return False
     if key in CHOSEN_GROUPS:
         names = value if isinstance(value, list) else [value]
-        return all(_is_option(name) for name in names) or (isinstance(value, dict) and _is_plain(key, value, of_sweep))
+        are_options = all(name is None or (isinstance(name, str) and OPTION.fullmatch(name)) for name in names)
+        return are_options or (isinstance(value, dict) and _is_plain(key, value, of_sweep))
     if "/" in key or package is not None:
         return False
     return is_removable(key) if override.is_delete() else _is_plain(key, value, of_sweep)
-
-
-def _is_option(name: Any) -> bool:
-    return name is None or (isinstance(name, str) and OPTION.fullmatch(name) is not None)
 
 
 def _is_plain(key: str, value: Any, of_sweep: bool) -> bool:

@@ -23,6 +23,7 @@ from nerf_lightning.files.made_folders import remove_empty
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.runs.saved_overrides import to_give_again
+from nerf_lightning.runs.summary import RunSummary, by_key, differing_keys, read_run, told_settings
 from nerf_lightning.runs.sweep_job import NUM_JOBS, JobRecord, read_records, records_folder, stop_file
 from nerf_lightning.runs.sweep_record import SweepRecord, sweep_record
 
@@ -76,7 +77,11 @@ class SweepWatch(Callback):
         os.environ[NUM_JOBS] = _num_jobs(config.hydra)
         launcher = config.hydra.launcher._target_
         if launcher.endswith(LOCAL_LAUNCHERS):
-            _share_cores(launcher, config.hydra.launcher)
+            # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local
+            # jobs are told nothing.
+            os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
+            if launcher.endswith(".LocalLauncher"):
+                os.environ.setdefault("OMP_NUM_THREADS", str(config.hydra.launcher.cpus_per_task or 1))
             _pass_signals_on(sweep)
         _begun.append(sweep)
 
@@ -108,7 +113,6 @@ def watched(run: Callable[[], None]) -> None:
 def _end() -> list[JobRecord]:
     # Imported late: they bring torch, and Hydra loads this module before it composes any command's config.
     from nerf_lightning.messages.console import say
-    from nerf_lightning.runs.sweep_table import job_rows
     from nerf_lightning.runs.table_files import write_csv, write_markdown
     from nerf_lightning.runs.table_screen import print_rows
 
@@ -128,6 +132,28 @@ def _end() -> list[JobRecord]:
     if any(record.state in ("running", "stopped") for record in records):
         say(f"go on with   {sweep.go_on_with()}")
     return records
+
+
+def job_rows(records: list[JobRecord], sweep_folder: Path) -> list[dict[str, Any]]:
+    """Return a row per job, sorted by PSNR; what no job has, or all have the same of, is left out of the settings."""
+    runs = {record.number: read_run(Path(record.folder)) for record in records}
+    settings = {record.number: told_settings(by_key(record.overrides)) for record in records}
+    swept = differing_keys(list(settings.values()))
+    rows = []
+    for record in sorted(records, key=lambda record: _rank(runs[record.number], record)):
+        run = runs[record.number]
+        row: dict[str, Any] = {"job": record.number} | {key: settings[record.number].get(key, "") for key in swept}
+        results = {"PSNR": run.psnr, "SSIM": run.ssim, "steps": run.steps, "seconds": run.seconds}
+        row |= results if "finished" in record.state else dict.fromkeys(results)
+        folder, whole = run.folder.absolute(), sweep_folder.absolute()
+        shown = str(folder.relative_to(whole) if folder.is_relative_to(whole) else run.folder)
+        rows.append(row | {"state": record.state, "folder": shown})
+    return rows
+
+
+def _rank(run: RunSummary, record: JobRecord) -> tuple[bool, float, int]:
+    known = run.psnr is not None and "finished" in record.state
+    return not known, -(run.psnr or 0.0) if known else 0.0, record.number
 
 
 def _remove_refused(sweep: Sweep) -> bool:
@@ -160,14 +186,6 @@ def _complain(bad: list[JobRecord], total: int, error: Exception | None) -> None
         raise InputError(message)
     log.error("nerf: %s", message)
     raise SystemExit(1)
-
-
-def _share_cores(launcher: str, settings: DictConfig) -> None:
-    # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local jobs are
-    # told nothing.
-    os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
-    if launcher.endswith(".LocalLauncher"):
-        os.environ.setdefault("OMP_NUM_THREADS", str(settings.cpus_per_task or 1))
 
 
 def _pass_signals_on(sweep: Sweep) -> None:

@@ -17,17 +17,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from nerf_lightning.compute.slurm import was_requeued
-from nerf_lightning.config.identity import settings_digest
+from nerf_lightning.config.key_meanings import settings_digest
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.files.json_files import number, write_json
 from nerf_lightning.files.made_folders import make_folder, remove_empty
 from nerf_lightning.files.regular import read_text
 from nerf_lightning.runs.summary import by_key, folders_of_runs, read_note
 
-NUM_JOBS = "NERF_LIGHTNING_JOBS"
-"""In the environment of the jobs: how many there are."""
-MOST_BYTES = 1 << 20
-"""Of a record."""
+NUM_JOBS = "NERF_LIGHTNING_JOBS"  # In the environment of the jobs: how many there are
+MOST_BYTES = 1 << 20  # Of a record
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +47,7 @@ class JobRecord:
 
 
 def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) -> Any:
-    """Run one job of a sweep and return its value, None where it failed.
-
-    Args:
-        run: what the command does.
-        config: the job's config.
-        command: its name.
+    """Run one job of a sweep (what a command does, with its config) and return its value, None where it failed.
 
     Raises:
         SystemExit: a signal stopped the job, which stops a sweep whose jobs run in one process.
@@ -63,11 +56,13 @@ def run_job(run: Callable[[DictConfig], Any], config: DictConfig, command: str) 
     sweep_folder, own = Path(hydra.sweep.dir), Path(hydra.runtime.output_dir)
     elsewhere = not hydra.launcher._target_.endswith(".BasicLauncher")
     if elsewhere:
-        from nerf_lightning.messages.console import (
-            label_lines,  # rich takes its time, and this file is read before any command
-        )
+        # Imported late: rich takes its time, and this file is read before any command.
+        from nerf_lightning.messages.console import label_lines
 
-        _behave_as_one_of_many()
+        # The sweep's own process hears Ctrl-C and passes it on to the jobs that run.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # Bars of several processes on one terminal overwrite each other; rich asks this variable.
+        os.environ["TTY_COMPATIBLE"] = "0"
         label_lines(job_label(int(hydra.job.num), own, list(hydra.overrides.task)))
         if stop_file(sweep_folder).exists():
             return None
@@ -147,13 +142,6 @@ def _former_run(sweep_folder: Path, own: Path, config: DictConfig) -> Path | Non
         return None
     others = sorted(folder for folder in folders_of_runs(sweep_folder) if folder != own)
     return finished_run([own, *others], config)
-
-
-def _behave_as_one_of_many() -> None:
-    # The sweep's own process hears Ctrl-C and passes it on to the jobs that run.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Bars of several processes on one terminal overwrite each other; rich asks this variable.
-    os.environ["TTY_COMPATIBLE"] = "0"
 
 
 def finished_run(folders: Iterable[Path], config: DictConfig) -> Path | None:

@@ -40,11 +40,7 @@ def sweep_record(sweep_folder: Path) -> Path:
 
 
 def read_sweep(sweep_folder: Path) -> SweepRecord | None:
-    """Return what a sweep was started with, None where the folder holds no sweep.
-
-    Raises:
-        InputError: the file is no record of a sweep.
-    """
+    """Return what a sweep was started with, None where the folder holds no sweep."""
     record = sweep_record(sweep_folder)
     if not record.is_file():
         return None

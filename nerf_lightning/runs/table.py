@@ -34,8 +34,7 @@ PLAIN = {
     "megabytes": "MB",
 }
 """Columns with the mean alone."""
-ORDERS = (*SPREAD, *PLAIN, "model")
-"""What rows may be sorted by."""
+ORDERS = (*SPREAD, *PLAIN, "model")  # What rows may be sorted by
 HIGH_FIRST = (*HIGHER_IS_BETTER, "frames_per_second")
 CHOOSE_PICTURES = ("split", "resolution", "masks", "downscale", "filter", "hold_every", "frames")
 """Where these differ, so do the pictures, and that need not be said again."""
@@ -44,8 +43,7 @@ NOTED = ("version", "commit", "device", "precision")
 MOST_SETTINGS = 32
 """Columns of settings by which runs differ: a stranger's run may have thousands."""
 MOST_LETTERS = 80
-MOST_CURVES = 40
-"""Rows whose curves are read, which takes time."""
+MOST_CURVES = 40  # Rows whose curves are read, which takes time
 
 Group = list[RunResult]
 CurveReader = Callable[[Path], Sequence[float]]
@@ -55,17 +53,9 @@ CurveReader = Callable[[Path], Sequence[float]]
 def result_table(
     found: FoundResults, order: str, published: bool, force: bool, curve_of: CurveReader | None
 ) -> tuple[list[Row], list[str]]:
-    """Return the rows, and the lines that belong below them.
+    """Return the rows, in one of `ORDERS`, and the lines that belong below them; a `curve_of` of None: no curves.
 
-    Args:
-        found: what was measured.
-        order: one of `ORDERS`.
-        published: add what others have published.
-        force: put results together that were not measured alike.
-        curve_of: reads the curve of a run; None: no curves.
-
-    Raises:
-        InputError: they were not measured alike, and not `force`.
+    `force` puts results together that were not measured alike.
     """
     notes = one_protocol(found.measured, force)
     groups, left_out = group_seeds(found.measured)

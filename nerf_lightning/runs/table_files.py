@@ -21,20 +21,17 @@ DECIMALS = {
     **{"depth error": 4, "depth error std": 4, "normal error": 2, "normal error std": 2, "MB": 1, "frames/s": 3},
 }
 """Columns of numbers, and the digits that are shown."""
-SECONDS = {"seconds": 1, "minutes": 60}
-"""Columns of times, in seconds each."""
+SECONDS = {"seconds": 1, "minutes": 60}  # Columns of times, in seconds each
 BLOCKS = "▁▂▃▄▅▆▇█"
-SPARKLINE = 12
-"""Signs in which a curve is drawn."""
+SPARKLINE = 12  # Signs in which a curve is drawn
 
 
 def write_csv(rows: list[Row], path: Path) -> None:
     """Write the rows with all digits; curves are left out."""
     columns = [column for column in rows[0] if column != "curve"]
     with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows(
-            map(for_csv, line) for line in (columns, *([row[c] for c in columns] for row in rows))
-        )
+        lines = (columns, *([row[column] for column in columns] for row in rows))
+        csv.writer(file).writerows(map(for_csv, line) for line in lines)
 
 
 def write_markdown(rows: list[Row], path: Path, notes: Sequence[str] = ()) -> None:
@@ -67,9 +64,8 @@ def shown_columns(rows: list[Row]) -> dict[str, list[str]]:
             columns["time"] = [_time(row) for row in rows]
         elif not name.endswith(" std"):
             deviations = [shown(row, f"{name} std") for row in rows]
-            columns[name] = [
-                shown(row, name) + (f" ± {of}" if of else "") for row, of in zip(rows, deviations, strict=True)
-            ]
+            pairs = zip(rows, deviations, strict=True)
+            columns[name] = [shown(row, name) + (f" ± {of}" if of else "") for row, of in pairs]
     if "model" in columns:
         columns["model"] = [f"{row['model']}{' (published)' if row.get('source') else ''}" for row in rows]
     return columns

@@ -23,19 +23,12 @@ NEXT = (
     *("depth error", "normal error", "parameters", "MB", "frames/s"),
 )
 """And those that are worth less, in their order."""
-WIDE_TEXT = 20
-"""Longer texts are broken if other columns have no room."""
+WIDE_TEXT = 20  # Longer texts are broken if other columns have no room
 PIPED_WIDTH = 160
 
 
 def print_rows(rows: list[Row], title: str, elsewhere: str) -> None:
-    """Print a table.
-
-    Args:
-        rows: all with the same columns.
-        title: the line above it.
-        elsewhere: where the columns are that do not fit, for the line below.
-    """
+    """Print a table with its title, and below it `elsewhere`: where the columns are that do not fit."""
     is_seen = "COLUMNS" in os.environ or sys.stdout.isatty() or sys.stderr.isatty()
     console = StdoutConsole(width=None if is_seen else PIPED_WIDTH)
     shown = shown_columns(rows)

@@ -22,8 +22,7 @@ from nerf_lightning.selftest.check import Check
 from nerf_lightning.selftest.scene import HELD_OUT, ball_scene, write_npz
 
 STEPS, STOP, MOST_SECONDS = 40, 20, 900
-ONE_STEP = 0.03
-"""The learning rate: about what a step moves a weight by."""
+ONE_STEP = 0.03  # The learning rate: about what a step moves a weight by
 # A film through two photographs: its frames are those views.
 FILM = ("path=photographs", f"path.views=[{HELD_OUT[0]},{HELD_OUT[1]}]", "path.num_frames=2")
 # A hash grid behind an occupancy grid, which has all the state that a run can have. A constant rate, since the two
@@ -52,11 +51,7 @@ class CommandLine:
         self.chains: list[Future[None]] = [self.pool.submit(self._train_and_film), self.pool.submit(self._resume)]
 
     def finished(self) -> Path:
-        """Wait for all runs, and return the folder.
-
-        Raises:
-            RuntimeError: a command failed.
-        """
+        """Wait for all runs, and return the folder."""
         for chain in self.chains:
             chain.result()
         return self.folder
@@ -124,9 +119,8 @@ def _state(path: Path, whole: bool) -> dict[str, Tensor]:
     found: dict[str, Tensor] = {name: value.double() for name, value in content["state_dict"].items()}
     if not whole:
         return {name: value for name, value in found.items() if name.endswith((".table", "mlp.0", "mlp.1"))}
-    found["progress"] = torch.tensor(
-        [float(value) for _, value in sorted(content["nerf_lightning"]["progress"].items())]
-    )
+    progress = sorted(content["nerf_lightning"]["progress"].items())
+    found["progress"] = torch.tensor([float(value) for _, value in progress])
     for number, state in content["optimizer_states"][0]["state"].items():
         found |= {f"optimizer.{number}.{name}": torch.as_tensor(value).double() for name, value in state.items()}
     return found

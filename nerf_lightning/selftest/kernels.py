@@ -52,21 +52,16 @@ def checks(device: torch.device, precisions: Sequence[MatmulPrecision]) -> list[
         found.append(Check(f"ragged samples: {what}", 8 * PACKED_SAMPLES * ROUNDING, sums, compare))
     for matmul_precision in precisions:
         for what, bound in BOUNDS.items():
-            compare, because = (
-                partial(_mlp, device, matmul_precision, what),
-                f"{LAYERS} layers of {matmul_precision} products",
-            )
-            found.append(
-                Check(f"perceptron, {matmul_precision}: {what}", bound(matmul_precision, LAYERS), because, compare)
-            )
+            name, because = f"perceptron, {matmul_precision}: {what}", f"{LAYERS} layers of {matmul_precision} products"
+            compare = partial(_mlp, device, matmul_precision, what)
+            found.append(Check(name, bound(matmul_precision, LAYERS), because, compare))
     return found
 
 
 def _loads(backend: str) -> float:
-    if backends.backend(f"{backends.KERNELS}.{backend}") is None:
-        raise CannotRun(
-            f"{backends.why_not(f'{backends.KERNELS}.{backend}')}: plain torch does its work, many times slower"
-        )
+    module = f"{backends.KERNELS}.{backend}"
+    if backends.backend(module) is None:
+        raise CannotRun(f"{backends.why_not(module)}: plain torch does its work, many times slower")
     return 0.0
 
 

@@ -42,8 +42,7 @@ LAYERS = 6
 # 0.5 to 0.75 dB. What rounding does to a run must be less than that: all of 0.5 dB where products have 8 bits, half
 # where they have 11, and a tenth where only the order of sums differs.
 PSNR_APART: dict[MatmulPrecision, float] = {"float32": 0.05, "tf32": 0.25, "bfloat16": 0.5}
-LEARNT = 1e4
-"""Tables begin between -1e-4 and 1e-4, and learn to be about 1."""
+LEARNT = 1e4  # Tables begin between -1e-4 and 1e-4, and learn to be about 1
 CPU = torch.device("cpu")
 
 
@@ -133,9 +132,8 @@ def gradients_apart(found: dict[str, Tensor], expected: dict[str, Tensor]) -> fl
 
 
 def _gradients(method: str, device: torch.device, matmul_precision: MatmulPrecision) -> float:
-    return gradients_apart(
-        Training(method, device, matmul_precision, TILE_POINTS).gradients(), reference_gradients(method)
-    )
+    found = Training(method, device, matmul_precision, TILE_POINTS).gradients()
+    return gradients_apart(found, reference_gradients(method))
 
 
 def _psnr(method: str, device: torch.device, matmul_precision: MatmulPrecision) -> float:

@@ -6,17 +6,20 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.text import Text
+from rich.tree import Tree
 
 from nerf_lightning.commands.train_job.evaluate_and_film import PostTraining
 from nerf_lightning.compute import ranks
 from nerf_lightning.config.auto_settings import resolve_auto, resolve_correction
 from nerf_lightning.config.instantiate import build
-from nerf_lightning.config.tree import print_tree
 from nerf_lightning.doctor.check import Check
 from nerf_lightning.doctor.gate import exposure_finding, require_sound
 from nerf_lightning.messages.console import StdoutConsole
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.escaping import for_terminal
 from nerf_lightning.nerf.types.scene import Scene
 from nerf_lightning.runs.folder import former_config, job_folder
 from nerf_lightning.training.build_run import Run, assemble
@@ -58,18 +61,12 @@ def build_job(asked: DictConfig) -> TrainJob:
 
 
 def assemble_job(
-    asked: DictConfig,
-    choices: Mapping[str, Any],
-    overrides: Sequence[str],
-    former: Mapping[str, Any] | None = None,
+    asked: DictConfig, choices: Mapping[str, Any], overrides: Sequence[str], former: Mapping[str, Any] | None = None
 ) -> TrainJob:
     """Build all that a run of `nerf train` is made of, and read its scene; nothing is written.
 
-    Args:
-        asked: the config of the run; what it leaves open is chosen for the scene.
-        choices: the names picked from each group, which its checkpoints keep.
-        overrides: what the config was composed with.
-        former: the config of the run that is gone on with, as its folder keeps it; None: it is a new one.
+    What the config leaves open is chosen for the scene; checkpoints keep the choices. `former` is the config of the run
+    that is gone on with, as its folder keeps it; None: it is a new one.
 
     Raises:
         InputError: anything in the config or in the capture that makes no run.
@@ -111,7 +108,11 @@ def searchpath_override() -> list[str]:
 
 
 def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) -> list[Callback]:
-    callbacks: list[Callback] = [signals, clock, FolderGuard(), *_chosen_callbacks(config)]
+    chosen = build(config.callbacks)
+    for name, callback in chosen.items():
+        if not isinstance(callback, Callback):
+            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
+    callbacks: list[Callback] = [signals, clock, FolderGuard(), *chosen.values()]
     if "live_view" in config.viewer:
         callbacks.append(build(config.viewer.live_view))
     if config.budget.seconds is not None:
@@ -120,9 +121,18 @@ def _callbacks(config: DictConfig, signals: StopSignals, clock: TrainingTime) ->
     return sorted(callbacks, key=lambda callback: isinstance(callback, Checkpoints))
 
 
-def _chosen_callbacks(config: DictConfig) -> list[Callback]:
-    chosen = build(config.callbacks)
-    for name, callback in chosen.items():
-        if not isinstance(callback, Callback):
-            raise InputError(f"callbacks.{name}={callback} is no callback. To do without one, add ~callbacks.{name}.")
-    return list(chosen.values())
+def print_tree(config: DictConfig, console: Console) -> None:
+    """Print a config, resolved, one setting a line; what a section is built of stands beside its name."""
+    tree = Tree("config")
+    _grow(tree, OmegaConf.to_container(config, resolve=True))
+    console.print(tree, soft_wrap=True)
+
+
+def _grow(tree: Tree, node: Any) -> None:
+    for key, value in node.items():
+        if isinstance(value, dict) and value:
+            built = str(value.get("_target_", "")).rpartition(".")[2]
+            branch = tree.add(Text(for_terminal(f"{key}  ({built})" if built else str(key)), style="bold"))
+            _grow(branch, {name: each for name, each in value.items() if not str(name).startswith("_")})
+        else:
+            tree.add(Text(for_terminal(f"{key}: {OmegaConf.to_yaml([value]).strip()[2:]}")))

@@ -45,11 +45,7 @@ class PostTraining:
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "PostTraining":
-        """Build what the config asks for.
-
-        Raises:
-            InputError: a setting is wrong, or a video is wanted and there is no ffmpeg.
-        """
+        """Build what the config asks for."""
         scoring, path = build(config.evaluation), build(config.path)
         if config.final.video:
             require_ffmpeg()
@@ -57,11 +53,7 @@ class PostTraining:
         return cls(scoring if config.final.evaluate else None, path if config.final.video else None, page)
 
     def require_film(self, scene: Scene) -> None:
-        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory.
-
-        Raises:
-            InputError: why not.
-        """
+        """Refuse a path that cannot be laid around the scene, or frames for which there is no memory."""
         if self.path is not None:
             record = scene_record(shown_capture(scene))
             require_room(lay_path(self.path, record), FilmSettings())
@@ -76,10 +68,15 @@ class PostTraining:
         scene, moved = _with_learnt_cameras(scene, trainer)
         with torch.no_grad():
             if self.scoring is not None:
-                origin = _origin(trainer, model, settings)
+                system: Any = trainer.lightning_module
+                config, choices = system.record["config"], system.record["choices"]
+                how = settings.device, settings.precision, trainer.global_step
+                origin = measured_of(model, config, choices, *how)
                 metrics = self.scoring.score(model, scene, scene.background, tile_points, folder, origin)
                 psnr = metrics["psnr"]
-                _log_metrics(trainer, metrics)
+                final = {name: metrics[name.partition("/")[2]] for name in FINAL_METRICS}
+                for logger in trainer.loggers:
+                    logger.log_metrics({name: v for name, v in final.items() if v is not None}, trainer.global_step)
                 lines += metric_lines(metrics, folder)
             if self.path is not None:
                 shown_scene = shown_capture(scene)
@@ -126,13 +123,6 @@ def _with_learnt_cameras(scene: Scene, trainer: Trainer) -> tuple[Scene, list[st
     return replace(scene, cameras=learnt, refined=True), lines
 
 
-def _origin(trainer: Trainer, model: Model, settings: TrainerSettings) -> dict[str, Any]:
-    system: Any = trainer.lightning_module
-    record = system.record
-    config, choices = record["config"], record["choices"]
-    return measured_of(model, config, choices, settings.device, settings.precision, trainer.global_step)
-
-
 def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Return the lines that a person reads at the end."""
     protocol = metrics["protocol"]
@@ -165,12 +155,6 @@ def metric_lines(metrics: dict[str, Any], folder: Path) -> list[str]:
         f"at most {metrics['peak_memory_gigabytes']:.2f} GB of memory"
     )
     return [*lines, f"metrics      {folder / 'metrics.json'}"]
-
-
-def _log_metrics(trainer: Trainer, metrics: dict[str, Any]) -> None:
-    values = {name: metrics[name.partition("/")[2]] for name in FINAL_METRICS}
-    for logger in trainer.loggers:
-        logger.log_metrics({name: v for name, v in values.items() if v is not None}, trainer.global_step)
 
 
 def _film_progress(folder: Path) -> list[str]:

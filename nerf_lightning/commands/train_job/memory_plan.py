@@ -67,22 +67,16 @@ class MemoryPlan:
 
         rows = [*self.rows, self.instead[0], *(replace(row, what=f"or {row.what}") for row in self.instead[1:])]
         lines = [line(row.what, row.num_bytes, row.where) for row in rows]
-        return "\n".join(
-            [
-                "memory plan:",
-                *lines,
-                line("at most, beside what is held", self.total, f"{self.free / GIGABYTE:.1f} GB are free"),
-            ]
-        )
+        total = line("at most, beside what is held", self.total, f"{self.free / GIGABYTE:.1f} GB are free")
+        return "\n".join(["memory plan:", *lines, total])
 
     @property
     def warning(self) -> str | None:
         """What to lower where the room is short; None where it is not."""
         if self.total <= NOTICEABLE * self.free:
             return None
-        largest = max(
-            (row for row in [*self.rows, *self.instead] if row.counts and row.cure), key=lambda row: row.num_bytes
-        )
+        curable = [row for row in [*self.rows, *self.instead] if row.counts and row.cure]
+        largest = max(curable, key=lambda row: row.num_bytes)
         needed, free, most = (f"{size / GIGABYTE:.1f} GB" for size in (self.total, self.free, largest.num_bytes))
         return (
             f"The run needs about {needed} of memory, and {free} are free: it may be stopped by the system. "
@@ -104,7 +98,7 @@ def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule)
         # What lies in memory already is not asked for again.
         there = f"mapped file {pixels.path}" if isinstance(pixels, MappedPixelStore) else "memory, there already"
         row = Row("pixels", num_bytes(pixels), there, counts=False)
-    weights = _weights(step)
+    compiles = settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
     steps = [_step(trial, tile, where), _picture(trial, data, where)]
     heaps = 0 if device.type == "cuda" else min(MOST_HEAPS, threads_on(device))
     gaps = int(heaps * GAPS * max(row.num_bytes for row in steps))
@@ -112,19 +106,15 @@ def memory_plan(settings: TrainerSettings, step: TrainStep, data: RayDataModule)
     return MemoryPlan(
         [
             row,
-            Row("weights, tables, grids", weights, f"{where}, there already", False),
+            Row("weights, tables, grids", _weights(step), f"{where}, there already", False),
             Row("gradients", trial.gradients, where, cure=tables),
             Row("optimizer's state", trial.optimizer, where, cure=tables),
             Row("gaps in the heap, about", gaps, where),
-            *([Row("compiled products, about", _compiled(step), where)] if _compiles_products(settings) else []),
+            *([Row("compiled products, about", _compiled(step), where)] if compiles else []),
         ],
         steps,
         free,
     )
-
-
-def _compiles_products(settings: TrainerSettings) -> bool:
-    return settings.device_type == "cpu" and settings.precision == "bf16-mixed" and cpu_multiplies_bfloat16()
 
 
 def _weights(step: TrainStep) -> int:

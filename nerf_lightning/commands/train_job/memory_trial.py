@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from nerf_lightning.compute.machine import torch_threads
 from nerf_lightning.data.ray_batches import RayBatches
 from nerf_lightning.evaluation.metrics import image_metrics
 from nerf_lightning.nerf.bands import BAND_PIXELS
@@ -50,19 +51,13 @@ class Trial:
 
 
 def try_out(settings: TrainerSettings, step: TrainStep, batches: RayBatches, tile: int | None) -> Trial:
-    """Return what the run will hold, by trials that leave nothing behind.
-
-    Args:
-        settings: the device and the precision.
-        step: ready to be taken.
-        batches: the loader.
-        tile: points of a tile; None trains batches whole.
-    """
+    """Return what the run will hold, by trials that leave nothing behind; a `tile` of None: whole batches."""
     step.to(settings.device)
     trainable = [parameter for parameter in step.model.parameters() if parameter.requires_grad]
     gradients = sum(parameter.nbytes for parameter in trainable)
     beside = threads_on(settings.device)
-    with _untouched(step), _one_thread():
+    # Tiles go one after the other: what other threads allocate is not seen, and is counted by their number.
+    with _untouched(step), torch_threads(1):
         batch, activations = _step(settings, step, batches, tile, gradients, beside)
         picture = _picture(settings, step, batches, tile, beside)
     return Trial(gradients, _optimizer_bytes(step, trainable), batch, activations, picture)
@@ -80,17 +75,6 @@ def _untouched(step: TrainStep) -> Iterator[None]:
         step.reset_statistics()
         for buffer, value in zip(buffers, former, strict=True):
             buffer.copy_(value)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let tiles go one after the other: what other threads allocate is not seen, and is counted by their number."""
-    former = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(former)
 
 
 def _step(
@@ -187,11 +171,7 @@ def _optimizer_bytes(step: TrainStep, trainable: list[nn.Parameter]) -> int:
 
 
 class PeakBytes(TorchDispatchMode):
-    """Watch what is allocated under it and freed again; what was there before does not count.
-
-    Args:
-        device_type: where; what lies elsewhere does not count.
-    """
+    """Watch what is allocated under it on a kind of device, and freed again; what was there before does not count."""
 
     def __init__(self, device_type: str):
         super().__init__()

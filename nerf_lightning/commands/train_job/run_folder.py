@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger
@@ -12,10 +13,9 @@ from omegaconf import DictConfig
 from nerf_lightning.commands.train_job.build import TrainJob
 from nerf_lightning.compute import ranks
 from nerf_lightning.files.atomic import full_disk_named
-from nerf_lightning.files.run_marker import require_run
+from nerf_lightning.files.made_folders import require_run
 from nerf_lightning.messages.errors import InputError
-from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, open_run, write_config
-from nerf_lightning.runs.log_file import log_file
+from nerf_lightning.runs.folder import ResumePoint, RunFolder, job_folder, log_file, open_run, write_config
 from nerf_lightning.runs.summary import read_note
 from nerf_lightning.training.callbacks.watcher import errors_told_once
 from nerf_lightning.training.launch.preemption import wants_restart
@@ -32,29 +32,22 @@ class HeldFolder:
     held: RunFolder | None
     loggers: list[Logger]
 
-    def plan(self, num_steps: int) -> None:
-        """Note how long the run is to be."""
+    def note(self, **values: Any) -> None:
+        """Add values to `run.json`."""
         if self.held is not None:
-            self.held.plan(num_steps)
+            self.held.note(**values)
 
     def trained(self, seconds: float) -> None:
         """Note how long this start has trained."""
         if self.held is not None:
             self.held.trained(seconds)
 
-    def finish(self, step: int, psnr: float | None) -> None:
-        """Note that the run is complete."""
-        if self.held is not None:
-            self.held.finish(step, psnr)
-
 
 @contextmanager
 def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
     """Take the folder of a job, and its log and loggers; note how the run ended, and let the folder go.
 
-    Args:
-        job: what is trained.
-        asked: the config before anything was chosen for the scene.
+    `asked` is the config before anything was chosen for the scene.
     """
     held: list[RunFolder] = []
 
@@ -76,7 +69,7 @@ def held_folder(job: TrainJob, asked: DictConfig) -> Iterator[HeldFolder]:
     except SystemExit as stop:
         for folder in held:
             folder.trained(job.clock.seconds)
-            folder.stop(restarted=wants_restart(stop.code))
+            folder.note(**({"preempted": True} if wants_restart(stop.code) else {}))  # then it is started again
         raise
     except (InputError, OSError):
         for folder in held:

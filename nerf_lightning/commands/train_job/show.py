@@ -1,23 +1,34 @@
 """What a person gets to see of a training: Lightning's profile, the page of the scene, the report of the run."""
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
+import torch
 from lightning.pytorch import Trainer
+from lightning.pytorch.profilers import SimpleProfiler
 
+from nerf_lightning.checkpoints.reading import read_checkpoint
+from nerf_lightning.checkpoints.recorded_frame import as_trained
+from nerf_lightning.commands.export import beside
 from nerf_lightning.commands.train_job.build import TrainJob
-from nerf_lightning.commands.train_job.final_page import write_final_page
-from nerf_lightning.commands.train_job.profile_table import profile_lines
 from nerf_lightning.compute import ranks
+from nerf_lightning.config.instantiate import build
+from nerf_lightning.config.load_model import load_model
 from nerf_lightning.doctor.examine import advice
+from nerf_lightning.export.page import PageExport
 from nerf_lightning.messages.console import say
-from nerf_lightning.report.page import write_page
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.report.page import write_report
 from nerf_lightning.report.read_run import read_run
 from nerf_lightning.runs.results import FILES
 from nerf_lightning.training.launch.lightning_flags import PROFILE
 
-MOST_VIDEO_BYTES = 20_000_000
-"""Of a film in the page that follows a training."""
+ROWS = 15  # Of the profile: the actions that took longest, with all that they called
+WIDTH = 54  # Characters of an action's name
+# The path of the film, in ten seconds.
+PATH = {"num_frames": 120, "fps": 12}
+MOST_VIDEO_BYTES = 20_000_000  # Of a film in the page that follows a training
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +49,7 @@ def show(job: TrainJob, folder: Path, trainer: Trainer, psnr: float | None) -> N
     if job.config.final.report:
         checks, target = job.checks, folder / "report.html"
         examine = None if checks is None else lambda: checks
-        write_page(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
+        write_report(read_run(folder, folder / FILES["run"], MOST_VIDEO_BYTES, examine), target)
         say(f"report       {target}", *_result(job, psnr))
 
 
@@ -49,3 +60,54 @@ def _result(job: TrainJob, psnr: float | None) -> list[str]:
     lines = [f"result       {quality}{used} of {used + len(job.scene.left_out)} photographs used"]
     cure = advice(job.checks or ())
     return lines if cure is None else [*lines, f"to improve   {cure}"]
+
+
+def write_final_page(what: PageExport, job: TrainJob, folder: Path) -> None:
+    """Write `page.html` into the folder of a run from its last checkpoint, or say why there is none."""
+    try:
+        # From the file, as nerf export does: what was trained in bfloat16 is baked in float32.
+        checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
+        model = load_model(checkpoint).to(job.settings.device).eval()
+        path = job.config.path.copy()
+        path.update(PATH)
+        what.beside = beside(checkpoint, as_trained(job.scene, checkpoint), build(path))
+        with torch.no_grad():
+            written = what.export(model, checkpoint.scene, folder, job.settings.inference_tile_points)
+        say(*(f"page         {file}" for file in written))
+    except Exception as error:  # out of graphics memory, a full disk, a broken compiler: the run is there all the same
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        log.warning(
+            "The run is whole, but its page (final.page) could not be made: %s Once that is mended, "
+            "nerf export ckpt=%s what=page makes it.",
+            reason if reason.endswith(".") else f"{reason}.",
+            folder,
+        )
+
+
+def profile_lines(trainer: Trainer) -> list[str]:
+    """Return the lines of the table; none where the simple profiler has not looked."""
+    profiler = trainer.profiler  # type: ignore[attr-defined]
+    if not isinstance(profiler, SimpleProfiler) or not profiler.recorded_durations:
+        return []
+    return list(_rows({action: list(taken) for action, taken in profiler.recorded_durations.items()}))
+
+
+def _rows(durations: dict[str, list[float]]) -> Iterator[str]:
+    """Yield a header and the actions that took longest.
+
+    >>> print(*_rows({"[Callback]Monitor{'every': 1}.on_train_batch_end": [0.5, 1.5], "save": [0.25]}), sep="\\n")
+    action                                                    calls   mean ms  seconds
+    Monitor.on_train_batch_end                                    2    1000.0     2.00
+    save                                                          1     250.0     0.25
+    """
+    yield f"{'action':<{WIDTH}}  {'calls':>7}  {'mean ms':>8}  {'seconds':>7}"
+    longest = sorted(durations.items(), key=lambda item: sum(item[1]), reverse=True)
+    for action, taken in longest[:ROWS]:
+        mean = 1000.0 * sum(taken) / len(taken)
+        yield f"{_short(action):<{WIDTH}}  {len(taken):>7}  {mean:>8.1f}  {sum(taken):>7.2f}"
+
+
+def _short(action: str) -> str:
+    """Return an action without its kind, and a callback without its settings."""
+    name, brace, rest = action.rpartition("]")[2].partition("{")
+    return (name + rest.rpartition("}")[2] if brace else name)[:WIDTH]

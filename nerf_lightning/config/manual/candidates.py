@@ -10,17 +10,12 @@ from nerf_lightning.files.folders import option_names
 
 SHELLS = ("bash", "zsh", "fish")
 FLAGS = ("--help", "--multirun", "--cfg", "--config-dir", "--hydra-help")
-TAKES_PATHS = ("table", "report")
-"""Commands to which a folder may be given without a key."""
+TAKES_PATHS = ("table", "report")  # Commands to which a folder may be given without a key
 LITERALS = {"bool": ("true", "false"), "null": ("null",)}
 
 
 def candidates(words: list[str], commands: Iterable[str]) -> list[str]:
-    """Return what the last word may become, as whole words.
-
-    Args:
-        words: all that stands behind `nerf` up to the cursor; the last one may be empty.
-        commands: the names that may come first.
+    """Return what the last word, which may be empty, may become, as whole words; the first is one of the commands.
 
     >>> candidates(["train", "model=nerf_s"], ["train"])
     ['model=nerf_small']

@@ -8,8 +8,7 @@ from nerf_lightning.config.manual.catalogue import Command, Option, Setting
 from nerf_lightning.config.manual.suggestions import did_you_mean
 from nerf_lightning.messages.errors import InputError
 
-COLUMN = 34
-"""Where the sentences of a list begin."""
+COLUMN = 34  # Where the sentences of a list begin
 PLACEHOLDER = re.compile(r"^\$(GROUPS|SETTINGS):(.*)$", re.MULTILINE)
 END = re.compile(r"(?<=\.)\s+(?=[A-Z`*-]|$)|;\s")
 
@@ -24,7 +23,8 @@ def command_page(command: Command, width: int) -> str:
         kind, names = found[1], found[2].split()
         if kind == "GROUPS":
             return "\n".join(_groups(command, names, width))
-        return "\n".join(_row(f"{key}={command.default(key)}", _meaning(command, key), width) for key in names)
+        meanings = {each.key: brief(each.meaning) for each in reversed(command.settings) if each.is_own}
+        return "\n".join(_row(f"{key}={command.default(key)}", meanings[key], width) for key in names)
 
     return PLACEHOLDER.sub(listed, command.template).rstrip()
 
@@ -54,10 +54,6 @@ def brief(text: str) -> str:
     'Shrink by 2.5 and more'
     """
     return END.split(text.replace("`", "").strip(), maxsplit=1)[0].removesuffix(".")
-
-
-def _meaning(command: Command, key: str) -> str:
-    return next(brief(each.meaning) for each in command.settings if each.key == key and each.is_own)
 
 
 def _groups(command: Command, in_full: list[str], width: int) -> Iterator[str]:

@@ -6,7 +6,7 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback
 
-from nerf_lightning.files.run_marker import require_run
+from nerf_lightning.files.made_folders import require_run
 
 
 class FolderGuard(Callback):
