@@ -1,5 +1,6 @@
 """What README and docs say is true: examples run, commands compose, settings and files that they name are there."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -10,11 +11,10 @@ import pytest
 import yaml
 from lightning import Trainer
 from support.captures import write_blender, write_npz
-from support.running import FAST, start_code
+from support.running import FAST, REPOSITORY, start_code
 
 from nerf_lightning import build_run
-from nerf_lightning.cli.completion import completion
-from nerf_lightning.cli.help import help_on_anything
+from nerf_lightning.cli.help import completion, help_on_anything
 from nerf_lightning.cli.main import OF_ITSELF, find_commands
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.files.folders import conf_folders
@@ -195,3 +195,39 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "method.html").is_file()
     assert "data.sample_budget" in (tmp_path / "settings.html").read_text(encoding="utf-8")
+
+
+SMALLER = (
+    (r"resolution=\d+", "resolution=16"),
+    (r"num_train=\d+", "num_train=6"),
+    (r"max_steps=\d+", "max_steps=3"),
+    (r"data\.crop_steps=\d+", "data.crop_steps=1"),
+    (r"width=64\)", "width=8)"),
+    (r"num_samples=\d+", "num_samples=8"),
+)
+AT_THE_END = {
+    "first_scene": "assert picture.rgb.shape == (16, 16, 3) and len(plt.get_fignums()) == 3, picture.rgb.shape",
+    "own_field_and_loss": (
+        "assert run.system.step.progress.step == 3 and len(pictures) == 4\n"
+        "trainer.save_checkpoint('own.ckpt')\n"
+        "try:\n    nl.load('own.ckpt')\n"
+        "except nl.InputError as error:\n    print('refused:', error)"
+    ),
+}
+
+
+def test_every_notebook_is_tested():
+    assert {path.stem for path in (REPOSITORY / "docs").glob("*.ipynb")} == AT_THE_END.keys()
+
+
+@pytest.mark.parametrize("name", AT_THE_END)
+def test_a_notebook_runs_from_top_to_bottom(name, tmp_path):
+    cells = json.loads((REPOSITORY / "docs" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    for given, instead in SMALLER:
+        code = re.sub(given, instead, code)
+    process = start_code(f"{code}\n\n{AT_THE_END[name]}\n", cwd=tmp_path)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors[-3000:]
+    assert "dB on test views" in output
+    assert name == "first_scene" or "refused: " in output

@@ -30,7 +30,7 @@ def record(metres_per_unit=METRES):
     return replace(scene, to_user=to_user, metres_per_unit=metres_per_unit)
 
 
-def test_a_reader_says_it_and_a_checkpoint_keeps_it(tmp_path):
+def test_a_reader_says_it_a_checkpoint_keeps_it_and_lengths_are_told_in_metres_where_it_is_known(tmp_path):
     root = write_colmap(tmp_path, Known())
     scene = read("colmap", root, metres_per_unit=2.5)
     assert scene.metres_per_unit == 2.5
@@ -39,9 +39,6 @@ def test_a_reader_says_it_and_a_checkpoint_keeps_it(tmp_path):
     assert kept["metres_per_unit"] == 2.5
     for nothing in (0.0, -1.0, float("nan"), float("inf")):
         refused(partial(read, metres_per_unit=nothing), "colmap", root, parts=("scene.metres_per_unit=", "0.01 for"))
-
-
-def test_lengths_are_told_in_metres_where_they_are_known():
     assert told_length(record()) == (pytest.approx(0.5), "metres")
     assert told_length(record(None)) == (pytest.approx(UNIT), "the capture's units")
 

@@ -14,21 +14,18 @@ def steps(folder):
     return {path.name: torch.load(path, weights_only=True)["step"] for path in sorted(folder.iterdir())}
 
 
-def test_the_last_two_are_kept(tmp_path):
+def test_the_last_two_are_kept_also_where_files_cannot_be_linked(tmp_path, monkeypatch):
+    def refuse(*names):
+        raise OSError(1, "Operation not permitted")
+
     for step in (1, 2, 3):
         write_checkpoint({"step": step}, tmp_path / "last.ckpt")
         write_checkpoint({"step": 10 * step}, tmp_path / "best.ckpt")
     assert steps(tmp_path) == {"best.ckpt": 30, "last.ckpt": 3, "previous.ckpt": 2}
-
-
-def test_the_last_two_are_kept_where_files_cannot_be_linked(tmp_path, monkeypatch):
-    def refuse(*names):
-        raise OSError(1, "Operation not permitted")
-
     monkeypatch.setattr(os, "link", refuse)
-    for step in (1, 2, 3):
+    for step in (4, 5):
         write_checkpoint({"step": step}, tmp_path / "last.ckpt")
-    assert steps(tmp_path) == {"last.ckpt": 3, "previous.ckpt": 2}
+    assert steps(tmp_path) == {"best.ckpt": 30, "last.ckpt": 5, "previous.ckpt": 4}
 
 
 @pytest.mark.parametrize("function", ["fsync", "unlink", "link", "replace"])
@@ -79,16 +76,13 @@ def test_a_save_that_fails_says_where_and_how_to_go_on(tmp_path, monkeypatch):
     def full(handle):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
-    (tmp_path / "run").mkdir()
-    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
-        write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
-
-
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "run").write_text("a file")
     with pytest.raises(InputError, match=r"run/checkpoints can be written, then go on with resume="):
         write_checkpoint({"a": 1}, tmp_path / "run" / "checkpoints" / "last.ckpt")
+    monkeypatch.setattr(os, "fsync", full)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match=r"No space left on device.*Free some space, then go on with resume="):
+        write_checkpoint({"a": 1}, tmp_path / "other" / "checkpoints" / "last.ckpt")
 
 
 def test_what_a_killed_process_left_is_swept(tmp_path):

@@ -9,12 +9,7 @@ from support.planted import write_checkpoint
 from support.running import refused
 from support.scenes import ball_scene
 
-from nerf_lightning.checkpoints.reading import (
-    last_good_checkpoint,
-    make_record,
-    newest_checkpoint,
-    read_checkpoint,
-)
+from nerf_lightning.checkpoints.reading import last_good_checkpoint, make_record, newest_checkpoint, read_checkpoint
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.messages.errors import InputError
 
@@ -31,22 +26,16 @@ def saved(path, change=lambda cameras: None):
 
 def test_a_scene_that_no_checkpoint_could_keep_is_refused_before_training():
     scene = ball_scene()
-    with (
-        budget(views=2),
-        pytest.raises(InputError, match=r"The scene has 6 views, .* add budgets.views=6"),
-    ):
+    with budget(views=2), pytest.raises(InputError, match=r"The scene has 6 views, .* add budgets.views=6"):
         make_record(scene, config="", choices={})
     with pytest.raises(InputError, match=r"cannot be kept in a checkpoint: scene.view_names names two views alike"):
         make_record(replace(scene, view_names=("a",) * 6), config="", choices={})
 
 
-def test_the_lens_is_kept(tmp_path):
+def test_the_lens_is_kept_and_an_unknown_one_is_refused(tmp_path):
     cameras = read_checkpoint(saved(tmp_path)).scene.cameras
     assert cameras.lens_model == "fisheye"
     assert torch.equal(cameras.lens, torch.tensor([FISHEYE] * 6))
-
-
-def test_an_unknown_lens_is_refused(tmp_path):
     path = saved(tmp_path, lambda cameras: cameras.update(lens_model="squinting"))
     with pytest.raises(InputError, match="lens_model is 'squinting', not pinhole or"):
         read_checkpoint(path)
@@ -80,11 +69,15 @@ DAMAGE = {
 }
 
 
-def test_the_newest_is_read(tmp_path, caplog):
+def test_the_newest_is_read_and_two_damaged_ones_are_refused(tmp_path, caplog):
     keep_two(tmp_path)
     assert newest_checkpoint(tmp_path).step == 8
     assert not caplog.records
     assert newest_checkpoint(tmp_path / "nothing") is None
+    DAMAGE["cut off"](keep_two(tmp_path))
+    DAMAGE["no bytes"](tmp_path / "previous.ckpt")
+    with pytest.raises(InputError, match=r"last\.ckpt cannot be read"):
+        newest_checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
@@ -107,13 +100,6 @@ def test_a_damaged_checkpoint_that_was_named_is_refused_and_the_others_are_named
     others = rf"{tmp_path}/previous\.ckpt or {tmp_path}/best\.ckpt|no checkpoint at"
     with pytest.raises(InputError, match=others):
         read_checkpoint(last)
-
-
-def test_two_damaged_ones_are_refused(tmp_path):
-    DAMAGE["cut off"](keep_two(tmp_path))
-    DAMAGE["no bytes"](tmp_path / "previous.ckpt")
-    with pytest.raises(InputError, match=r"last\.ckpt cannot be read"):
-        newest_checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize(("bad_steps", "good"), [((0, 0), "last"), ((3, 0), "previous"), ((3, 2), None)])

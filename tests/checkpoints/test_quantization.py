@@ -26,12 +26,9 @@ def round_trip(rows, *how, **more):
     return dequantized({"rows": {"model.t": packed}, "switches": {}}, "a file")["model.t"], packed
 
 
-def test_float32_comes_back_to_the_bit():
+def test_float32_comes_back_to_the_bit_float16_to_eleven_and_int8_to_half_a_step_of_its_level():
     for rows in (table(), torch.randn(2, 3, 5), torch.randn(7)):
         assert torch.equal(round_trip(rows, "float32")[0], rows)
-
-
-def test_float16_is_right_to_eleven_bits_and_int8_to_half_a_step_of_its_level():
     rows = table()
     half, packed = round_trip(rows, "float16", STARTS)
     assert packed["values"].dtype == torch.float16

@@ -53,13 +53,10 @@ def test_another_size_keeps_the_cube_of_ndc(tmp_path):
     assert torch.equal(in_recorded_frame(small, scene_record(whole)).cameras.ndc, whole.cameras.ndc)
 
 
-def test_the_same_scene_stays_as_it_is(tmp_path):
-    scene = read("colmap", write_colmap(tmp_path, Known()))
+def test_the_same_scene_stays_as_it_is_and_another_space_is_refused_by_name(tmp_path):
+    scene = read("colmap", write_colmap(tmp_path / "colmap", Known()))
     assert in_recorded_frame(scene, scene_record(scene)) is scene
-
-
-def test_another_space_is_refused_by_name(tmp_path):
-    root = write_llff(tmp_path, Known(c2w=wall()))
+    root = write_llff(tmp_path / "llff", Known(c2w=wall()))
     whole, other = read("llff", root, space="ndc"), read("llff", root, space="contracted")
     with pytest.raises(InputError, match=r"read with space=contracted, .* with space=ndc\. Give scene\.space=ndc\."):
         in_recorded_frame(other, scene_record(whole))

@@ -53,7 +53,7 @@ def in_another_frame(scene):
     """The scene in a working frame that is turned, moved and of another unit."""
     frame = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
     c2w = poses_from_user(scene.cameras.c2w.double(), frame.double()).float()
-    return replace(scene, cameras=replace(scene.cameras, c2w=c2w), to_user=scene.to_user @ frame)
+    return replace(scene, cameras=replace(scene.cameras, c2w=c2w), to_user=scene.to_user @ frame.double())
 
 
 def test_the_same_capture_is_the_same_to_rounding():
@@ -87,12 +87,9 @@ def test_what_has_changed_is_named(words):
     assert "; ".join(told(CHANGED[words])) == words
 
 
-def test_one_pose_that_moves_the_working_frame_is_one_pose():
+def test_one_pose_that_moves_the_frame_is_one_pose_and_a_mask_is_part_of_a_photograph():
     moved = with_cameras(c2w=changed_at(SCENE.cameras.c2w, 2, 0, 3, by=0.01))
     assert told(in_another_frame(moved)) == ["the pose of 1 of 6 photographs (ball_2)"]
-
-
-def test_a_mask_is_part_of_a_photograph():
     mask = torch.ones(len(SCENE.pixels.rgba), dtype=torch.uint8)
     masked = with_pixels(mask=mask)
     other = with_pixels(mask=changed_at(mask, 0, by=255))

@@ -1,8 +1,10 @@
-"""Paths are read as they were typed, or pasted from what a sweep has said; what lists values stays a list."""
+"""Paths are read as they were typed, or pasted from what a sweep has said; words that are no settings are told."""
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from support.running import refused
 
+from nerf_lightning.cli.arguments import require_settings
 from nerf_lightning.cli.quoting import quoted_paths, unquoted
 from nerf_lightning.cli.sweep_arguments import sweep_arguments
 
@@ -70,3 +72,17 @@ def test_a_path_alone_stays_and_a_number_of_something_else(tmp_path, monkeypatch
 def test_quotes_come_off_again():
     words = quoted_paths([f"run={path}" for path in PATHS], sweep=False)
     assert [unquoted(word.removeprefix("run=")) for word in words] == PATHS
+
+
+@pytest.mark.parametrize("typed", ["scene.root= data/x", "scene = bricks", "scene.root data/x", "scene =bricks"])
+def test_spaces_around_the_equals_sign_are_told_in_one_paragraph(typed):
+    told = "settings are key=value without spaces: scene.root=data/x"
+    refused(require_settings, ["seed=1", *typed.split()], False, parts=(told,))
+    if "=" in typed:  # where a path may stand alone, too
+        refused(require_settings, typed.split(), True, parts=("without spaces",))
+
+
+@pytest.mark.parametrize("or_paths", [False, True])
+def test_options_removals_and_empty_values_pass(or_paths):
+    require_settings([], or_paths)
+    require_settings(["--multirun", "~callbacks.film", "logger.name=", "a=b=c", *["out"] * or_paths], or_paths)

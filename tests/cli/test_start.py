@@ -1,10 +1,16 @@
-"""What a run loads before its first step: nothing heavy that it does not need."""
+"""What a run loads before its first step: nothing heavy that it does not need, the rest without a pause."""
 
+import gc
 import subprocess
 import sys
 
 import pytest
+from support.cold_import import cold_import
 from support.running import FAST, REPOSITORY, start
+
+from nerf_lightning.cli import prepare
+from nerf_lightning.cli.loading import announce_start, quick_imports
+from nerf_lightning.config.scene_overrides import UnknownScene
 
 # Some are there in every installation, some only with extras; none has to do with a step.
 NOT_NEEDED = (
@@ -63,3 +69,54 @@ def test_training_imports_nothing_heavy_beside_lightnings_own():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
+
+
+def test_the_collector_rests_while_lightning_is_loaded_and_scipys_signals_wait_for_who_asks(tmp_path_factory):
+    during, loaded, after, *_, asked = cold_import(tmp_path_factory)
+    assert (during, after) == ("False", "True True")
+    assert (loaded, asked) == ("[]", "3 True")
+
+
+def test_later_jobs_of_a_sweep_leave_nothing_behind():
+    import lightning  # noqa: F401
+
+    before = gc.get_freeze_count()
+    with quick_imports():
+        assert gc.isenabled()
+    assert gc.get_freeze_count() <= before
+
+
+@pytest.mark.parametrize(
+    ("terminal", "arguments", "lines"),
+    [(True, ["seed=1", "-m"], 1), (False, ["seed=1"], 0), (True, ["--cfg", "job"], 0)],
+)
+def test_a_terminal_is_told_at_once_that_a_command_starts(monkeypatch, capsys, terminal, arguments, lines):
+    monkeypatch.delitem(sys.modules, "torch", raising=False)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    announce_start("train", arguments)
+    assert capsys.readouterr().err.splitlines() == ["nerf train starts; loading PyTorch takes a few seconds"] * lines
+
+
+@pytest.fixture(autouse=True)
+def _unknown(monkeypatch):
+    def unknown(arguments):
+        raise UnknownScene("nobody knows it")
+
+    monkeypatch.setattr(prepare, "_eval", unknown)
+
+
+def test_a_page_goes_without_photographs_and_says_so_unless_they_were_wished_for(caplog):
+    typed = ["ckpt=a", "what=page"]
+    assert prepare._export(typed) == ["photographs=false", *typed]
+    assert caplog.messages == ["what=page goes without photographs: nobody knows it"]
+    with pytest.raises(UnknownScene):
+        prepare._view(["ckpt=a", "photographs=True"])
+    assert prepare._export(["ckpt=a", "what=volume"]) == ["ckpt=a", "what=volume"]
+    assert prepare._export(["ckpt=a"]) == ["ckpt=a"]
+    assert prepare._export(["ckpt=a", "what=my_own"])[0] == "photographs=false"
+
+
+@pytest.mark.parametrize(("wish", "said"), [([], 1), (["photographs=false"], 0)])
+def test_so_does_the_viewer_and_says_so_unless_they_were_not_wished_for(caplog, wish, said):
+    assert prepare._view(["ckpt=a", *wish]) == ["photographs=false", "ckpt=a", *wish]
+    assert len(caplog.messages) == said

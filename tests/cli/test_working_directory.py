@@ -7,13 +7,13 @@ import sys
 import pytest
 from support.running import FAST, REPOSITORY, start_cold
 
-from nerf_lightning.cli import working_directory
+from nerf_lightning.cli import process
 from nerf_lightning.selftest.scene import write_npz
 
 PLANTED = ("torch", "numpy", "numba", "hydra", "lightning", "yaml", "psutil", "multiprocessing")
 SPAWN = """
 import multiprocessing
-from nerf_lightning.cli.working_directory import keep_from_subprocesses
+from nerf_lightning.cli.process import keep_from_subprocesses
 if __name__ == "__main__":
     keep_from_subprocesses()
     child = multiprocessing.get_context("spawn").Process(target=print, args=("spawned",))
@@ -64,7 +64,7 @@ def test_a_clone_that_is_not_installed_is_found_by_them(monkeypatch):
     found = [place for place in sys.path if os.path.realpath(place) != os.path.realpath(REPOSITORY)]
     monkeypatch.setattr(sys, "path", found)
     monkeypatch.setattr(os, "environ", os.environ | {"PYTHONPATH": "of the user"})
-    working_directory.keep_from_subprocesses()
+    process.keep_from_subprocesses()
     assert sys.path[-1] == str(REPOSITORY)
     assert os.environ["PYTHONPATH"].split(os.pathsep) == ["of the user", str(REPOSITORY)]
 

@@ -2,13 +2,16 @@
 
 import re
 import signal
+import sys
 import time
 
 import pytest
 import torch
+from support.posed_captures import Known, write_colmap, write_llff, write_transforms
 from support.running import FAST, said, start
 
 from nerf_lightning.checkpoints.format import FORMAT
+from nerf_lightning.cli import main as cli
 
 
 @pytest.fixture
@@ -16,41 +19,23 @@ def last(finished_run):
     return finished_run / "checkpoints" / "last.ckpt"
 
 
-@pytest.mark.parametrize("command", ["eval", "render"])
-def test_a_missing_checkpoint(nerf, tmp_path, command):
-    said(
-        nerf(command, f"ckpt={tmp_path}/none.ckpt"), "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt"
-    )
-
-
-def test_a_truncated_checkpoint(nerf, last, tmp_path):
+def test_files_that_are_no_checkpoint_to_use_are_named(nerf, last, tmp_path):
+    for command in ("eval", "render"):
+        missing = nerf(command, f"ckpt={tmp_path}/none.ckpt")
+        said(missing, "There is no checkpoint at", "none.ckpt", "last.ckpt or best.ckpt")
     (tmp_path / "cut.ckpt").write_bytes(last.read_bytes()[:5000])
     said(nerf("render", f"ckpt={tmp_path}/cut.ckpt"), "cut.ckpt cannot be read", "train again")
-
-
-def changed(last, tmp_path, change):
     content = torch.load(last, weights_only=True)
-    change(content)
+    content["nerf_lightning"]["format"] = 99
     torch.save(content, tmp_path / "changed.ckpt")
-    return f"ckpt={tmp_path}/changed.ckpt"
-
-
-def test_a_checkpoint_of_another_format(nerf, last, tmp_path):
-    path = changed(last, tmp_path, lambda content: content["nerf_lightning"].__setitem__("format", 99))
+    path = f"ckpt={tmp_path}/changed.ckpt"
     said(nerf("render", path), "has checkpoint format 99", f"reads format {FORMAT}", "Use the version that wrote it")
-
-
-def test_a_file_of_torch_that_is_no_checkpoint_of_ours(nerf, tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
     said(nerf("render", f"ckpt={tmp_path}/other.ckpt"), "not a checkpoint of nerf_lightning")
 
 
-def test_weights_that_do_not_fit(nerf, last, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "field.width=48", f"init_from={last}",
-        f"paths.output_dir={tmp_path}/run", "trainer.max_steps=1",
-    )  # fmt: skip
-    said(result, "size mismatch", "overrides.yaml")
+def test_weights_that_do_not_fit(train, last):
+    said(train("field.width=48", f"init_from={last}", "trainer.max_steps=1"), "size mismatch", "overrides.yaml")
 
 
 def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
@@ -61,12 +46,6 @@ def test_an_output_folder_that_cannot_be_written(nerf, last, capture, tmp_path):
         ("render", f"ckpt={last}"),
     ):
         said(nerf(*command, f"paths.output_dir={tmp_path}/file/run"), "cannot be written", "paths.output_dir=DIR")
-
-
-def test_near_behind_far(nerf, capture, tmp_path):
-    result = nerf("train", "scene=npz", f"scene.path={capture}", "scene.near=7.0", f"paths.output_dir={tmp_path}/run")
-    said(result, "near", "7.0", "far")
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_missing_capture(nerf, tmp_path):
@@ -80,65 +59,45 @@ def test_a_gpu_that_is_not_there(nerf):
     said(nerf("train", "trainer=gpu"), "torch sees no CUDA device", "trainer=cpu")
 
 
-def test_batch_norm_with_tiles(nerf, capture, tmp_path):
-    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, "field.batch_norm=true",
-                  f"paths.output_dir={tmp_path}/run")  # fmt: skip
-    said(result, "field.batch_norm=true", "trainer.tile_points=null")
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [
+        ("scene.near=7.0", "near"),
         ("scene.near=close", "scene.near=close does not fit: it must be a number"),
-        ("seed=1.5", "seed=1.5 does not fit"),
         ("trainer.precision=16-mixed", "it must be auto, 32-true, tf32, bf16-mixed"),
-        ("trainer.accelerator=quantum", "trainer.accelerator=quantum does not fit: it must be auto, cpu, gpu"),
-        ("field.density_activation=exp", "density_activation=exp does not fit: it must be relu, softplus"),
         ("callbacks.validation_pictures.every_steps=0", "every_steps=0: give 1 or more"),
         ("path.num_frames=0", "path.num_frames is 0"),
-        ("path=photographs path.views=[nobody,0]", "path.views: the capture has no photograph nobody"),
         ("path=photographs path.views=-1", "path.views=-1 does not fit: it must be a list or null"),
         ("path=keyframes path.file=none.yaml", "none.yaml cannot be read"),
         ("evaluation.max_views=0", "evaluation.max_views=0"),
-        ("evaluation.split=all", "evaluation.split=all does not fit"),
         ("model.levels.coarse.sampler.num_samples=2", "at least 3 samples"),
         ("data.batch_rays=0", "data.batch_rays=0"),
         ("init_from=nowhere.ckpt", "There is no checkpoint at nowhere.ckpt"),
-        ("trainer.max_epochs=0", "trainer.max_epochs=0"),
         ("trainer.max_epochs=inf", "trainer.max_epochs=inf: give a positive number up to"),
-        ("resume=[5]", "resume=[5] does not fit: it must be a path"),
         ("scene._target_=5", "See nerf train --help"),
         ("trainer.num_threads=0", "trainer.num_threads=0: give a number from 1 to 4096"),
-        ("trainer.num_threads=1000000000", "trainer.num_threads=1000000000: give a number from 1 to 4096"),
         ("trainer.devices=1000000000", "trainer.devices=1000000000: give a number from 1 to 1024"),
-        ("init_from=true", "init_from=True does not fit: it must be a path"),
         ("init_from=[1]", "init_from=[1] does not fit: it must be a path"),
         ("model.levels.coarse.field=-1", "model.levels.coarse.field=-1 does not fit: it must be a Field, chosen by"),
-        ("model.levels.coarse.field=[1]", "model.levels.coarse.field=[1] does not fit: it must be a Field"),
         ("optimizer.lr=-1", "The optimizer refuses its settings: Invalid learning rate: -1. Mend optimizer.*"),
         ("callbacks.monitor=5", "callbacks.monitor=5 is no callback. To do without one, add ~callbacks.monitor."),
-        ("final=5", "final=5 does not fit: it holds settings, such as final.evaluate=VALUE"),
         ("budget=null", "budget=None does not fit: it holds settings, such as budget.seconds=VALUE"),
+        ("final=5", "final=5 does not fit: it holds settings, such as final.evaluate=VALUE"),
         ("data.batch_rays=1000000000000", "data.batch_rays=1000000000000, which takes"),
         ("scene.aabb_half=inf", "scene.aabb_half is inf, but half the side of a box must be above 0"),
         ("scene.far=1e300", "scene.far is 1e+300, but rays need 0 <= near < far <= 1e+09"),
-        ("model=5", "A group was given something else than the name of one of its options"),
         ("field=null", "A group was given something else than the name of one of its options"),
-        ("encoder=[1]", "A group was given something else than the name of one of its options"),
+        ("model=5", "A group was given something else than the name of one of its options"),
     ],
 )
-def test_a_bad_setting_is_named_before_a_folder_is_taken(nerf, capture, tmp_path, override, words):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run", *override.split()
-    )
-    said(result, words)
+def test_a_bad_setting_is_named_before_a_folder_is_taken(train, tmp_path, override, words):
+    said(train(*override.split()), words)
     assert not (tmp_path / "run").exists()
 
 
-def test_no_ffmpeg_is_said_before_the_training(nerf, capture, tmp_path, monkeypatch):
+def test_no_ffmpeg_is_said_before_the_training(train, tmp_path, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
-    result = nerf("train", "scene=npz", f"scene.path={capture}", *FAST, f"paths.output_dir={tmp_path}/run")
-    said(result, "ffmpeg")
+    said(train(), "ffmpeg")
     assert not (tmp_path / "run").exists()
 
 
@@ -149,39 +108,26 @@ def test_transparent_pictures_need_a_background(nerf, tmp_path):
     said(result, "transparent pixels", "scene.background=none", "white, black or random")
 
 
-@pytest.mark.parametrize("background", ["red", "random-ish"])
-def test_an_unknown_background_of_a_render(nerf, last, tmp_path, background):
-    said(nerf("render", f"ckpt={last}", f"background={background}", f"paths.output_dir={tmp_path}"), background)
-
-
 def test_a_full_disk_outside_checkpoints_is_one_paragraph(nerf, last, tmp_path, monkeypatch):
     def full(*arguments, **options):
         raise OSError(28, "No space left on device", "metrics.json")
 
     monkeypatch.setattr("nerf_lightning.evaluation.evaluator.write_metrics", full)
-    import sys as system
-
-    from nerf_lightning.cli import main as cli
-
-    monkeypatch.setattr(system, "argv", ["nerf", "eval", f"ckpt={last}", f"paths.output_dir={tmp_path}"])
+    monkeypatch.setattr(sys, "argv", ["nerf", "eval", f"ckpt={last}", f"paths.output_dir={tmp_path}"])
     with pytest.raises(SystemExit) as stop:
         cli.main()
     assert stop.value.code == 2
 
 
-def test_batch_norm_trains_whole_batches(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "field.batch_norm=true", "trainer.tile_points=null",
-        "trainer.max_steps=2", "final.video=false", f"paths.output_dir={tmp_path}/run",
-    )  # fmt: skip
+def test_batch_norm_trains_whole_batches_and_no_tiles(train):
+    said(train("field.batch_norm=true"), "field.batch_norm=true", "trainer.tile_points=null")
+    whole = ("field.batch_norm=true", "trainer.tile_points=null")
+    result = train(*whole, "trainer.max_steps=2", "final.video=false", "final.evaluate=false")
     assert result.code == 0, result.err
 
 
-def test_a_loss_that_is_not_a_number(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "optimizer.lr=1e38", f"paths.output_dir={tmp_path}/run",
-        "trainer.max_steps=50",
-    )  # fmt: skip
+def test_a_loss_that_is_not_a_number(train):
+    result = train("optimizer.lr=1e38", "trainer.max_steps=50")
     said_lines = [line for line in result.err.splitlines() if line.startswith("nerf: ")]
     assert result.code == 2
     assert len(said_lines) == 1
@@ -189,7 +135,8 @@ def test_a_loss_that_is_not_a_number(nerf, capture, tmp_path):
     assert "optimizer.lr" in said_lines[0]
 
 
-def test_no_ffmpeg(nerf, last, tmp_path, monkeypatch):
+def test_no_ffmpeg_or_no_such_background_for_a_render(nerf, last, tmp_path, monkeypatch):
+    said(nerf("render", f"ckpt={last}", "background=red", f"paths.output_dir={tmp_path}"), "red")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
     result = nerf("render", f"ckpt={last}", "path.num_frames=2", f"paths.output_dir={tmp_path}")
     said(result, "ffmpeg", "PNG frames")
@@ -218,11 +165,47 @@ def test_ctrl_c_outside_training_is_quiet(last, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["render", "export what=cameras"])
-@pytest.mark.parametrize("ckpt", ["true", "[1]"])
-def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command, ckpt):
-    said(nerf(*command.split(), f"ckpt={ckpt}", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
+def test_a_checkpoint_that_is_no_path(nerf, tmp_path, command):
+    said(nerf(*command.split(), "ckpt=[1]", f"paths.output_dir={tmp_path}/out"), "does not fit: it must be a path")
 
 
 def test_a_part_of_ones_own_that_is_not_found_says_where_python_looks(nerf, capture):
     result = nerf("train", "scene=npz", f"scene.path={capture}", "model=nerf_tiny", "loss._target_=my_losses.L1")
     said(result, "loss cannot be built: No module named 'my_losses'", "PYTHONPATH=FOLDER before nerf train")
+
+
+BROKEN = {
+    "colmap": ("sparse/0/images.bin", ("images.bin ends after 100 bytes", "cut short", "nerf poses images=DIR")),
+    "llff": ("poses_bounds.npy", ("poses_bounds.npy is not an array of numbers", "imgs2poses", "scene=colmap")),
+    "transforms": ("transforms.json", ("transforms.json is not valid json", "line 1", "Export it again")),
+}
+WRITERS = {"colmap": write_colmap, "llff": write_llff, "transforms": write_transforms}
+
+
+def train_on(nerf, tmp_path, kind, *settings):
+    where = (f"scene.root={tmp_path}/capture", f"scene.cache_dir={tmp_path}/cache", f"paths.output_dir={tmp_path}/run")
+    return nerf("train", f"scene={kind}", *where, *FAST, *settings)
+
+
+def refused(result, tmp_path, *parts):
+    said(result, *parts)
+    assert not (tmp_path / "run").exists()
+    assert not list((tmp_path / "cache").glob("*.pixels")) if (tmp_path / "cache").exists() else True
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_capture_is_one_paragraph_and_leaves_nothing(nerf, tmp_path, kind):
+    WRITERS[kind](tmp_path / "capture", Known())
+    name, parts = BROKEN[kind]
+    path = tmp_path / "capture" / name
+    path.write_bytes(path.read_bytes()[:100])
+    refused(train_on(nerf, tmp_path, kind), tmp_path, *parts)
+
+
+def test_bad_settings_are_one_paragraph(nerf, tmp_path):
+    write_colmap(tmp_path / "capture", Known())
+    spaces = ("space", "auto", "bounded", "contracted")
+    for setting, parts in (
+        ("space=unbounded", spaces), ("root=123", ("root",)), ("downscale=1.5", ("downscale", "1.5")),
+    ):  # fmt: skip
+        refused(train_on(nerf, tmp_path, "colmap", f"scene.{setting}"), tmp_path, *parts)

@@ -228,30 +228,6 @@ def test_a_run_whose_folder_is_deleted_stops(number, capture, tmp_path):
     assert len([line for line in output.splitlines() if line.startswith("nerf: ")]) == 1, output
 
 
-@pytest.mark.slow
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("number", range(5))
-def test_of_processes_that_resume_one_run_at_once_one_does(number, capture, tmp_path):
-    ended(train(capture, tmp_path / "run", 5))
-    ends = [ended(each) for each in [train(capture, tmp_path / "run", 200) for _ in range(3)]]
-    assert sorted(code for code, _ in ends) == [0, 2, 2]
-    assert sum("is in use by another process that is training there" in output for _, output in ends) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.exhaustive
-def test_a_run_that_is_stopped_for_a_while_goes_on(capture, tmp_path):
-    process = train(capture, tmp_path / "run", 10**6, "budget.seconds=3")
-    once_saved(process, tmp_path / "run")
-    process.send_signal(signal.SIGSTOP)
-    time.sleep(10)
-    process.send_signal(signal.SIGCONT)
-    code, output = ended(process)
-    assert code == 0, output
-    used = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)["callbacks"]["TimeBudget"]
-    assert 3.0 <= used["used"] < 10.0
-
-
 BACK = """
 import sys, time
 from nerf_lightning.cli import main as cli

@@ -25,7 +25,7 @@ def begin(*arguments, buffered=True, **streams):
 
 
 @pytest.mark.parametrize("buffered", [True, False])
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["eval", "--cfg", "job"]])
+@pytest.mark.parametrize("arguments", [["--version"], ["eval", "--cfg", "job"]])
 def test_help_that_nobody_reads_to_its_end_says_nothing(arguments, buffered):
     assert unread(*arguments, buffered=buffered) == (READER_LEFT, "")
     assert unread(*arguments, buffered=buffered, merged=True)[0] == READER_LEFT
@@ -57,21 +57,17 @@ def test_bad_input_is_told_though_nobody_reads_stdout():
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
 @pytest.mark.parametrize("buffered", [True, False])
-@pytest.mark.parametrize("arguments", [["--version"], ["train", "--help"]])
-def test_a_full_disk_is_told_once(arguments, buffered):
+def test_a_full_disk_is_told_once(buffered):
     with open("/dev/full", "w") as full:
-        process = begin(*arguments, stdout=full, stderr=subprocess.PIPE, buffered=buffered)
+        process = begin("train", "--help", stdout=full, stderr=subprocess.PIPE, buffered=buffered)
         _, told = process.communicate(timeout=300)
     assert process.returncode == 2
     assert told.startswith("nerf: No space left on device.")
     assert len(told.splitlines()) == 1
 
 
-def test_another_pipe_that_breaks_is_an_error():
+def test_another_pipe_that_breaks_is_an_error_and_exit_codes_pass():
     with pytest.raises(BrokenPipeError), ends_quietly():
         raise BrokenPipeError(32, "the encoder has ended")
-
-
-def test_exit_codes_pass():
     with pytest.raises(SystemExit, match=r"^3$"), ends_quietly():
         raise SystemExit(3)

@@ -36,13 +36,7 @@ def test_commands_groups_options_keys_and_values():
     assert "--multirun" in completed("train", "--m")
     assert completed("no_command", "x") == []
     assert completed() == sorted(NAMES)
-
-
-def test_values_of_a_sweep_one_after_the_other():
     assert completed("train", "-m", "model=nerf,fast_d") == ["model=nerf,fast_dense"]
-
-
-def test_settings_are_those_of_the_options_that_were_typed():
     assert completed("train", "scene=colmap", "scene.f") == ["scene.far=", "scene.frames="]
     assert "scene.file=" in completed("train", "scene=transforms", "scene.f")
 

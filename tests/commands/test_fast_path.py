@@ -6,7 +6,7 @@ import time
 
 import pytest
 import torch
-from support.running import FAST, FAST_PATH, start
+from support.running import FAST, FAST_PATH, finished, saved, start
 
 QUIET = (*[x for x in FAST if not x.startswith(("model=", "data.batch", "data.crop"))], *FAST_PATH)
 STEPS = 70
@@ -18,16 +18,6 @@ def arguments(capture, folder, *extra):
         "final.evaluate=false", "final.video=false", "resume=auto", "callbacks.checkpoints.every_steps=5",
         "callbacks.validation_pictures.every_steps=1000", f"paths.output_dir={folder}", *extra,
     )  # fmt: skip
-
-
-def finished(process):
-    output, _ = process.communicate(timeout=300)
-    return process.returncode, output
-
-
-def saved(folder):
-    last = folder / "checkpoints" / "last.ckpt"
-    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
 
 
 def flat(value, path=""):
@@ -90,10 +80,7 @@ def test_a_time_budget_ends_the_run_and_its_schedule(capture, tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "parts"),
     [
-        (
-            ("encoder.log2_table_size=30", "encoder.num_levels=16", "encoder.max_resolution=9999"),
-            ("GiB", "encoder.log2_table_size"),
-        ),
+        (("encoder.log2_table_size=30", "encoder.num_levels=16", "encoder.max_resolution=9999"), ("GiB",)),
         (("budget.seconds=0",), ("budget.seconds=0", "positive")),
         (("data.sample_budget=100", "data.crop_steps=5"), ("data.sample_budget=100", "no crop")),
         (("encoder.log2_table_size=34",), ("log2_table_size=34",)),
@@ -131,7 +118,7 @@ def test_a_checkpoint_is_enough_to_render_every_kind_of_level(nerf, capture, tmp
 
 def test_bench_measures_a_packed_model(nerf, tmp_path, monkeypatch):
     threads, set_threads = [], torch.set_num_threads
-    monkeypatch.setattr("nerf_lightning.bench.benchmark.num_cores", lambda: 2)
+    monkeypatch.setattr("nerf_lightning.commands.bench.num_cores", lambda: 2)
     monkeypatch.setattr(torch, "set_num_threads", lambda count: (threads.append(count), set_threads(count)))
     result = nerf(
         "bench", "scene.resolution=24", "scene.num_train=6", "scene.num_val=2", "scene.num_test=1",

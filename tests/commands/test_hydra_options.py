@@ -1,12 +1,16 @@
-"""Hydra's own options, wherever and however they are typed."""
+"""Hydra's own options and values, wherever and however they are typed; what cannot be read is explained."""
 
 import argparse
+import shlex
 
 import pytest
 from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from support.running import said
 
 from nerf_lightning.cli.arguments import options_first
+from nerf_lightning.config.overrides import to_type
 
 TAKING_A_VALUE = [
     (option, (action.choices or ["x/y z"])[0])
@@ -41,25 +45,24 @@ def _full(option):
     return next(word for word in words if word.startswith("--"))
 
 
-def test_overrides_stay_as_they_are():
+def test_overrides_stay_as_they_are_and_options_of_a_sweep_are_hydras(nerf):
     overrides = ["~callbacks.monitor", "+a=-1", "++b={c:[1,2]}", "seed=1,2", "outputs/bricks", "x=a b", "y="]
     assert options_first(overrides) == overrides
+    result = nerf("train", "seed=0", "--multirun", "--help")
+    assert result.code == 0
+    assert "Examples:" in result.out
 
 
-@pytest.mark.parametrize("arguments", [["--cfg", "jobb"], ["--cfg"], ["--confdir=x"], ["seed=1", "-x"]])
-def test_an_option_that_hydra_does_not_know_is_one_paragraph(nerf, arguments):
-    said(nerf("train", *arguments), "nerf COMMAND --hydra-help")
+def test_options_that_hydra_does_not_know_or_that_do_not_go_together_are_one_paragraph(nerf):
+    for arguments in (["--cfg", "jobb"], ["--cfg"], ["--confdir=x"], ["seed=1", "-x"]):
+        said(nerf("train", *arguments), "nerf COMMAND --hydra-help")
+    for arguments in (["-m", "--cfg", "job"], ["--resolve"]):
+        said(nerf("train", *arguments), "--")
 
 
-@pytest.mark.parametrize("arguments", [["-m", "--cfg", "job"], ["--resolve"]])
-def test_options_that_do_not_go_together_are_one_paragraph(nerf, arguments):
-    said(nerf("train", *arguments), "--")
-
-
-@pytest.mark.parametrize("form", [["--cfg=job"], ["--cfg", "job"], ["-c", "job"]])
 @pytest.mark.parametrize("command", ["eval", "render", "view", "report", "table", "train"])
-def test_every_command_shows_its_config(nerf, command, form):
-    result = nerf(command, *form, "--package", "paths")
+def test_every_command_shows_its_config(nerf, command):
+    result = nerf(command, "-c", "job", "--package", "paths")
     assert result.code == 0, result.err
     assert result.out.startswith("# @package paths\nroot_dir: outputs\n")
 
@@ -73,7 +76,30 @@ def test_a_checkpoints_scene_and_options_go_together(nerf, finished_run):
     assert f"run: {finished_run}" in page.out, page.err
 
 
-def test_options_of_a_sweep_are_hydras(nerf):
-    result = nerf("train", "seed=0", "--multirun", "--help")
-    assert result.code == 0
-    assert "Examples:" in result.out
+NAMES = ["data/fox", "my fox", "fox (1)", "a,b", "it's", 'say "so"', "${HOME}", "C:\\fox", "C:\\it's", "end\\", "a=b"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_suggested_comes_back_through_shell_and_hydra(name):
+    (word,) = shlex.split(to_type("scene.root", name))
+    (override,) = OverridesParser.create().parse_overrides([word])
+    node = OmegaConf.create({"value": override.value()})
+    assert node.value == name
+
+
+@pytest.mark.parametrize("name", ["fox (1)", "fox (é)"])
+def test_a_value_that_hydra_cannot_read_is_written_out_with_quotes(nerf, name):
+    result = nerf("doctor", "scene=colmap", f"scene.name={name}")
+    assert result.code == 2
+    assert result.err.strip().startswith(f"nerf: scene.name={name} cannot be read")
+    assert result.err.strip().endswith(f"""Type "scene.name='{name}'".""")
+
+
+@pytest.mark.parametrize("end", ["", "\r"])
+def test_a_folder_needs_no_quotes_and_a_line_may_end_as_on_windows(nerf, end):
+    words = ["doctor", "scene=colmap", "scene.root=新加卷/fox (1)"]
+    said(nerf(*(f"{word}{end}" for word in words), *[end] * bool(end)), "The folder 新加卷/fox (1) does not exist")
+
+
+def test_spaces_around_the_equals_sign_are_told(nerf):
+    said(nerf("eval", "ckpt=", "data/x"), "settings are key=value without spaces: scene.root=data/x")

@@ -14,6 +14,7 @@ from support.ports import unused_port
 from support.running import FAST, start
 from support.viser_client import ViserClient
 
+from nerf_lightning.commands.train_job import live_view
 from nerf_lightning.commands.train_job.live_view import LiveView
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.callbacks.stop_signals import StopSignals
@@ -25,19 +26,6 @@ from nerf_lightning.viewer.progressive import ProgressiveRendering
 from nerf_lightning.viewer.render_queue import RenderQueue
 from nerf_lightning.viewer.renderer import SlicedRenderer
 from nerf_lightning.viewer.training_switch import TrainingSwitch
-
-
-@pytest.fixture
-def capture(tmp_path):
-    import numpy as np
-    from support.scenes import ball_scene
-
-    scene = ball_scene(num_views=6, size=16, background="black")
-    poses = torch.eye(4).repeat(6, 1, 1)
-    poses[:, :3] = scene.cameras.c2w
-    pictures = torch.stack([scene.pixels.view(view) for view in range(6)]).float() / 255
-    np.savez(tmp_path / "ball.npz", images=pictures[..., :3].numpy(), poses=poses.numpy(), focal=1.6 * 16)
-    return tmp_path / "ball.npz"
 
 
 def run(capture, folder, *arguments):
@@ -59,14 +47,8 @@ def address_in(process):
 def test_a_watched_training_ends_with_the_same_weights_and_closes_its_page(capture, tmp_path):
     steps = "trainer.max_steps=200"
     alone = run(capture, tmp_path / "alone", steps)
-    watched = run(
-        capture,
-        tmp_path / "watched",
-        steps,
-        "viewer=on",
-        f"viewer.live_view.port={unused_port()}",
-        "viewer.live_view.max_height=48",
-    )
+    page = ("viewer=on", f"viewer.live_view.port={unused_port()}", "viewer.live_view.max_height=48")
+    watched = run(capture, tmp_path / "watched", steps, *page)
     address = address_in(watched)
     client, lazy = ViserClient(address, 64, 48), ViserClient(address, 64, 48, reads=False)
     client.look_from(0)
@@ -134,8 +116,6 @@ class FakeSystem:
 
 @pytest.mark.parametrize("slice_seconds", [0.01, 0.2, 2.0])
 def test_pictures_take_no_more_than_their_share_of_the_time(monkeypatch, trainer, slice_seconds):
-    from nerf_lightning.commands.train_job import live_view
-
     clock = Clock()
     monkeypatch.setattr(live_view, "time", clock)
     callback = LiveView(share=0.2)
@@ -161,13 +141,10 @@ def test_nobody_looking_on_costs_nothing(trainer):
     assert queue.slices == 0
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0, -1.0])
-def test_a_share_that_leaves_nothing_is_refused(share):
-    with pytest.raises(InputError, match="give a part of the time between 0 and 1"):
-        LiveView(share=share)
-
-
-def test_a_place_where_nobody_can_listen_is_refused_at_once():
+def test_settings_of_the_page_that_cannot_be_are_refused_at_once():
+    for share in (0.0, 1.0, -1.0):
+        with pytest.raises(InputError, match="give a part of the time between 0 and 1"):
+            LiveView(share=share)
     with pytest.raises(InputError, match="cannot listen there"):
         LiveView(host="192.0.2.1")
     with pytest.raises(InputError, match="port=0"):
@@ -274,27 +251,21 @@ def test_ctrl_c_ends_a_pause(watched):
     assert watched.turns == 2
 
 
-def test_several_processes_are_not_paused():
-    switch = TrainingSwitch(can_pause=False)
-    switch.pause()
-    assert not switch.wants_pause
-
-
-def test_a_stop_ends_the_training_and_a_pause(watched):
+def test_a_stop_ends_the_training_and_a_pause_and_several_processes_are_not_paused(watched):
     watched.callback.switch.pause()
     watched.at_turn[2] = watched.callback.switch.stop
     watched.step()
     watched.step()
     assert watched.trainer.should_stop is True
+    switch = TrainingSwitch(can_pause=False)
+    switch.pause()
+    assert not switch.wants_pause
 
 
 @pytest.mark.slow
 def test_a_training_stopped_in_the_page_is_saved_and_evaluated(capture, tmp_path):
-    watched = start(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "final.video=false", "logger=none", "viewer=on",
-        "trainer.num_threads=1", "trainer.max_steps=1000000", f"viewer.live_view.port={unused_port()}",
-        "viewer.live_view.max_height=32", f"paths.output_dir={tmp_path / 'run'}",
-    )  # fmt: skip
+    page = ("viewer=on", f"viewer.live_view.port={unused_port()}", "viewer.live_view.max_height=32")
+    watched = run(capture, tmp_path / "run", *page, "trainer.max_steps=1000000", "final.evaluate=true")
     client = ViserClient(address_in(watched), 32, 24)
     client.look_from(0)
     client.set("Pause", True)

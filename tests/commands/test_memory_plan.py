@@ -11,7 +11,7 @@ import torch
 from support.configs import composed, options
 from support.scenes import ball_scene
 
-from nerf_lightning.commands.train_job import memory_plan
+from nerf_lightning.commands.train_job import fit, memory_plan
 from nerf_lightning.commands.train_job.memory_plan import MemoryPlan, Row
 from nerf_lightning.commands.train_job.memory_trial import peak_bytes
 from nerf_lightning.config.instantiate import build
@@ -137,7 +137,7 @@ def test_the_plan_is_right_to_a_fifth(model, precision, threads, overrides):
     pytest.fail(f"planned {planned}, of which {gaps} for gaps, measured {seen}")
 
 
-def test_what_a_chain_of_layers_holds_is_counted_to_the_byte():
+def test_what_a_chain_of_layers_holds_is_counted_to_the_byte_and_views_take_nothing():
     weight, points = torch.randn(8, 8, requires_grad=True), torch.randn(1000, 8)
 
     def forward():
@@ -151,9 +151,6 @@ def test_what_a_chain_of_layers_holds_is_counted_to_the_byte():
         assert peak_bytes(forward, CPU) == 2 * layer  # one goes in, one comes out
     assert peak_bytes(forward, CPU) == 3 * layer  # the way back needs what lies between
     assert peak_bytes(forward, torch.device("meta")) == 0
-
-
-def test_views_and_what_was_there_before_take_nothing():
     before = torch.zeros(1000)
     assert peak_bytes(lambda: before.view(10, 100).t().add_(1.0), CPU) == 0
     assert peak_bytes(lambda: before + 1.0, CPU) == 4000
@@ -198,14 +195,11 @@ def plan(step, free, counts=True):
     return MemoryPlan(rows, steps, free)
 
 
-def test_the_total_counts_what_is_there_at_a_time_and_no_mapped_file():
+def test_the_total_counts_what_is_there_at_a_time_and_a_shortage_is_said_with_its_cure():
     assert plan(2 * 10**9, 10**10).total == 6 * 10**9
     assert plan(10**8, 10**10).total == 5 * 10**9
     assert plan(2 * 10**9, 10**10, counts=False).total == 3 * 10**9
     assert "at most" in str(plan(2 * 10**9, 10**10)).splitlines()[-1]
-
-
-def test_a_shortage_is_said_with_its_cure():
     assert plan(2 * 10**9, 7 * 10**9).warning is None
     assert "lower trainer.tile_points" in str(plan(4 * 10**9, 7 * 10**9).warning)
     assert "7.0 GB are free" in str(plan(4 * 10**9, 7 * 10**9).warning)
@@ -229,14 +223,12 @@ def test_a_plan_is_logged_row_by_row_for_who_asks(monkeypatch, caplog):
     assert len(messages) == 4
 
 
-def test_else_it_is_one_line_that_says_what_is_counted(monkeypatch, caplog):
+def test_a_plan_is_one_line_that_says_what_is_counted_and_not_mentioned_where_it_is_small(monkeypatch, caplog):
     _, messages = announced(monkeypatch, caplog, logging.INFO, free=10**10)
     assert len(messages) == 1
     assert messages[0].startswith("memory: at most about 3.0 GB beside the ")
     assert "10.0 GB are free" in messages[0]
-
-
-def test_a_small_one_is_not_mentioned(monkeypatch, caplog):
+    caplog.clear()
     assert announced(monkeypatch, caplog, logging.INFO, free=10**12)[1] == []
 
 
@@ -247,3 +239,14 @@ def test_a_run_that_is_surely_small_is_not_tried(monkeypatch):
     monkeypatch.setattr(memory_plan, "memory_plan", tried)
     monkeypatch.setattr(memory_plan, "free_memory", lambda device: 10**12)
     memory_plan.announce_memory(*built_for("nerf_tiny", 1, 8192))
+
+
+@pytest.mark.parametrize(("steps", "measured"), [(2, []), (3, [8192])])
+def test_a_short_run_does_not_measure(steps, measured, train, monkeypatch):
+    asked = []
+    monkeypatch.setattr(fit, "SHORT_RUN", 2)
+    monkeypatch.setattr(fit, "measured_tile", lambda *given: asked.append(8192) or 8192)
+    short = ("trainer.tile_points=auto", f"trainer.max_steps={steps}")
+    result = train(*short, "final.evaluate=false", "final.video=false")
+    assert result.code == 0, result.err
+    assert asked == measured

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import yaml
-from support.running import FAST, refused, said
+from support.running import refused, said
 
 from nerf_lightning.runs.saved_overrides import former_overrides
 
@@ -41,12 +41,8 @@ QUICK = ("final.evaluate=false", "final.video=false", "callbacks.validation_pict
 
 
 @pytest.fixture
-def train(nerf, capture, tmp_path):
-    def call(*arguments):
-        folder = f"paths.output_dir={tmp_path}/run"
-        return nerf("train", "scene=npz", f"scene.path={capture}", *FAST, *QUICK, folder, *arguments)
-
-    return call
+def train(train):
+    return lambda *arguments: train(*QUICK, *arguments)
 
 
 @pytest.fixture

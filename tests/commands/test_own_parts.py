@@ -40,20 +40,12 @@ def test_what_is_ones_own_is_told_at_the_start_and_opened_where_it_is_trusted(ne
     run, output = own_run
     assert f"builds them only with trust={MODULE}" in " ".join(output.split())
     said(nerf("eval", f"ckpt={run}"), "VoxelModel", f"If it is your own, add trust={MODULE};")
-    measured = nerf(
-        "eval", f"ckpt={run}", f"trust={MODULE}", "evaluation.max_views=1", f"paths.output_dir={tmp_path}/m"
-    )
+    where = f"paths.output_dir={tmp_path}/out"
+    measured = nerf("eval", f"ckpt={run}", f"trust={MODULE}", "evaluation.max_views=1", where)
     assert measured.code == 0, measured.err
     assert "dB" in measured.out
-    points = nerf(
-        "export",
-        f"ckpt={run}",
-        "what=points",
-        "what.num_points=50",
-        "what.max_views=1",
-        "trust=[support]",
-        f"paths.output_dir={tmp_path}/p",
-    )
+    small = ("what=points", "what.num_points=50", "what.max_views=1")
+    points = nerf("export", f"ckpt={run}", *small, "trust=[support]", where)
     assert points.code == 0, points.err
     said(nerf("render", f"ckpt={run}", "trust=no such module"), "trust=no such module", "a Python module")
 

@@ -190,7 +190,7 @@ RECORDS = {
     "no extent": (recorded(far=torch.zeros(6)), "near is not everywhere from 0"),
     "no box": (recorded(aabb=torch.zeros(2, 3)), "aabb has no inside"),
     "no frame": (
-        recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))),
+        recorded(to_user=torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0])).double()),
         "to_user is not a rotation",
     ),
     "no views": (recorded(view_names=()), "of 0 views"),

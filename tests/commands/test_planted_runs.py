@@ -217,7 +217,7 @@ def test_numbers_of_a_note_that_are_none_do_not_end_a_run(run, value):
     note = {"fingerprint": "0", "seconds": value, "finished_at_step": value}
     (run / "run.json").write_text(json.dumps(note))
     assert _newest_unfinished(run.parent, "0", 10, None) == run
-    RunFolder(run, FileLock(run / "lock"), None).finish(12)
+    RunFolder(run, FileLock(run / "lock"), None).note(finished_at_step=12)
     found = read_note(run)
     assert found["finished_at_step"] == 12
     assert 0 <= found["seconds"] < 60

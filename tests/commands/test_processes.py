@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 from support.ports import unused_port
-from support.running import FAST, FAST_PATH, said, start, start_cold
+from support.running import FAST, FAST_PATH, finished, said, saved, start, start_cold
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.training.launch import processes
@@ -29,16 +29,6 @@ def arguments(capture, *extra):
         f"trainer.max_steps={STEPS}", TILES, "scene.background=random", "final.video=false", "path.num_frames=3",
         "evaluation.max_views=3", "callbacks.validation_pictures.every_steps=1000", *extra,
     )  # fmt: skip
-
-
-def finished(process):
-    output, _ = process.communicate(timeout=300)
-    return process.returncode, output
-
-
-def saved(folder):
-    last = folder / "checkpoints" / "last.ckpt"
-    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
 
 
 def assert_close(folder, other):
@@ -162,6 +152,14 @@ def test_processes_that_would_train_alone_are_refused(nerf, capture, monkeypatch
     assert "Add trainer=torchrun" in result.err
 
 
+def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
+    command, *rest = arguments(capture, "trainer=torchrun", "seed=0,1", f"paths.output_dir={tmp_path}")
+    result = nerf(command, "-m", *rest)
+    assert result.code == 2
+    assert "each of the processes would run the sweep by itself" in result.err
+
+
 SLURM = {"JOB_ID": "1", "JOB_NAME": "wrap", "NTASKS": "4", "PROCID": "0", "LOCALID": "0", "NODELIST": "localhost"}
 
 
@@ -182,15 +180,7 @@ def test_a_slurm_job_whose_tasks_would_not_train_together_is_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_sweep_under_torchrun_is_refused(nerf, capture, monkeypatch, tmp_path):
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
-    command, *rest = arguments(capture, "trainer=torchrun", "seed=0,1", f"paths.output_dir={tmp_path}")
-    result = nerf(command, "-m", *rest)
-    assert result.code == 2
-    assert "each of the processes would run the sweep by itself" in result.err
-
-
-def test_a_process_needs_a_device(monkeypatch):
+def test_a_process_needs_a_device_and_the_first_failure_of_its_own_is_the_exit_code(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert num_processes("auto", "cuda") == 4
     assert num_processes(2, "cuda") == 2
@@ -198,8 +188,5 @@ def test_a_process_needs_a_device(monkeypatch):
     for devices, device_type, words in ((8, "cuda", "there are 4 devices"), ("auto", "cpu", "trainer.devices=2")):
         with pytest.raises(InputError, match=words):
             num_processes(devices, device_type)
-
-
-def test_the_first_failure_of_its_own_is_the_exit_code():
     assert processes._exit_code([-15, 2]) == 2
     assert processes._exit_code([143, 143]) == 143

@@ -7,18 +7,17 @@ import shutil
 import pytest
 from support.browser import opened
 from support.measured_runs import leave_measured_run
-from support.running import said
+from support.running import finished, said, start
+
+from nerf_lightning.commands import report
 
 
 @pytest.fixture(scope="module")
 def page_of_run(finished_run, tmp_path_factory):
     """The page of a real run, written by a process of its own; with what the command printed."""
-    from support.running import start
-
     folder = tmp_path_factory.mktemp("page")
-    process = start("report", finished_run, f"paths.output_dir={folder}")
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    code, output = finished(start("report", finished_run, f"paths.output_dir={folder}"))
+    assert code == 0, output
     return folder / "report.html", output
 
 
@@ -33,21 +32,15 @@ def test_the_page_has_everything_and_loads_nothing(page_of_run, finished_run):
     assert f"report       {path}" in output
     assert "left out" not in output
     metrics = json.loads((finished_run / "metrics.json").read_text())
-    for shown in (
-        f"{metrics['psnr']:.2f} dB",
-        metrics["protocol"]["split_hash"],
-        metrics["origin"]["checkpoint"],
-        metrics["environment"]["torch"],
-        "trainer.max_steps=20",
-        "near and far",
-    ):
+    stamps = metrics["protocol"]["split_hash"], metrics["origin"]["checkpoint"], metrics["environment"]["torch"]
+    for shown in (f"{metrics['psnr']:.2f} dB", *stamps, "trainer.max_steps=20", "near and far"):
         assert shown in text, shown
     addresses = re.findall(r'(?:src|href)="([^"]{5})', text)
     assert set(addresses) == {"data:"}
     assert 'http-equiv="Content-Security-Policy" content="default-src &#x27;none&#x27;' in text
 
 
-def test_sliders_work_in_a_browser(page_of_run):
+def test_sliders_work_and_videos_play_in_a_browser(page_of_run):
     with opened(page_of_run[0].as_uri(), 1200, 900) as driver:
         run = driver.execute_script
         assert not [entry for entry in driver.get_log("browser") if "favicon" not in entry["message"]]
@@ -80,9 +73,6 @@ def test_sliders_work_in_a_browser(page_of_run):
             shots.append(picture.screenshot_as_png)
         assert shots[0] == shots[2] != shots[1]
 
-
-def test_videos_play_in_a_browser(page_of_run):
-    with opened(page_of_run[0].as_uri()) as driver:
         script = (
             "const done = arguments[0]; const films = [...document.querySelectorAll('video')];"
             "const ready = film => film.readyState > 0 || film.error;"
@@ -105,8 +95,6 @@ def test_without_its_photographs_the_page_says_so(nerf, finished_run, tmp_path):
 
 
 def test_photographs_on_a_disk_that_fails_are_left_out(nerf, finished_run, tmp_path, monkeypatch):
-    from nerf_lightning.commands import report
-
     def fail(*_):
         raise OSError(5, "Input/output error", "photographs/IMG_7.jpg")
 

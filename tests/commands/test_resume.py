@@ -1,24 +1,26 @@
 """A run stopped anywhere and resumed ends with the weights, bit for bit, of one that was never stopped."""
 
 import json
-import random
+import logging
+import os
 import shutil
 import signal
 import time
 
 import pytest
 import torch
-from support.running import FAST, start
+from support.running import FAST, finished, saved, start
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-STEPS = 110
-FEWER_STEPS = 70  # where it is stopped once
+from nerf_lightning.compute.slurm import requeue, slurm_job, was_requeued
+from nerf_lightning.training.launch.preemption import preemptible, wants_restart
+
+STEPS = 70
 
 
-def arguments(capture, folder, steps=STEPS, threads=1):
+def arguments(capture, folder, steps=STEPS):
     return (
-        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}",
-        f"trainer.num_threads={threads}",
+        "train", "scene=npz", f"scene.path={capture}", *FAST, f"trainer.max_steps={steps}", "trainer.num_threads=1",
         "scene.background=random", "final.evaluate=false", "final.video=false", "resume=auto",
         "callbacks.validation_pictures.every_steps=1000", "callbacks.checkpoints.every_steps=7",
         "trainer.val_every_steps=14", f"paths.output_dir={folder}",
@@ -26,7 +28,7 @@ def arguments(capture, folder, steps=STEPS, threads=1):
 
 
 def state(folder):
-    content = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    content = saved(folder)
     return content["global_step"], content["state_dict"], content["optimizer_states"][0]["state"]
 
 
@@ -37,97 +39,34 @@ def assert_same_to_the_bit(ours, theirs):
         assert all(torch.equal(ours[2][parameter][name], value) for name, value in moments.items())
 
 
-def steps_saved(folder):
-    last = folder / "checkpoints" / "last.ckpt"
-    return torch.load(last, weights_only=True)["global_step"] if last.exists() else 0
-
-
-def never_stopped_on(threads, capture, tmp_path_factory, steps=STEPS):
+@pytest.fixture(scope="module")
+def never_stopped(capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("never_stopped") / "run"
-    process = start(*arguments(capture, folder, steps, threads))
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    code, output = finished(start(*arguments(capture, folder)))
+    assert code == 0, output
     return state(folder)
 
 
-@pytest.fixture(scope="module")
-def never_stopped(capture, tmp_path_factory):
-    return never_stopped_on(1, capture, tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def never_stopped_soon_over(capture, tmp_path_factory):
-    return never_stopped_on(1, capture, tmp_path_factory, FEWER_STEPS)
-
-
-@pytest.fixture(scope="module")
-def never_stopped_on_two_threads(capture, tmp_path_factory):
-    return never_stopped_on(2, capture, tmp_path_factory)
-
-
-def run_and_stop(capture, folder, how, after_step, threads=1, steps=STEPS):
-    """Start or resume; stop as soon as `after_step` is saved; return what was said and the exit code."""
-    after_step = max(after_step, steps_saved(folder) + 7)
-    process = start(*arguments(capture, folder, steps, threads))
-    while process.poll() is None and steps_saved(folder) < after_step:
-        time.sleep(0.02)
-    if process.poll() is None:
-        process.send_signal(how)
-    output, _ = process.communicate(timeout=300)
-    return process.returncode, output
-
-
-def assert_the_same_end(capture, folder, never_stopped, threads):
-    order = random.Random(time.time_ns())
-    points = sorted(order.sample(range(7, STEPS - 60), 3))
-    for point, how in zip(points, [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], strict=True):
-        code, output = run_and_stop(capture, folder, how, point, threads)
-        assert code in (-how, 128 + how), (points, output)
-        if how == signal.SIGKILL:
-            killed_at = steps_saved(folder)
-        else:
-            assert "go on with: nerf train" in output
-            assert f"resume={folder}" in output
-    process = start(*arguments(capture, folder, threads=threads))
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    assert "going on from step" in output
-    assert_same_to_the_bit(state(folder), never_stopped)
-    steps = [
-        event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("Training loss/sum")
-    ]
-    assert steps == list(range(5, STEPS + 1, 5)), "TensorBoard shows each step once"
-    validated = [
-        event.step for event in EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("PSNR/validation")
-    ]
-    assert len(set(validated)) == len(validated)
-    # Killed between a save and the validation of the same step, it has lost that one.
-    assert {14 * number for number in range(1, STEPS // 14)} - {killed_at} <= set(validated)
-
-
 @pytest.mark.slow
-@pytest.mark.exhaustive  # killed once: test_kill.py; the packed model, killed and stopped: test_fast_path.py
-def test_a_run_that_is_killed_and_stopped_again_and_again_ends_the_same(capture, tmp_path, never_stopped):
-    assert_the_same_end(capture, tmp_path / "run", never_stopped, 1)
-
-
-@pytest.mark.slow
-@pytest.mark.exhaustive
-def test_a_run_on_two_threads_ends_the_same(capture, tmp_path, never_stopped_on_two_threads):
-    assert_the_same_end(capture, tmp_path / "run", never_stopped_on_two_threads, 2)
-
-
-@pytest.mark.slow
-def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped_soon_over):
-    """The command that a stopped run prints: no override needs to be repeated."""
+def test_a_run_is_resumed_by_its_folder_alone(capture, tmp_path, never_stopped):
+    """The command that a stopped run prints: no override needs to be repeated. TensorBoard shows each step once."""
     folder = tmp_path / "run"
-    code, output = run_and_stop(capture, folder, signal.SIGTERM, 14, steps=FEWER_STEPS)
+    process = start(*arguments(capture, folder))
+    while process.poll() is None and saved(folder)["global_step"] < 14:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    code, output = finished(process)
     assert code == 143, output
     assert f"go on with: nerf train resume={folder}" in output
-    process = start("train", f"resume={folder}")
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    assert_same_to_the_bit(state(folder), never_stopped_soon_over)
+    code, output = finished(start("train", f"resume={folder}"))
+    assert code == 0, output
+    assert "going on from step" in output
+    assert_same_to_the_bit(state(folder), never_stopped)
+    log = EventAccumulator(str(folder / "tensorboard")).Reload()
+    assert [event.step for event in log.Scalars("Training loss/sum")] == list(range(5, STEPS + 1, 5))
+    validated = [event.step for event in log.Scalars("PSNR/validation")]
+    assert len(set(validated)) == len(validated)
+    assert set(range(14, STEPS + 1, 14)) <= set(validated)  # and when it was stopped, or went on
 
 
 @pytest.mark.parametrize(("planned", "asked", "end"), [(20, 8, 20), (24, 22, 24), (20, 22, 22)])
@@ -145,11 +84,134 @@ def test_a_run_is_not_made_shorter_than_it_was_to_be(nerf, finished_run, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped_soon_over):
+def test_a_finished_run_can_be_extended_and_equals_a_long_one(capture, tmp_path, never_stopped):
     folder = tmp_path / "run"
-    for steps in (30, FEWER_STEPS):
-        extra = (f"scheduler.decay_steps={FEWER_STEPS}",)  # null stretches the schedule over the new length
-        process = start(*arguments(capture, folder, steps), *extra)
-        output, _ = process.communicate(timeout=300)
-        assert process.returncode == 0, output
-    assert_same_to_the_bit(state(folder), never_stopped_soon_over)
+    for steps in (30, STEPS):
+        extra = (f"scheduler.decay_steps={STEPS}",)  # null stretches the schedule over the new length
+        code, output = finished(start(*arguments(capture, folder, steps), *extra))
+        assert code == 0, output
+    assert_same_to_the_bit(state(folder), never_stopped)
+
+
+# What srun sets for a job of one task; by SLURM_NTASKS Lightning recognises Slurm.
+SLURM = {"JOB_ID": "4711", "JOB_NAME": "nerf", "NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0"}
+SLURM |= {"NODELIST": "localhost"}
+
+
+@pytest.fixture
+def scontrol(tmp_path, monkeypatch):
+    """A Slurm job whose scontrol writes down what it is asked; returns what it was asked."""
+    asked = tmp_path / "asked"
+    fake = tmp_path / "bin" / "scontrol"
+    fake.parent.mkdir()
+    fake.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{fake.parent}{os.pathsep}{os.environ['PATH']}")
+    for name, value in SLURM.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    return lambda: asked.read_text().splitlines() if asked.exists() else []
+
+
+def begin(capture, root, *more, **options):
+    return start(
+        "train", "scene=npz", f"scene.path={capture}", *FAST, "logger=none", "trainer.max_steps=150",
+        "final.video=false", f"paths.root_dir={root}", *more, **options,
+    )  # fmt: skip
+
+
+def saved_below(root, step, process):
+    while process.poll() is None:
+        found = list(root.rglob("last.ckpt"))
+        if found and torch.load(found[0], weights_only=True)["global_step"] >= step:
+            return found[0].parent.parent
+        time.sleep(0.05)
+    raise AssertionError(process.communicate()[0])
+
+
+def test_a_job_of_an_array_is_named_by_array_and_task(monkeypatch):
+    monkeypatch.setenv("SLURM_JOB_ID", "13")
+    assert slurm_job() == "13"
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "12")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "3")
+    assert slurm_job() == "12_3"
+
+
+def test_a_first_start_was_not_requeued(monkeypatch):
+    assert not was_requeued()
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert not was_requeued(), "only Slurm restarts Slurm's jobs"
+    monkeypatch.setenv("SLURM_JOB_ID", "13")
+    assert was_requeued()
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "0")
+    assert not was_requeued()
+
+
+def test_usr1_requeues_and_sigterm_does_not(scontrol):
+    for number, asked in ((signal.SIGTERM, []), (signal.SIGUSR1, ["requeue 4711"])):
+        before = signal.getsignal(number)
+        with pytest.raises(SystemExit) as stop, preemptible():
+            signal.raise_signal(number)
+        assert stop.value.code == 128 + number
+        assert wants_restart(stop.value.code) == bool(asked)
+        assert scontrol() == asked
+        assert signal.getsignal(number) == before
+
+
+def test_one_process_asks_for_all_and_a_refusal_by_slurm_is_told(scontrol, monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("SLURM_PROCID", "1")
+    requeue()
+    assert scontrol() == []
+    monkeypatch.setenv("SLURM_PROCID", "0")
+    (tmp_path / "bin" / "scontrol").write_text("#!/bin/sh\necho 'Job may not be requeued' >&2\nexit 1\n")
+    with caplog.at_level(logging.ERROR):
+        requeue()
+    assert "scontrol requeue 4711 failed: Job may not be requeued. Submit the job again by hand" in caplog.text
+
+
+def test_submitits_own_handler_is_called_after_the_run_has_saved(monkeypatch):
+    monkeypatch.setenv("SUBMITIT_EXECUTOR", "slurm")
+    called = []
+    before = signal.signal(signal.SIGUSR2, lambda number, frame: called.append(number))
+    try:
+        with pytest.raises(SystemExit), preemptible():
+            signal.raise_signal(signal.SIGUSR2)
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert called == [signal.SIGUSR2]
+
+
+@pytest.mark.slow
+def test_a_slurm_job_whose_time_is_up_goes_on_in_its_folder_when_it_is_started_again(capture, tmp_path, scontrol):
+    root = tmp_path / "runs"
+    process = begin(capture, root)
+    folder = saved_below(root, 10, process)
+    process.send_signal(signal.SIGUSR1)
+    code, output = finished(process)
+    assert code == 128 + signal.SIGUSR1, output
+    assert scontrol() == ["requeue 4711"]
+    assert not list(root.rglob("hpc_ckpt*")), "Lightning's own requeueing is off"
+    note = json.loads((folder / "run.json").read_text())
+    assert (note["slurm_job"], note["preempted"]) == ("4711", True)
+    code, output = finished(begin(capture, root, env={"SLURM_RESTART_COUNT": "1"}))
+    assert code == 0, output
+    assert "going on from step" in output
+    assert len(list(root.rglob("run.json"))) == 1
+    assert json.loads((folder / "run.json").read_text())["finished_at_step"] == 150
+
+
+@pytest.mark.exhaustive
+def test_a_job_of_submitit_saves_is_started_again_and_goes_on(capture, tmp_path):
+    folder = tmp_path / "sweep"
+    process = begin(
+        capture, tmp_path, "-m", "hydra/launcher=slurm_here", "seed=0", "hydra.sweep.dir=" + str(folder),
+        "hydra.launcher.timeout_min=10",
+    )  # fmt: skip
+    run = saved_below(folder, 10, process)
+    record = json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())
+    os.kill(record["process"], signal.SIGUSR2)
+    code, output = finished(process)
+    assert code == 0, output
+    (log,) = folder.glob(".submitit/*/*_log.err")
+    assert "going on from step" in log.read_text()
+    assert json.loads((run / "run.json").read_text())["finished_at_step"] == 150
+    assert json.loads((folder / ".hydra" / "jobs" / "0.json").read_text())["state"] == "finished"

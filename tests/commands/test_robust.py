@@ -6,7 +6,7 @@ import time
 import pytest
 import torch
 from support.configs import composed
-from support.running import FAST, said, start
+from support.running import FAST, finished, said, saved, start
 
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.nerf.losses.mse import MeanSquaredError
@@ -24,17 +24,11 @@ def arguments(capture, folder, *more):
     )  # fmt: skip
 
 
-def saved(folder):
-    last = folder / "checkpoints" / "last.ckpt"
-    return torch.load(last, weights_only=True) if last.exists() else {"global_step": 0}
-
-
 @pytest.fixture(scope="module")
 def run(capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("robust") / "run"
-    process = start(*arguments(capture, folder))
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    code, output = finished(start(*arguments(capture, folder)))
+    assert code == 0, output
     return folder
 
 
@@ -54,10 +48,9 @@ def test_a_run_that_was_killed_and_goes_on_ends_with_the_same_bits(capture, run,
         time.sleep(0.02)
     if process.poll() is None:
         process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=300)
-    process = start(*arguments(capture, folder))
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    finished(process)
+    code, output = finished(start(*arguments(capture, folder)))
+    assert code == 0, output
     ours, theirs = saved(folder)["state_dict"], saved(run)["state_dict"]
     assert 0 < float(theirs["loss.threshold"]) < 1
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)

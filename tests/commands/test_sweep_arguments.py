@@ -13,21 +13,14 @@ def leave_sweep(folder, *arguments, slurm_job=None):
     SweepRecord(list(arguments), slurm_job).write(folder)
 
 
-def test_the_flag_comes_first_wherever_it_was_typed():
+def test_the_flag_comes_first_wherever_it_was_typed_and_a_single_run_stays_as_it_is():
     assert sweep_arguments(["seed=0,1", "--multirun"])[:2] == ["-m", "seed=0,1"]
-
-
-def test_a_single_run_stays_as_it_is():
     assert sweep_arguments(["seed=0", "paths.output_dir=out"]) == ["seed=0", "paths.output_dir=out"]
 
 
 def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):
-    made = (
-        "hydra.mode=MULTIRUN",
-        "hydra.sweep.dir=x",
-        f"hydra.sweep.subdir='{JOB_NUMBER}_seed=${{seed}}'",
-        "sweep.resume=true",
-    )
+    subdir = f"hydra.sweep.subdir='{JOB_NUMBER}_seed=${{seed}}'"
+    made = ("hydra.mode=MULTIRUN", "hydra.sweep.dir=x", subdir, "sweep.resume=true")
     leave_sweep(tmp_path / "my sweep", *made, "hydra/launcher=parallel", "seed=0,1", "model=nerf_tiny")
     asked = ["-m", "sweep.resume=true", f"paths.output_dir='{tmp_path}/my sweep'", "model=nerf"]
     assert sweep_arguments(asked) == [
@@ -36,13 +29,10 @@ def test_going_on_repeats_what_the_sweep_was_started_with(tmp_path):
     ]  # fmt: skip
 
 
-def test_going_on_without_saying_with_what_names_the_newest(tmp_path):
+def test_going_on_with_nothing_is_refused_and_without_saying_with_what_names_the_newest(tmp_path):
     leave_sweep(tmp_path / "sweeps" / "old", "seed=0,1")
     with pytest.raises(InputError, match=rf"newest is paths\.output_dir={tmp_path}/sweeps/old"):
         sweep_arguments(["-m", "sweep.resume=true", f"paths.root_dir={tmp_path}"])
-
-
-def test_going_on_with_nothing_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no sweep \(no .hydra/sweep.yaml\)"):
         sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={tmp_path}"])
     assert "seed=0,1" in sweep_arguments(["-m", "sweep.resume=true", f"paths.output_dir={tmp_path}", "seed=0,1"])
@@ -66,9 +56,7 @@ def test_a_requeued_slurm_job_finds_its_own_sweep(tmp_path, monkeypatch):
     ("group", "plugin", "extra"),
     [
         ("launcher=parallel", "joblib", "sweep"),
-        ("launcher=joblib", "joblib", "sweep"),
         ("launcher=slurm", "submitit", "slurm"),
-        ("launcher=slurm_here", "submitit", "slurm"),
         ("sweeper=search", "optuna", "sweep"),
     ],
 )

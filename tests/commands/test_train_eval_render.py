@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 from support.captures import real_capture
-from support.running import FAST, said
+from support.running import said
 from support.videos import read_video
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -18,30 +18,25 @@ def events(folder):
     return EventAccumulator(str(folder / "tensorboard"), size_guidance=everything).Reload()
 
 
-def test_a_run_folder_has_everything(finished_run):
+def test_a_run_folder_has_everything_and_the_end_says_where(finished_run):
     for name in (
-        "metrics.json",
-        "metrics.csv",
-        "checkpoints/last.ckpt",
-        "checkpoints/best.ckpt",
-        ".hydra/config.yaml",
-        "video.mp4",
-        "depth.mp4",
-        "progress.mp4",
-        "train.log",
+        *("metrics.json", "metrics.csv", "checkpoints/last.ckpt", "checkpoints/best.ckpt", ".hydra/config.yaml"),
+        *("video.mp4", "depth.mp4", "progress.mp4", "train.log"),
     ):
         assert (finished_run / name).stat().st_size > 0, name
     assert len(list((finished_run / "images").glob("test_*.png"))) == 1
     assert len(list((finished_run / "images" / "validation").glob("*.png"))) == 2
-
-
-def test_the_end_says_psnr_ssim_video_and_tensorboard(finished_run):
     output = (finished_run / "output.txt").read_text()
     metrics = json.loads((finished_run / "metrics.json").read_text())
     assert f"test PSNR    {metrics['psnr']:.2f} dB   SSIM {metrics['ssim']:.4f}" in output
     assert str(finished_run / "video.mp4") in output
     assert "LPIPS" not in output  # the report says what it needs
     assert f"tensorboard --logdir {finished_run / 'tensorboard'}" in output
+    _, frames = read_video(finished_run / "video.mp4")
+    assert frames.shape == (2, 16, 16, 3)
+    content = torch.load(finished_run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert "model.levels.fine.field.color_head.weight" in content["state_dict"]
+    assert content["global_step"] == 20
 
 
 def test_metrics_carry_their_protocol(finished_run):
@@ -60,12 +55,7 @@ def test_metrics_carry_their_protocol(finished_run):
     assert [row["name"] for row in rows] == [row["name"] for row in metrics["per_image"]]
 
 
-def test_the_video_has_the_pictures_own_size(finished_run):
-    _, frames = read_video(finished_run / "video.mp4")
-    assert frames.shape == (2, 16, 16, 3)
-
-
-def test_tensorboard_has_scalars_pictures_config_and_a_row_of_hyper_parameters(finished_run):
+def test_tensorboard_has_scalars_pictures_config_histograms_and_a_row_of_hyper_parameters(finished_run):
     log = events(finished_run)
     tags = log.Tags()
     assert {
@@ -83,17 +73,9 @@ def test_tensorboard_has_scalars_pictures_config_and_a_row_of_hyper_parameters(f
     assert {"model", "scene", "seed", "trainer.max_steps"} <= set(settings)
     assert len(settings) <= 15
     assert "data.sample_budget" not in settings, "as by default"
-
-
-def test_tensorboard_opens_on_psnr_pictures_and_losses_and_ends_with_histograms(finished_run):
-    tags = events(finished_run).Tags()
     groups = sorted({tag.partition("/")[0] for kind in ("scalars", "images", "histograms") for tag in tags[kind]})
     assert groups[:3] == ["PSNR", "Pictures", "Training loss"]
     assert groups[-2:] == ["weights_along_rays", "weights_per_ray"]
-
-
-def test_tensorboard_shows_what_lies_along_the_rays_of_each_level(finished_run):
-    log = events(finished_run)
     for level in ("coarse", "fine"):
         assert all(event.value > 0 for event in log.Scalars(f"gradients/norm_{level}"))
         assert [event.step for event in log.Scalars(f"rays/effective_samples_{level}")] == [10, 20]
@@ -101,12 +83,6 @@ def test_tensorboard_shows_what_lies_along_the_rays_of_each_level(finished_run):
             assert [event.step for event in log.Histograms(f"{name}_{level}")] == [10, 20], name
         shares = log.Histograms(f"weights_along_rays/weight_{level}")[-1].histogram_value
         assert 0 < sum(shares.bucket) <= 1.0 + 1e-5
-
-
-def test_a_checkpoint_loads_with_weights_only_and_names_its_state_dict(finished_run):
-    content = torch.load(finished_run / "checkpoints" / "last.ckpt", weights_only=True)
-    assert "model.levels.fine.field.color_head.weight" in content["state_dict"]
-    assert content["global_step"] == 20
 
 
 def test_eval_needs_the_checkpoint_alone_and_repeats_the_trained_number(finished_run, nerf, tmp_path):
@@ -117,20 +93,15 @@ def test_eval_needs_the_checkpoint_alone_and_repeats_the_trained_number(finished
     ours = json.loads((tmp_path / "metrics.json").read_text())
     theirs = json.loads((finished_run / "metrics.json").read_text())
     assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=1e-6)
-    assert ours["protocol"]["split_hash"] == theirs["protocol"]["split_hash"]
+    assert all(ours[part] == theirs[part] for part in ("protocol", "origin", "environment"))
     assert "test PSNR" in result.out
 
 
-def test_eval_of_another_split_and_of_bytes(finished_run, nerf, tmp_path):
-    nerf(
-        "eval",
-        f"ckpt={finished_run}/checkpoints/best.ckpt",
-        f"paths.output_dir={tmp_path}",
-        "evaluation.split=train",
-        "evaluation.quantize=true",
-        "evaluation.max_views=1",
-    )
-    protocol = json.loads((tmp_path / "metrics.json").read_text())["protocol"]
+def test_a_loose_checkpoint_is_evaluated_beside_itself_on_another_split_and_in_bytes(finished_run, nerf, tmp_path):
+    loose = tmp_path / "loose.ckpt"
+    loose.write_bytes((finished_run / "checkpoints" / "best.ckpt").read_bytes())
+    nerf("eval", f"ckpt={loose}", "evaluation.split=train", "evaluation.quantize=true", "evaluation.max_views=1")
+    protocol = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())["protocol"]
     assert (protocol["split"], protocol["pixels"]) == ("train", "8-bit")
 
 
@@ -163,18 +134,9 @@ def test_a_sweep_of_eval_keeps_the_scene_and_has_a_folder_per_job(finished_run, 
     assert {protocol["scene"] for protocol in protocols} == {"npz"}
 
 
-def test_a_loose_checkpoint_is_evaluated_beside_itself(finished_run, nerf, tmp_path):
-    loose = tmp_path / "loose.ckpt"
-    loose.write_bytes((finished_run / "checkpoints" / "last.ckpt").read_bytes())
-    assert nerf("eval", f"ckpt={loose}", "evaluation.max_views=1").code == 0
-    assert (tmp_path / "evaluation" / "metrics.json").is_file()
-
-
-def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7",
-        f"init_from={finished_run}", "resume=auto", f"paths.output_dir={tmp_path}/run", "final.video=false",
-    )  # fmt: skip
+def test_a_model_can_start_from_another_runs_weights(finished_run, train, tmp_path):
+    little = ("trainer.max_steps=1", "optimizer.lr=1e-12", "seed=7", "final.video=false")
+    result = train(*little, f"init_from={finished_run}", "resume=auto")
     assert result.code == 0, result.err
     assert f"begins with the weights of {finished_run}/checkpoints/last.ckpt, of step " in result.err
     assert "resume=auto: there is no unfinished run of this config to go on with" in result.err
@@ -183,12 +145,9 @@ def test_a_model_can_start_from_another_runs_weights(finished_run, nerf, capture
     assert all(torch.allclose(ours[key], theirs[key], atol=1e-9) for key in ours)
 
 
-def test_an_epoch_is_every_training_ray_once(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.max_epochs=1", "data.batch_rays=100",
-        "trainer.max_steps=1000",
-        f"paths.output_dir={tmp_path}/run", "final.video=false", "final.evaluate=false", "logger=none",
-    )  # fmt: skip
+def test_an_epoch_is_every_training_ray_once(train, tmp_path):
+    once = ("trainer.max_epochs=1", "data.batch_rays=100", "trainer.max_steps=1000")
+    result = train(*once, "final.video=false", "final.evaluate=false", "logger=none")
     assert result.code == 0, result.err
     steps = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"]
     assert steps == 3 + -(-8 * 256 // 100)  # after the crop
@@ -227,12 +186,9 @@ def test_a_few_steps_of_forward_facing_experiments(nerf, tmp_path, experiment):
     assert (tmp_path / "run" / "metrics.json").is_file()
 
 
-def test_the_articles_figure_is_drawn_after_each_epoch(nerf, capture, tmp_path):
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "callbacks=article", "data.batch_rays=512",
-        "data.crop_steps=0", "trainer.max_steps=9", f"paths.output_dir={tmp_path}/run", "final.evaluate=false",
-        "final.video=false", "callbacks.epoch_figures.every_steps=1",
-    )  # fmt: skip
+def test_the_articles_figure_is_drawn_after_each_epoch(train, tmp_path):
+    article = ("callbacks=article", "data.batch_rays=512", "data.crop_steps=0", "callbacks.epoch_figures.every_steps=1")
+    result = train(*article, "trainer.max_steps=9", "final.evaluate=false", "final.video=false")
     assert result.code == 0, result.err
     figures = sorted(file.name for file in (tmp_path / "run/images/epochs").glob("*.png"))
     assert figures == ["epoch_0001.png", "epoch_0002.png"]  # 4 steps an epoch, 9 steps

@@ -21,13 +21,17 @@ def native(monkeypatch):
     return pretend
 
 
-def test_precision_follows_the_machine(native):
+def test_precision_and_device_follow_the_machine_with_their_reasons(native, monkeypatch):
     native(True)
     assert TrainerSettings(accelerator="cpu").precision == "bf16-mixed"
     assert "native bfloat16" in TrainerSettings(accelerator="cpu").describe()
     native(False)
     assert TrainerSettings(accelerator="cpu").precision == "32-true"
     assert "no native bfloat16" in TrainerSettings(accelerator="cpu").describe()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "(no GPU found)" in TrainerSettings().describe()
+    assert "(as asked)" in TrainerSettings(accelerator="cpu").describe()
+    assert devices.has_native_bfloat16("cpu") in (True, False)
 
 
 def test_the_environment_says_what_auto_means(native, monkeypatch):
@@ -50,10 +54,6 @@ def test_a_precision_that_is_asked_for_is_taken_with_a_warning_where_it_is_slow(
     assert "no native bfloat16" in caplog.text
 
 
-def test_the_probe_answers_on_this_machine():
-    assert devices.has_native_bfloat16("cpu") in (True, False)
-
-
 def test_the_length_is_the_smaller_of_steps_and_epochs():
     assert TrainerSettings(max_steps=100).num_steps(1000, 10, 0) == 100
     assert TrainerSettings(max_steps=1000, max_epochs=1).num_steps(1000, 10, 0) == 100
@@ -62,10 +62,10 @@ def test_the_length_is_the_smaller_of_steps_and_epochs():
     assert TrainerSettings(max_epochs=2).num_steps(995, 10, 30) == 229  # the crop is no epoch
 
 
-@pytest.mark.parametrize("name", ["max_steps", "val_every_steps"])
-def test_no_steps_at_all_are_refused(name):
-    with pytest.raises(InputError, match=f"trainer.{name}=0"):
-        TrainerSettings(**{name: 0})
+def test_no_steps_at_all_are_refused():
+    for name in ("max_steps", "val_every_steps"):
+        with pytest.raises(InputError, match=f"trainer.{name}=0"):
+            TrainerSettings(**{name: 0})
 
 
 def test_tiles_can_be_chosen_and_switched_off():
@@ -76,7 +76,7 @@ def test_tiles_can_be_chosen_and_switched_off():
     assert whole.inference_tile_points == compute_settings.CPU_TILE_POINTS
 
 
-def test_what_a_run_measured_is_kept_but_does_not_overrule():
+def test_what_a_run_measured_is_kept_as_far_as_somebody_could_have_measured_it_but_does_not_overrule():
     measured = TrainerSettings(accelerator="cpu")
     measured.keep_tile(65536)
     assert measured.inference_tile_points == 65536
@@ -85,6 +85,10 @@ def test_what_a_run_measured_is_kept_but_does_not_overrule():
     named = TrainerSettings(accelerator="cpu", tile_points=99)
     named.keep_tile(65536)
     assert named.inference_tile_points == 99
+    settings = TrainerSettings(accelerator="cpu")
+    for found, taken in ((1, 1024), (1 << 31, 1 << 18)):
+        settings.keep_tile(found)
+        assert settings.tile_points == taken
 
 
 @pytest.mark.parametrize(("precision", "matmul_precision"), [("32-true", "float32"), ("bf16-mixed", "bfloat16")])
@@ -97,13 +101,9 @@ def test_a_models_fields_multiply_in_the_precision_of_the_run(precision, matmul_
 
 
 @pytest.mark.slow
-def test_bfloat16_trains_and_evaluates(nerf, capture, tmp_path):
-    from support.running import FAST
-
-    result = nerf(
-        "train", "scene=npz", f"scene.path={capture}", *FAST, "trainer.precision=bf16-mixed", "trainer.max_steps=3",
-        "callbacks.validation_pictures.every_steps=3", "path.width=8", f"paths.output_dir={tmp_path}/run",
-    )  # fmt: skip
+def test_bfloat16_trains_and_evaluates(train, tmp_path):
+    every = ("callbacks.validation_pictures.every_steps=3", "trainer.max_steps=3", "path.width=8")
+    result = train("trainer.precision=bf16-mixed", *every)
     assert result.code == 0, result.err
     weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(value.dtype == torch.float32 for value in weights.values() if value.is_floating_point())
@@ -119,16 +119,3 @@ def test_what_this_machine_lacks_is_refused_with_a_cure(monkeypatch):
     ):
         with pytest.raises(InputError, match=words):
             TrainerSettings(**settings)
-
-
-def test_the_choice_of_the_device_has_its_reason(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "(no GPU found)" in TrainerSettings().describe()
-    assert "(as asked)" in TrainerSettings(accelerator="cpu").describe()
-
-
-def test_a_tile_from_a_file_is_one_that_somebody_could_have_measured():
-    settings = TrainerSettings(accelerator="cpu")
-    for found, taken in ((1, 1024), (1 << 31, 1 << 18)):
-        settings.keep_tile(found)
-        assert settings.tile_points == taken

@@ -17,6 +17,7 @@ from support.viser_client import ViserClient
 
 from nerf_lightning.cli.prepare import prepared
 from nerf_lightning.commands import view
+from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.viewer import page as page_module
 
@@ -62,7 +63,7 @@ def client(page):
 
 
 @pytest.mark.slow
-def test_a_client_sees_a_coarse_picture_then_a_fine_one_and_another_when_it_moves(client):
+def test_a_client_sees_coarse_then_fine_pictures_and_those_that_leave_or_never_read_harm_nobody(client, page):
     client.look_from(0)
     fine = client.wait_for_height(96)
     assert len(client.pictures[0]) <= 96
@@ -71,10 +72,6 @@ def test_a_client_sees_a_coarse_picture_then_a_fine_one_and_another_when_it_move
     client.look_from(90)
     other = client.wait_for_height(96, after=before)
     assert np.abs(fine.astype(float) - other).mean() > 1
-
-
-@pytest.mark.slow
-def test_clients_that_leave_or_never_read_harm_nobody(page, client):
     slow = ViserClient(page.address, reads=False)
     for degrees in range(20):
         slow.look_from(degrees)
@@ -122,7 +119,7 @@ def test_without_viser_there_is_one_paragraph(finished_run, nerf, monkeypatch):
     def missing(name):
         raise ImportError(f"No module named '{name}'")
 
-    monkeypatch.setattr(page_module, "import_module", missing)
+    monkeypatch.setattr(errors, "import_module", missing)
     said(
         nerf("view", f"ckpt={finished_run}/checkpoints/last.ckpt"),
         "needs viser, which is not installed",
@@ -175,14 +172,12 @@ def of_unknown_scene(tmp_path):
     return write_checkpoint(tmp_path / "x.ckpt", lambda content: content["nerf_lightning"]["choices"].update(scene="x"))
 
 
-def test_why_there_are_no_photographs_is_said(of_unknown_scene, caplog):
+def test_why_there_are_no_photographs_is_said_and_none_are_guessed(of_unknown_scene, caplog):
     given = [f"ckpt={of_unknown_scene}", "port=9000"]
     assert prepared("view", given) == ["photographs=false", *given]
     assert "shown without their photographs" in caplog.text
     assert "was trained on the scene 'x', which conf/scene/ lacks. Name the scene: add scene=" in caplog.text
-
-
-def test_photographs_that_nobody_knows_are_not_guessed(of_unknown_scene, caplog):
+    caplog.clear()
     with pytest.raises(InputError, match="was trained on the scene 'x'"):
         prepared("view", [f"ckpt={of_unknown_scene}", "photographs=true"])
     assert prepared("view", [f"ckpt={of_unknown_scene}", "photographs=false"])[0] == "photographs=false"

@@ -105,11 +105,6 @@ def test_photographs_alone_are_examined_trained_for_minutes_and_reported():
     assert unbounded.budget.seconds is None
 
 
-def test_what_is_neither_a_switch_nor_auto_is_refused():
-    with pytest.raises(InputError, match="doctor=maybe does not fit"):
-        chosen_for(PHOTOGRAPHS, "doctor=maybe")
-
-
 def corrected_for(verdict, *overrides):
     config, choices = compose_config("train", overrides)
     said = "2 of 20 differ in brightness"
@@ -158,9 +153,11 @@ def test_a_run_that_is_gone_on_with_keeps_the_correction_that_was_chosen_for_it(
         assert config.correction == chosen.correction
 
 
-def test_a_new_run_knows_of_no_former_one(tmp_path):
+def test_a_new_run_knows_of_no_former_one_and_what_is_neither_a_switch_nor_auto_is_refused(tmp_path):
     for overrides in ([], [f"paths.output_dir={tmp_path}/new"], ["resume=auto"]):
         assert former_config(compose_config("train", overrides)[0], job_folder=None) is None
+    with pytest.raises(InputError, match="doctor=maybe does not fit"):
+        chosen_for(PHOTOGRAPHS, "doctor=maybe")
 
 
 def test_what_the_doctor_of_a_training_finds_reaches_its_step(monkeypatch):

@@ -1,4 +1,4 @@
-"""What all readers of captures can be told stands in one yaml, and a new reader has it from there."""
+"""What all readers can be told stands in one yaml, for new ones, too; what exporters need is found by itself."""
 
 from dataclasses import MISSING, dataclass, fields
 
@@ -8,11 +8,14 @@ from support.configs import composed
 from support.planted import write_checkpoint
 from support.posed_captures import Known, ring, write_transforms
 
+from nerf_lightning.config.exporters import exporter_class, kernel_modules
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.config.scene_overrides import scene_overrides
 from nerf_lightning.data.captures.reader import CaptureReader
 from nerf_lightning.data.readers.transforms import TransformsReader
+from nerf_lightning.export.page import PageExport
 from nerf_lightning.files.folders import conf_folder
+from nerf_lightning.nerf.kernels.backends import backend
 
 
 @dataclass
@@ -56,3 +59,14 @@ def test_what_a_run_was_told_is_taken_from_its_checkpoint(tmp_path, scene):
     overrides = scene_overrides(str(file))
     assert {f"scene={scene}", "scene.downscale=2", f"scene.root='{tmp_path}'"} <= set(overrides)
     assert not [each for each in overrides if "cache_dir" in each]
+
+
+def test_every_kernel_of_models_and_of_exporters_compiles():
+    modules = kernel_modules()
+    assert {"nerf_lightning.nerf.kernels.march.cpu", "nerf_lightning.export.voxel_kernels.texels"} <= set(modules)
+    assert all(backend(module) for module in modules)
+
+
+def test_an_exporter_is_known_by_its_yaml_and_one_of_somebody_else_is_not():
+    assert exporter_class("page") is PageExport
+    assert exporter_class("my_own") is None

@@ -70,14 +70,11 @@ def test_too_small_a_picture_has_no_score(lpips):
         lpips(torch.rand(smallest - 1, 64, 3), torch.rand(smallest - 1, 64, 3))
 
 
-def test_a_missing_file_says_how_to_get_it(tmp_path):
+def test_a_missing_file_says_how_to_get_it_and_a_wrong_one_is_named(tmp_path):
     with pytest.raises(InputError) as caught:
         load_lpips(str(tmp_path / "alexnet.pth"))
     assert "there is no such file" in str(caught.value)
     assert LPIPS_HINT in str(caught.value)
-
-
-def test_a_wrong_file_is_named(tmp_path):
     path = tmp_path / "weights.pth"
     wrong = torchvision_like(ALEXNET)
     wrong["features.3.weight"] = torch.zeros(1)

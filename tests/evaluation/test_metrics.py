@@ -19,11 +19,8 @@ def pair(mse, size=16):
     return truth + math.sqrt(mse), truth
 
 
-def test_psnr_by_hand():
+def test_psnr_by_hand_and_finite_where_pictures_are_equal():
     torch.testing.assert_close(psnr(torch.tensor([1.0, 0.01, 1e-4])), torch.tensor([0.0, 20.0, 40.0]))
-
-
-def test_a_psnr_is_finite_where_pictures_are_equal():
     torch.testing.assert_close(psnr(torch.tensor([0.0, 1e-12, 1e-10])), torch.tensor([100.0, 100.0, 100.0]))
     assert psnr(torch.tensor(math.nan)).isnan()
 
@@ -48,9 +45,11 @@ def test_ssim_falls_with_noise():
     assert 1.0 > scores[0] > scores[1] > scores[2] > 0.0
 
 
-def test_an_image_smaller_than_the_window_has_no_ssim():
+def test_an_image_smaller_than_the_window_has_no_ssim_and_without_pixels_no_psnr():
     assert image_metrics(*pair(0.01, SSIM_WINDOW - 1))["ssim"] is None
     assert math.isfinite(image_metrics(*pair(0.01, SSIM_WINDOW))["ssim"])
+    picture = torch.rand(12, 12, 3)
+    assert math.isnan(image_metrics(picture, picture, torch.zeros(12, 12, dtype=torch.bool))["psnr"])
 
 
 def test_psnr_is_averaged_over_images_not_pooled():
@@ -72,11 +71,6 @@ def test_median_and_worst_know_which_way_is_worse():
     for function in (mean_over_images, median_over_images, worst_of_images):
         with pytest.raises(ValueError, match="no image"):
             function([])
-
-
-def test_of_no_pixel_the_psnr_is_no_number():
-    picture = torch.rand(12, 12, 3)
-    assert math.isnan(image_metrics(picture, picture, torch.zeros(12, 12, dtype=torch.bool))["psnr"])
 
 
 def test_psnr_and_its_standard_error_by_hand():

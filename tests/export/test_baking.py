@@ -10,15 +10,9 @@ from support.baked_ball import RADIUS, all_around, baked_ball, deserialized, qui
 from support.known_fields import ball
 from support.running import refused
 
+from nerf_lightning.export.baking import baked_field
 from nerf_lightning.export.baking.bake import bake
-from nerf_lightning.export.baking.baked_field import (
-    EXPONENT_STEP,
-    LEAST_EXPONENT,
-    described,
-    serialized,
-    tiles_of,
-    to_bytes_of_density,
-)
+from nerf_lightning.export.baking.baked_field import described, serialized, tiles_of, to_bytes_of_density
 from nerf_lightning.export.baking.contraction import Contraction
 from nerf_lightning.export.baking.cost import measured_cost
 from nerf_lightning.export.baking.density import depths_of_voxels
@@ -93,14 +87,11 @@ def test_only_what_is_seen_is_kept():
     assert 0.5 < distance.min() < distance.max() < 0.82
 
 
-def test_bytes_of_density_are_exponents():
-    optical = 2.0 ** np.linspace(-6, 3.5, 50)
-    found = 2.0 ** (LEAST_EXPONENT + EXPONENT_STEP * to_bytes_of_density(optical)) - 2.0**LEAST_EXPONENT
+def test_bytes_of_density_are_exponents_and_a_tile_borders_on_the_first_values_of_the_next_blocks():
+    optical, least = 2.0 ** np.linspace(-6, 3.5, 50), baked_field.LEAST_EXPONENT
+    found = 2.0 ** (least + baked_field.EXPONENT_STEP * to_bytes_of_density(optical)) - 2.0**least
     np.testing.assert_allclose(found, optical, rtol=0.04)
     assert to_bytes_of_density(np.zeros(1))[0] == 0
-
-
-def test_a_tile_borders_on_the_first_values_of_the_next_blocks():
     index = np.full((2, 2, 1), -1, np.int32)
     index[0, 0, 0], index[1, 1, 0] = 0, 1
     values = np.random.default_rng(0).integers(1, 255, (2, 8, 8, 8)).astype(np.uint8)

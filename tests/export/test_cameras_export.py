@@ -40,20 +40,15 @@ LENSES = {
 
 def same_rays(one, other, names):
     for name, theirs in names.items():
-        (mine, my_directions), (their, their_directions) = (
-            user_rays(one, name, PLACES),
-            user_rays(other, theirs, PLACES),
-        )
+        mine, my_directions = user_rays(one, name, PLACES)
+        their, their_directions = user_rays(other, theirs, PLACES)
         torch.testing.assert_close(mine, their, atol=2e-4 * max(1.0, float(mine.abs().max())), rtol=0)
         torch.testing.assert_close(my_directions, their_directions, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("camera", LENSES)
-@pytest.mark.parametrize("moved", [False, True])
-def test_round_trip_through_both_formats(tmp_path, camera, moved):
-    known = Known(camera=camera, params=LENSES[camera])
-    if moved:
-        known = known.moved(120.0, ROTATION, np.array([900.0, 20.0, -70.0]))
+def test_round_trip_through_both_formats(tmp_path, camera):
+    known = known_turned(camera=camera, params=LENSES[camera])
     scene = read("colmap", write_colmap(tmp_path / "made", known))
     folder = tmp_path / "exported"
     CamerasExport(images="images").export(solid(ball()), scene_record(scene), folder, 4096)

@@ -12,7 +12,7 @@ from support.baked_ball import all_around, beside, read_baked, record_of, shiny_
 from support.browser import drag, opened
 from support.contracted_hall import hall_model, hall_scene
 
-from nerf_lightning.commands.page_path import page_path
+from nerf_lightning.commands.export import page_path
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.instantiate import build
 from nerf_lightning.export.baking.cost import over

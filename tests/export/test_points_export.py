@@ -78,7 +78,7 @@ def test_views_agree_about_what_both_see_and_not_about_what_is_hidden():
 
 def test_forward_facing_captures_have_their_points_in_the_world(tmp_path):
     scene = read("llff", write_llff(tmp_path / "c", Known(c2w=wall(), focal=(14.0, 14.0)), near=2.0), space="ndc")
-    user = scene.to_user
+    user = scene.to_user.float()
 
     def plane(positions):  # in the cube, where the user's wall y = 5 is a plane of constant z
         forward = torch.linalg.inv(user) @ torch.tensor([0.0, 5.0, 0.0, 1.0])
@@ -145,7 +145,7 @@ def test_las_holds_the_points_of_the_ply_with_their_colours(tmp_path):
     np.testing.assert_array_equal(colors, 257 * np.asarray(expected.colors)[:, :3].astype(int))
 
 
-@pytest.mark.parametrize("extent", [0.0, 1e-6, 3.7, 8e5])
+@pytest.mark.parametrize("extent", [0.0, 1e-6, 8e5])
 @pytest.mark.parametrize("place", [0.0, -1e7])
 def test_the_steps_of_a_las_file_suit_the_extent(tmp_path, extent, place):
     laspy = pytest.importorskip("laspy", reason="laspy is not installed (the extra las)")

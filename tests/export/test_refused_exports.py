@@ -10,7 +10,6 @@ from support.known_fields import ball, solid
 from support.scenes import ball_scene
 
 from nerf_lightning.checkpoints.reading import scene_record
-from nerf_lightning.export import mesh_files
 from nerf_lightning.export.cameras import CamerasExport
 from nerf_lightning.export.images import ImagesExport
 from nerf_lightning.export.mesh import MeshExport
@@ -18,6 +17,7 @@ from nerf_lightning.export.page import PageExport
 from nerf_lightning.export.points import PointsExport
 from nerf_lightning.export.volume import VolumeExport
 from nerf_lightning.export.voxel_kernels import layout
+from nerf_lightning.messages import errors
 from nerf_lightning.messages.errors import InputError
 
 TILE = 1 << 15
@@ -64,10 +64,7 @@ def test_no_grid_is_laid_over_ndc_or_has_one_cell(tmp_path, exporter):
     [
         (VolumeExport(1024), r"12\.9 GB, and 0\.8 GB of memory can be had\. what\.resolution=\d+ would fit"),
         (MeshExport(2048, "tsdf"), r"2049 x 2049 x 2049 points, which takes 103\.\d GB.*what\.resolution=\d+ would"),
-        (
-            MeshExport(texture=True, texture_size=8192),
-            r"8192 x 8192 texels, which takes 6\.\d GB.*texture_size=\d+ would",
-        ),
+        (MeshExport(texture=True, texture_size=8192), r"8192 x 8192 texels, which takes 6\.\d GB.*texture_size=\d+ w"),
     ],
 )
 def test_what_is_beyond_memory_is_refused_with_what_would_fit(tmp_path, monkeypatch, what, said):
@@ -91,7 +88,7 @@ def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, library
             raise ImportError(f"No module named '{library}'")
         return import_module(name)
 
-    monkeypatch.setattr(mesh_files, "import_module", absent)
+    monkeypatch.setattr(errors, "import_module", absent)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(InputError, match=said):
         exported(tmp_path, what)

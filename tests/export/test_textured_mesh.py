@@ -92,16 +92,6 @@ def test_glb_holds_its_picture_and_no_viewer_lights_it(tmp_path):
     assert "COLOR_0" not in primitive["attributes"]
 
 
-def test_obj_has_its_material_and_its_picture_beside_it(tmp_path):
-    written = exported(tmp_path, solid(ball()), record(), format="obj")
-    assert sorted(each.name for each in written) == ["mesh.mtl", "mesh.obj", "mesh.png"]
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["mesh.mtl", "mesh.obj", "mesh.png"]
-    assert "mtllib mesh.mtl" in (tmp_path / "mesh.obj").read_text()
-    assert "map_Kd mesh.png" in (tmp_path / "mesh.mtl").read_text()
-    with Image.open(tmp_path / "mesh.png") as picture:
-        assert picture.size == (64, 64)
-
-
 def test_texels_are_those_whose_centres_lie_in_a_triangle():
     corners = np.array([[[1.0, 1.0], [7.2, 1.0], [1.0, 7.2]]])
     face, shares = covered_texels(corners, 8)
@@ -112,11 +102,19 @@ def test_texels_are_those_whose_centres_lie_in_a_triangle():
     np.testing.assert_allclose(places, np.stack([column[inside], row[inside]], axis=1), atol=1e-5)
 
 
-def test_a_folder_where_the_picture_shall_be_is_refused_before_any_work(tmp_path):
+def test_obj_has_its_material_and_its_picture_beside_it_unless_a_folder_is_in_the_way(tmp_path):
     (tmp_path / "mesh.png").mkdir()
     with pytest.raises(InputError, match=r"mesh\.png is a folder.*paths\.output_dir=DIR"):
         exported(tmp_path, solid(ball()), record(), format="obj")
     assert [each.name for each in tmp_path.iterdir()] == ["mesh.png"]
+    (tmp_path / "mesh.png").rmdir()
+    written = exported(tmp_path, solid(ball()), record(), format="obj")
+    assert sorted(each.name for each in written) == ["mesh.mtl", "mesh.obj", "mesh.png"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["mesh.mtl", "mesh.obj", "mesh.png"]
+    assert "mtllib mesh.mtl" in (tmp_path / "mesh.obj").read_text()
+    assert "map_Kd mesh.png" in (tmp_path / "mesh.mtl").read_text()
+    with Image.open(tmp_path / "mesh.png") as picture:
+        assert picture.size == (64, 64)
 
 
 def test_a_mesh_that_no_view_sees_gets_no_texture(tmp_path):

@@ -1,8 +1,9 @@
-"""Names from files stay text wherever they are shown: whatever they hold, nothing acts on it and nothing is lost."""
+"""Names from files stay text wherever they are shown; how far something is is told where no terminal shows a bar."""
 
 import csv
 import html
 import io
+import itertools
 import logging
 import os
 import re
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
+from nerf_lightning.messages import console
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.messages.escaping import (
     JOINERS,
@@ -83,8 +85,12 @@ def test_markdown_shows_the_text(text):
     assert [html.unescape(cell) for cell in re.findall("<td>(.*)</td>", row)] == [shown, "x"]
 
 
-def test_addresses_in_markdown_are_no_links():
+def test_addresses_in_markdown_are_no_links_formulas_are_quoted_and_numbers_left():
     assert for_markdown("see https://a.b and www.a.b") == "see https:&#47;/a.b and www&#46;a.b"
+    for text in ("=1", "+a", "-a", "--1", "@a", "\t=1", "\r=1", "-1+1"):
+        assert for_csv(text) == f"'{for_terminal(text)}"
+    for text in ("-1.5", "+3", "1e-3", "-2E5", "a=1", ""):
+        assert for_csv(text) == text
 
 
 @given(st.lists(ANYTHING | MARKUP | st.floats(allow_nan=False), min_size=1))
@@ -98,16 +104,6 @@ def test_no_cell_of_a_csv_file_is_a_formula(values):
         else:
             assert cell.removeprefix("'") == for_terminal(value).removeprefix("'")
             assert not cell.startswith(("=", "+", "-", "@", "\t", "\r")) or float(cell) is not None
-
-
-@pytest.mark.parametrize("text", ["=1", "+a", "-a", "--1", "@a", "\t=1", "\r=1", "-1+1"])
-def test_formulas_are_quoted(text):
-    assert for_csv(text) == f"'{for_terminal(text)}"
-
-
-@pytest.mark.parametrize("text", ["-1.5", "+3", "1e-3", "-2E5", "a=1", ""])
-def test_numbers_are_left(text):
-    assert for_csv(text) == text
 
 
 @given(ANYTHING | MARKUP)
@@ -125,11 +121,9 @@ def test_names_with_control_characters_are_refused(name):
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    "name", ["a b.png", "Schloß/übung_1.png", "写真　1.jpg", "at 9.41\u202fAM.png", "👨\u200d👩\u200d👧.png"]
-)
-def test_names_of_all_languages_are_taken(name):
-    require_printable(name, "a photograph")
+def test_names_of_all_languages_are_taken():
+    for name in ("a b.png", "Schloß/übung_1.png", "写真　1.jpg", "at 9.41\u202fAM.png", "👨\u200d👩\u200d👧.png"):
+        require_printable(name, "a photograph")
 
 
 def test_log_messages_stay_in_their_line():
@@ -145,3 +139,30 @@ def test_log_messages_stay_in_their_line():
     lines = formatter.format(record).splitlines()
     assert lines[1].startswith("Traceback")
     assert lines[-1] == r"ValueError: \x1b[2J"
+
+
+@pytest.fixture
+def told(monkeypatch, caplog):
+    """Let every reading of the clock be 20 s later; return what was told."""
+    clock = itertools.count(0.0, 20.0)
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    caplog.set_level(logging.INFO)
+    return lambda: [record.getMessage() for record in caplog.records]
+
+
+def test_items_that_take_long_are_told_in_lines(told):
+    assert list(console.tracked(range(5), "filming")) == [0, 1, 2, 3, 4]
+    assert told() == ["filming: 20 %, about 2 min 40 s left", "filming: 60 %, about 53 s left"]
+
+
+def test_stages_are_told_in_lines_with_the_share_of_the_whole(told):
+    with console.StageProgress({"matching": 3.0, "reconstruction": 1.0}) as report:
+        for stage, fraction in (("matching", 0.0), ("matching", 0.5), ("reconstruction", 0.0), ("reconstruction", 1.0)):
+            report(stage, fraction)
+    assert [line.partition(", about")[0] for line in told()] == ["matching: 38 %"]
+
+
+def test_nobody_is_told_of_what_is_quick(monkeypatch, caplog):
+    caplog.set_level(logging.INFO)
+    list(console.tracked(range(1000), "filming"))
+    assert not caplog.records

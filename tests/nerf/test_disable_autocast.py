@@ -83,14 +83,11 @@ def test_an_encoder_is_the_same_under_autocast(option):
     assert torch.equal(plain, lowered)
 
 
-def test_an_mlp_is_the_same_under_autocast():
+def test_an_mlp_and_metrics_are_the_same_under_autocast():
     field, points = tiny_field(), Points(torch.rand(8, 5, 3), torch.rand(8, 1, 3))
     plain, lowered = under_autocast_and_not(lambda: field(points))
     assert torch.equal(plain.rgb, lowered.rgb)
     assert torch.equal(plain.density, lowered.density)
-
-
-def test_metrics_are_the_same_under_autocast():
     truth, render, lpips = torch.rand(48, 48, 3), torch.rand(48, 48, 3), LPIPS()
     plain, lowered = under_autocast_and_not(lambda: image_metrics(render, truth) | {"lpips": lpips(render, truth)})
     assert plain == lowered

@@ -148,7 +148,7 @@ def test_a_table_of_cameras_is_a_capture(tmp_path):
     assert torch.equal(scene.pixels.view(1), torch.from_numpy(picture(1, 16, 16)))
     torch.testing.assert_close(scene.cameras.focal, torch.full((8, 2), 25.0))
     centers = scene.cameras.c2w[..., 3].double() @ scene.to_user[:3, :3].T + scene.to_user[:3, 3]
-    torch.testing.assert_close(centers, cameras.c2w[..., 3], atol=1e-4, rtol=0)
+    torch.testing.assert_close(centers, cameras.c2w[..., 3].double(), atol=1e-4, rtol=0)
     for written in ("0.png,25,1,2\n", "0.png,wide,0,0,1,0,0,0\n"):
         (tmp_path / "cameras.csv").write_text(written)
         refused(build(composed("train", SEARCHED, "scene=table", *given).scene).read, parts=("file,focal,x,y,z",))

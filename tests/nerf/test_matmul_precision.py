@@ -65,9 +65,8 @@ def test_a_cpu_without_bfloat16_rounds_where_one_with_it_does(monkeypatch):
 
 def test_a_cpu_that_may_not_use_what_it_has_counts_as_one_without():
     ask = "from nerf_lightning.nerf import matmul_precision; print(matmul_precision.cpu_multiplies_bfloat16())"
-    ran = subprocess.run(
-        [sys.executable, "-c", ask], env=os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}, capture_output=True, text=True
-    )
+    narrow = os.environ | {"ATEN_CPU_CAPABILITY": "avx2"}
+    ran = subprocess.run([sys.executable, "-c", ask], env=narrow, capture_output=True, text=True)
     assert ran.stdout.strip() == "False", ran.stderr
 
 

@@ -28,13 +28,13 @@ def test_neighbouring_numbers_are_not_correlated(axis):
 
 def test_each_ray_step_seed_attempt_and_purpose_has_its_own_numbers():
     base = batch_random(fold(0, 0, 0), 64).uniform("jitter", 8)
-    others = [
-        batch_random(fold(0, 0, 1), 64).uniform("jitter", 8),
-        batch_random(fold(0, 1, 0), 64).uniform("jitter", 8),
-        batch_random(fold(1, 0, 0), 64).uniform("jitter", 8),
-        batch_random(fold(0, 0, 0), 64).uniform("importance", 8),
-    ]
-    for other in others:
+    for key, purpose in (
+        ((0, 0, 1), "jitter"),
+        ((0, 1, 0), "jitter"),
+        ((1, 0, 0), "jitter"),
+        ((0, 0, 0), "importance"),
+    ):
+        other = batch_random(fold(*key), 64).uniform(purpose, 8)
         assert float((base == other).float().mean()) < 0.01
     assert base.unique().numel() > 500  # no two rays share a jitter
 

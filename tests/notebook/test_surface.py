@@ -34,21 +34,15 @@ def test_the_types_that_are_told_are_those_of_what_is_there():
     assert told == nl._OFFERED
 
 
-def test_a_folder_is_read_as_its_files_tell(tmp_path):
-    scene = nl.read(write_blender(tmp_path, {"train": 3, "val": 1, "test": 1}), background="black")
+def test_a_folder_is_read_as_its_files_tell_or_as_it_is_named_and_so_is_an_archive(tmp_path, capture):
+    folder = write_blender(tmp_path, {"train": 3, "val": 1, "test": 1})
+    scene = nl.read(folder, background="black")
     assert isinstance(scene, nl.Scene)
     assert scene.background == "black"
     assert scene.pixels.view(0).shape == (8, 8, 4)
     assert scene.cameras.c2w.shape == (5, 3, 4)
-
-
-def test_an_archive_is_read(capture):
+    assert len(nl.read(folder, scene="blender").splits["train"]) == 3
     assert len(nl.read(capture).view_names) == 10
-
-
-def test_a_format_may_be_named(tmp_path):
-    scene = nl.read(write_blender(tmp_path, {"train": 3, "val": 1, "test": 1}), scene="blender")
-    assert len(scene.splits["train"]) == 3
 
 
 @pytest.mark.parametrize(
@@ -67,21 +61,18 @@ def test_what_cannot_be_read_is_told_in_words(settings, parts):
         assert part in str(caught.value)
 
 
-def test_a_run_leaves_folder_metrics_and_model(run):
+def test_a_run_leaves_folder_metrics_and_the_model_of_its_checkpoint(run):
     assert (run.folder / "run.json").is_file()
     assert run.metrics["psnr"] == run.psnr
     assert len(run.metrics["per_image"]) == 2
     assert run.model.checkpoint.step == 4
     assert HydraConfig.instance().cfg is None
-
-
-def test_a_run_and_its_checkpoint_are_the_same_model(run):
     one, other = nl.load(run.folder, "trainer=cpu"), nl.load(run.folder / "checkpoints" / "last.ckpt", "trainer=cpu")
     assert torch.equal(one.render(0).rgb, other.render(0).rgb)
     assert not one.module.training
 
 
-def test_a_view_is_rendered_by_number_name_and_camera(run, capture):
+def test_a_view_is_rendered_by_number_name_and_camera_and_a_path_camera_by_camera(run, capture):
     model, scene = run.model, nl.read(capture)
     picture = model.render(2)
     assert isinstance(picture, nl.Picture)
@@ -91,9 +82,6 @@ def test_a_view_is_rendered_by_number_name_and_camera(run, capture):
     seen = model.render(model.in_frame(scene).cameras[2])
     assert seen.rgb.shape == picture.rgb.shape
     assert not torch.equal(model.render(2, background="black").rgb, model.render(2, background="white").rgb)
-
-
-def test_a_path_is_rendered_camera_by_camera(run):
     cameras = run.model.path("orbit", num_frames=3, width=5, height=4)
     assert run.model.render(cameras[1]).depth.shape == (4, 5)
     assert run.model.render(cameras[1:2]).depth.shape == (4, 5)
@@ -108,6 +96,7 @@ def test_a_path_is_rendered_camera_by_camera(run):
         (lambda model: model.render(0, background="blue"), ("blue",)),
         (lambda model: model.path("orbitt"), ("orbitt", "orbit")),
         (lambda model: model.path(num_frames=0), ("num_frames",)),
+        (lambda model: nl.load("nowhere"), ("no checkpoint",)),
     ],
 )
 def test_what_cannot_be_rendered_is_told_in_words(run, ask, parts):
@@ -129,10 +118,6 @@ def test_what_makes_no_run_is_told_in_words_and_leaves_nothing(overrides, parts,
     place = (f"paths.root_dir={tmp_path / 'runs'}", "scene=npz", f"scene.path={capture}", *SMALL)
     refused(nl.train, *place, *overrides, parts=parts)
     assert not (tmp_path / "runs").exists()
-
-
-def test_what_is_no_checkpoint_is_told_in_words(tmp_path):
-    refused(nl.load, tmp_path, parts=("no checkpoint",))
 
 
 def test_a_run_that_is_stopped_saves_and_goes_on(capture, tmp_path, monkeypatch):

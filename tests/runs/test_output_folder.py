@@ -1,12 +1,14 @@
-"""A folder is made for what is written, and vanishes where a command is refused before it writes."""
+"""A run's folder vanishes where a command is refused before it writes; every start adds to its train.log."""
 
 import errno
+import logging
 
 import pytest
-from support.running import refused
+from support.running import refused, start_code
 
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.runs import output_folder
+from nerf_lightning.runs.folder import log_file
 from nerf_lightning.runs.output_folder import filled_folder
 
 
@@ -28,13 +30,10 @@ def test_what_was_made_and_stays_empty_is_removed(tmp_path):
     assert list(there.iterdir()) == []
 
 
-def test_what_holds_something_stays(tmp_path):
+def test_what_holds_something_and_an_empty_folder_that_was_there_stay(tmp_path):
     with filled_folder(None, tmp_path / "a" / "b") as folder:
         (folder / "written").write_text("")
     assert (tmp_path / "a" / "b" / "written").is_file()
-
-
-def test_an_empty_folder_that_was_there_stays(tmp_path):
     with filled_folder(str(tmp_path), tmp_path):
         pass
     assert tmp_path.is_dir()
@@ -43,3 +42,32 @@ def test_an_empty_folder_that_was_there_stays(tmp_path):
 def test_a_full_disk_is_said_of_the_folder(tmp_path):
     with pytest.raises(OSError, match=r"No space left on device: '.*/out'"), filled_folder(None, tmp_path / "out"):
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_every_start_adds_its_lines(tmp_path):
+    for word in ("first", "second\x1b[2J\nERROR"):
+        with log_file(tmp_path):
+            logging.getLogger("a.b").warning("the %s start", word)
+    logging.getLogger("a.b").warning("after it")
+    first, second = (tmp_path / "train.log").read_text(encoding="utf-8").splitlines()
+    assert first.endswith(" WARNING a.b: the first start")
+    assert second.endswith(r" WARNING a.b: the second\x1b[2J\nERROR start")
+
+
+FULL = """
+import logging, pathlib, resource, signal, sys
+from nerf_lightning.runs.folder import log_file
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (60, 60))
+with log_file(pathlib.Path(sys.argv[1])):
+    for number in range(5):
+        logging.warning("line %d", number)
+print("went on")
+"""
+
+
+def test_a_full_disk_costs_lines_alone(tmp_path):
+    process = start_code(FULL, str(tmp_path))
+    output, errors = process.communicate(timeout=300)
+    assert (process.returncode, output, errors) == (0, "went on\n", "")
+    assert (tmp_path / "train.log").stat().st_size == 60

@@ -1,13 +1,16 @@
-"""Rows of a sweep's table, from records and run folders that a test wrote."""
+"""Rows of a sweep's table, from records and run folders that a test wrote, and numbers that others published."""
 
 import csv
 import json
+import statistics
 
+import pytest
 import yaml
 
+from nerf_lightning.runs.published import published_for
 from nerf_lightning.runs.summary import read_run
+from nerf_lightning.runs.sweep import job_rows
 from nerf_lightning.runs.sweep_job import JobRecord, read_records
-from nerf_lightning.runs.sweep_table import job_rows
 from nerf_lightning.runs.table_files import write_csv, write_markdown
 from nerf_lightning.runs.table_screen import print_rows
 
@@ -24,22 +27,15 @@ def record(folder, number, overrides, state="finished", **more):
     return JobRecord(number, overrides, str(folder / f"job_{number}"), 1, state, **more)
 
 
-def test_a_run_folder_is_read_whoever_wrote_it(tmp_path):
+def test_a_run_folder_is_read_whoever_wrote_it_and_what_is_missing_or_damaged_is_not_known(tmp_path):
     leave_run(tmp_path / "run", ["model=nerf", "seed=3"], 20.5)
     run = read_run(tmp_path / "run")
     assert (run.psnr, run.ssim, run.steps, run.seconds) == (20.5, 0.5, 10, 3.25)
     assert run.overrides == {"model": "nerf", "seed": "3"}
-
-
-def test_without_an_evaluation_the_validation_counts(tmp_path):
-    leave_run(tmp_path / "run", [], None, psnr=17.0)
-    assert read_run(tmp_path / "run").psnr == 17.0
-
-
-def test_what_is_missing_or_damaged_is_not_known(tmp_path):
+    leave_run(tmp_path / "other", [], None, psnr=17.0)
+    assert read_run(tmp_path / "other").psnr == 17.0
     nothing = read_run(tmp_path / "nowhere")
     assert (nothing.psnr, nothing.ssim, nothing.steps, nothing.seconds, nothing.overrides) == (None,) * 4 + ({},)
-    leave_run(tmp_path / "run", ["seed=0"], 20.5)
     for name in ("run.json", "metrics.json", ".hydra/overrides.yaml"):
         (tmp_path / "run" / name).write_text("[1, {")
     assert read_run(tmp_path / "run").overrides == {}
@@ -85,14 +81,42 @@ def test_files_are_whole_and_the_text_is_short(tmp_path, capsys):
     assert "0.000125207" in capsys.readouterr().out
 
 
-def test_records_come_back_in_the_order_of_jobs(tmp_path):
+def test_records_come_back_in_the_order_of_jobs_and_one_that_is_being_written_is_none_yet(tmp_path):
     for number in (10, 9):
         record(tmp_path, number, ["seed=0"], "failed", reason="no rays").write(tmp_path)
     assert [found.number for found in read_records(tmp_path)] == [9, 10]
     assert read_records(tmp_path)[0] == record(tmp_path, 9, ["seed=0"], "failed", reason="no rays")
-
-
-def test_a_record_that_is_being_written_is_none_yet(tmp_path):
-    record(tmp_path, 1, ["seed=0"]).write(tmp_path)
     (tmp_path / ".hydra" / "jobs" / ".2.77.part.json").write_text('{"num')
-    assert [found.number for found in read_records(tmp_path)] == [1]
+    assert [found.number for found in read_records(tmp_path)] == [9, 10]
+
+
+BLENDER = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
+LLFF = ("fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex")
+MIP360 = ("bicycle", "flowers", "garden", "stump", "treehill", "room", "counter", "kitchen", "bonsai")
+
+
+@pytest.mark.parametrize(
+    ("method", "scenes", "reader", "mean"),
+    [
+        ("NeRF", BLENDER, "blender", 31.01),
+        ("NeRF of nerf-factory", BLENDER, "blender", 32.33),
+        ("MLP with occupancy grid of nerfacc", BLENDER, "blender", 31.55),
+        ("ngp_pl", BLENDER, "blender", 32.96),
+        ("Zip-NeRF", BLENDER, "blender", 33.69),
+        ("NeRF of nerf-factory", LLFF, "llff", 26.85),
+        ("Zip-NeRF", MIP360, "colmap", 28.56),
+    ],
+)
+def test_the_numbers_give_the_published_means(method, scenes, reader, mean):
+    """A mistyped digit would show: each method's mean was published beside its scenes."""
+    found = [
+        next(result.psnr for result in published_for(scene, reader) if result.method == method) for scene in scenes
+    ]
+    assert statistics.fmean(found) == pytest.approx(mean, abs=0.0105)
+
+
+def test_a_scene_is_found_by_its_first_word_and_in_its_own_format_alone():
+    assert next(found.method for found in published_for("Lego_200", "blender")) == "Zip-NeRF"
+    assert published_for("lego", "colmap") == []
+    assert published_for("legolas", "blender") == []
+    assert {found.benchmark for found in published_for("room", "colmap")} == {"LLFF", "mip-NeRF 360"}

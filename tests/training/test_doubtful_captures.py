@@ -1,7 +1,6 @@
 """A training says what is wrong with its capture as far as that is seen in no time, though no doctor is asked."""
 
 import numpy as np
-import pytest
 from PIL import Image
 from support.captures import npz_content, picture, write_blender, write_npz
 from support.posed_captures import Known, ring, write_transforms
@@ -27,17 +26,11 @@ def test_a_sound_capture_is_trained_on_without_a_word(caplog, tmp_path):
     assert of_npz(caplog, tmp_path, npz_content()["images"]) == []
 
 
-@pytest.mark.parametrize("level", [0, 1])
-def test_photographs_of_one_colour_show_nothing(caplog, tmp_path, level):
-    images = np.full_like(npz_content()["images"], level)
-    (said,) = of_npz(caplog, tmp_path, images)
-    assert said.startswith(
-        "8 of 8 training photographs of npz show nothing: 0 (all 0, 0, 0)" if not level else "8 of 8"
-    )
-
-
-def test_a_few_that_show_nothing_are_named(caplog, tmp_path):
+def test_photographs_of_one_colour_show_nothing_and_a_few_are_named(caplog, tmp_path):
     images = npz_content()["images"]
+    for level, told in ((0, "8 of 8 training photographs of npz show nothing: 0 (all 0, 0, 0)"), (1, "8 of 8")):
+        (said,) = of_npz(caplog, tmp_path, np.full_like(images, level))
+        assert said.startswith(told)
     images[2] = 0
     (said,) = of_npz(caplog, tmp_path, images)
     assert said.startswith("1 of 8 training photographs of npz show nothing: 2 (all 0, 0, 0).")

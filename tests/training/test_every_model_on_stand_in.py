@@ -89,8 +89,7 @@ def step_and_render(there, run, waits):
 
 
 @pytest.mark.parametrize(
-    ("model", "precision"),
-    [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in SINGLE],
+    ("model", "precision"), [marked(model, "bf16-mixed") for model in MODELS] + [(model, "32-true") for model in SINGLE]
 )
 def test_steps_on_cuda_wait_where_it_is_named_alone(model, precision):
     with StandInDevice("cuda") as there, backends.without("hash_grid.cuda", "mlp.cuda"):
@@ -111,14 +110,19 @@ def test_every_model_trains_and_renders_on_mps(model):
         assert bool(run.all_losses().isfinite().all())
 
 
-BESIDE = [f"{group}={option}" for group in ("correction", "refinement", "loss") for option in options(group)]
+BESIDE = {
+    group: [option for option in options(group) if f"{group}={option}" not in ("correction=auto", "loss=proposal")]
+    for group in ("correction", "refinement", "loss")
+}
 
 
 @pytest.mark.parametrize("kind", ["cuda", "mps"])
-@pytest.mark.parametrize("part", [part for part in BESIDE if part not in ("correction=auto", "loss=proposal")])
-def test_what_learns_beside_a_model_neither_waits_nor_lies_apart(part, kind):
+@pytest.mark.parametrize("number", range(max(map(len, BESIDE.values()))))
+def test_what_learns_beside_a_model_neither_waits_nor_lies_apart(number, kind):
+    """An option of each group at a time."""
+    parts = [f"{group}={offered[number % len(offered)]}" for group, offered in BESIDE.items()]
     with StandInDevice(kind) as there:
-        run = step_by_step("nerf_tiny", there.device, "32-true", None, *small("nerf_tiny"), part)
+        run = step_by_step("nerf_tiny", there.device, "32-true", None, *small("nerf_tiny"), *parts)
         for _ in range(WARM):
             run.step()
         with there.in_step() if kind == "cuda" else nullcontext():  # which has one memory for both

@@ -65,18 +65,14 @@ def fitted(tmp_path_factory):
     return run, trainer, bar, outputs, folder
 
 
-def test_losses_are_on_the_bar_and_in_lightnings_own_logger(fitted):
-    _, trainer, bar, outputs, _ = fitted
+def test_losses_are_on_the_bar_and_in_lightnings_own_logger_and_validation_returns_and_logs_its_own(fitted):
+    run, trainer, bar, outputs, _ = fitted
     assert {"train/loss", "train/psnr"} <= bar.shown
     assert "val/psnr" in trainer.progress_bar_metrics
     rows = list(csv.DictReader((Path(trainer.logger.log_dir) / "metrics.csv").read_text().splitlines()))
     logged = [float(row["train/loss"]) for row in rows if row.get("train/loss")]
     assert logged == pytest.approx([float(loss) for loss in outputs.train])
     assert float(trainer.callback_metrics["train/loss"]) == pytest.approx(logged[-1])
-
-
-def test_validation_returns_and_logs_loss_and_psnr(fitted):
-    run, trainer, _, outputs, _ = fitted
     assert outputs.val
     assert all(float(each["psnr"]) == pytest.approx(-10 * torch.log10(each["loss"]).item()) for each in outputs.val)
     (metrics,) = quiet(logger=False, enable_progress_bar=False).validate(run.system, run.data, verbose=False)
@@ -84,13 +80,16 @@ def test_validation_returns_and_logs_loss_and_psnr(fitted):
     assert metrics["val/loss"] == pytest.approx(10 ** (-metrics["val/psnr"] / 10))
 
 
-def test_the_test_is_that_of_nerf_eval(fitted, tmp_path):
+def test_the_test_is_that_of_nerf_eval_and_rays_alone_are_no_picture_to_test(fitted, tmp_path):
     run, *_ = fitted
     (metrics,) = quiet(logger=False, enable_progress_bar=False).test(run.system, run.data, verbose=False)
     with torch.no_grad():
         ours = Scoring().score(run.system.model, run.scene, run.scene.background, 8192, tmp_path)
     assert metrics["test/psnr"] == pytest.approx(ours["psnr"], abs=1e-4)
     assert metrics["test/cc_psnr"] == pytest.approx(ours["cc_psnr"], abs=1e-4)
+    trainer = quiet(logger=False, enable_progress_bar=False)
+    with pytest.raises(nl.InputError, match=r"whole views.*datamodule=run\.data"):
+        trainer.test(run.system, dataloaders=run.data.val_dataloader(), verbose=False)
 
 
 def test_predictions_are_pictures_of_the_test_views(fitted):
@@ -101,13 +100,6 @@ def test_predictions_are_pictures_of_the_test_views(fitted):
     assert all(isinstance(picture, Picture) for picture in pictures)
     own = render_picture(run.system.model.eval(), run.system.rays, views[0], run.scene.background, 8192)
     assert torch.equal(pictures[0].rgb, own.rgb)
-
-
-def test_rays_alone_are_no_picture_to_test(fitted):
-    run, *_ = fitted
-    trainer = quiet(logger=False, enable_progress_bar=False)
-    with pytest.raises(nl.InputError, match=r"whole views.*datamodule=run\.data"):
-        trainer.test(run.system, dataloaders=run.data.val_dataloader(), verbose=False)
 
 
 @pytest.mark.parametrize("weights_only", [False, True])

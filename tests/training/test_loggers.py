@@ -102,14 +102,10 @@ class Takes(WandbLogger):
         return SimpleNamespace(finish=lambda exit_code: self.codes.append(exit_code))
 
 
-def test_pictures_go_to_those_who_take_them(tmp_path):
+def test_pictures_go_to_those_who_take_them_and_a_run_of_weights_and_biases_ends_with_ours(tmp_path):
     taker = Takes()
     show_picture([taker, CSVLogger(tmp_path)], "validation/picture", PICTURE, 7)
     assert taker.pictures == [("validation/picture", (4, 5, 3), 7)]
-
-
-def test_a_run_of_weights_and_biases_ends_with_ours(tmp_path):
-    taker = Takes()
     chosen = {"wandb": lambda **given: taker}
     chosen["wandb"].func = None
     with opened_loggers(chosen, tmp_path, "now"):

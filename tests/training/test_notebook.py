@@ -139,9 +139,7 @@ def test_whoever_uses_hydra_keeps_it(run):
     ("overrides", "parts"),
     [
         (["optimizer.lrr=1"], ("optimizer.lr",)),
-        (["optimizer.lr=much"], ("The optimizer refuses its settings",)),
         (["model=nerff"], ("nerff",)),
-        (["optimizer=3"], ("A group was given",)),
         (["trainer.max_steps=7"], ("trainer.max_steps=7", "Trainer(max_steps=...)")),
         (["callbacks.monitor.every_steps=7"], ("callbacks.monitor.every_steps=7", "Trainer(callbacks=[...])")),
         (["+trainer.lightning.profiler=simple"], ("trainer.lightning.profiler", "Lightning's Trainer")),
@@ -167,7 +165,6 @@ def test_a_number_of_steps_is_the_length_of_the_run(run, trainer):
         ({"max_epochs": 2}, 2 * STEPS_OF_AN_EPOCH),
         ({"max_epochs": 2, "max_steps": 9}, 9),
         ({"max_epochs": 3, "limit_train_batches": 4}, 12),
-        ({"fast_dev_run": True}, 1),
         ({"fast_dev_run": 3}, 3),
     ],
 )
@@ -179,9 +176,16 @@ def test_an_epoch_is_every_training_ray_once(run, trainer, settings, steps):
     assert (one.system.step.progress.step, one.system.step.num_steps) == (steps, steps)
 
 
-def test_a_run_without_end_is_refused(run, trainer):
+def test_runs_without_end_and_on_several_devices_without_a_strategy_that_adds_once_are_refused(
+    run, trainer, monkeypatch
+):
     one = run()
     refused(trainer(max_steps=-1, max_epochs=-1).fit, one.system, one.data, parts=("max_steps", "max_epochs"))
+    # Lightning's own adds them up in each tile's backward, and takes their mean.
+    one, fit = run(), trainer(max_steps=2)
+    monkeypatch.setattr(Trainer, "world_size", 2)
+    parts = ("several devices", "trainer=ddp", "strategy=OneSumPerStep()")
+    refused(fit.fit, one.system, one.data, parts=parts)
 
 
 def test_lightnings_look_before_training_is_no_validation(run, trainer, tmp_path):
@@ -206,19 +210,11 @@ def test_what_would_be_computed_otherwise_than_it_says_is_refused(run, trainer, 
         refused(trainer(max_steps=2, **settings).fit, one.system, one.data, parts=parts)
 
 
-def test_several_devices_need_a_strategy_that_adds_gradients_once(run, trainer, monkeypatch):
-    """Lightning's own adds them up in each tile's backward, and takes their mean."""
-    one, fit = run(), trainer(max_steps=2)
-    monkeypatch.setattr(Trainer, "world_size", 2)
-    parts = ("several devices", "trainer=ddp", "strategy=OneSumPerStep()")
-    refused(fit.fit, one.system, one.data, parts=parts)
-
-
 @pytest.mark.parametrize("settings", [(), FAST_PATH])
 def test_a_run_goes_on_from_the_checkpoint_that_lightning_wrote(run, trainer, settings):
-    whole, rest, found = whole_and_resumed(lambda: run(*settings, "scheduler=constant"), trainer, stop=20, steps=40)
-    assert found.endswith("step=20.ckpt")
-    assert rest.system.step.progress.step == 40
+    whole, rest, found = whole_and_resumed(lambda: run(*settings, "scheduler=constant"), trainer, stop=12, steps=24)
+    assert found.endswith("step=12.ckpt")
+    assert rest.system.step.progress.step == 24
     assert_equal(rest, whole)
 
 
@@ -281,7 +277,7 @@ def test_what_learns_beside_the_model_goes_on_too(run, trainer):
         goes_on.fit(other.system, other.data, ckpt_path=found)
 
 
-def test_checkpoints_of_other_runs_and_programs_are_refused(run, trainer, saved, tmp_path):
+def test_checkpoints_of_other_runs_programs_and_strangers_are_refused(run, trainer, saved, tmp_path):
     _, found = saved
     other = run("field=nerf_mlp_small")
     with pytest.raises(InputError, match=r"state_dict\..*Training cannot go on"):
@@ -292,6 +288,11 @@ def test_checkpoints_of_other_runs_and_programs_are_refused(run, trainer, saved,
     again = run()
     with pytest.raises(InputError, match="not a checkpoint of nerf_lightning"):
         trainer(max_steps=4).fit(again.system, again.data, ckpt_path=tmp_path / "other.ckpt")
+    content = torch.load(saved[1], weights_only=True)
+    content["nerf_lightning"]["config"] = "model: {_target_: os.system, command: touch here}"
+    torch.save(content, tmp_path / "stranger.ckpt")
+    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "stranger.ckpt", parts=("os.system",))
+    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "missing.ckpt", parts=("no checkpoint at",))
 
 
 def test_what_was_fitted_loaded_or_belongs_to_another_run_is_not_fitted(run, trainer, saved):
@@ -303,14 +304,6 @@ def test_what_was_fitted_loaded_or_belongs_to_another_run_is_not_fitted(run, tra
         (run().system, run().data, ("same run",)),
     ):
         refused(trainer(max_steps=4).fit, system, data, parts=parts)
-
-
-def test_a_stranger_names_no_class(saved, tmp_path):
-    content = torch.load(saved[1], weights_only=True)
-    content["nerf_lightning"]["config"] = "model: {_target_: os.system, command: touch here}"
-    torch.save(content, tmp_path / "stranger.ckpt")
-    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "stranger.ckpt", parts=("os.system",))
-    refused(RadianceFieldSystem.load_from_checkpoint, tmp_path / "missing.ckpt", parts=("no checkpoint at",))
 
 
 def test_the_callbacks_of_nerf_train_work_there_too(run, trainer, capture, tmp_path):

@@ -48,16 +48,13 @@ def assert_same(run, other):
         torch.testing.assert_close(value, other.training.model.state_dict()[name], rtol=0, atol=0, msg=name)
 
 
-def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid():
+def test_recorded_steps_are_the_steps_bit_by_bit_across_updates_of_the_grid_and_for_each_size_of_batches():
     sizes = [48] * 20
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))
     assert list(run.training._recorded.recordings) == [48]
     assert run.training.model.statistics()["train/dropped_samples"] == 0
     assert run.all_losses().unique().numel() == 20
-
-
-def test_each_size_of_batches_has_its_recording():
     sizes = [32, 48, 32, 48, 48, 32]
     run = trained(sizes, record=True)
     assert_same(run, trained(sizes, record=False))

@@ -1,7 +1,10 @@
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
+from lightning.pytorch.trainer.states import TrainerFn, TrainerState
+from support.learnt_cameras import LearntShifts
 from support.scenes import ball_scene, tiny_model
 from support.steps import gradients, make_step, rays_of
 
@@ -11,6 +14,9 @@ from nerf_lightning.nerf.losses.mse import MeanSquaredError
 from nerf_lightning.nerf.losses.robust import RobustLoss
 from nerf_lightning.nerf.models.render_image import render_picture
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.randomness import batch_random, fold
+from nerf_lightning.training.step import Share
+from nerf_lightning.training.system import RadianceFieldSystem
 
 
 @pytest.mark.parametrize("background", ["white", "black", "random", "none"])
@@ -192,7 +198,7 @@ def test_tiles_never_part_the_squares_of_a_robust_loss(tile_points):
     assert not torch.allclose(found[0][0], torch.cat([p.grad.flatten() for p in plain.model.parameters()]))
 
 
-def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_a_restart_lets_it_forget():
+def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_smaller_batches_hold_whole_squares():
     step = robust_step(None)
     loader, optimizer = RayBatches(ball_scene(), step.progress, 0, 64, patch=4), step.new_optimizer()
     with torch.no_grad():
@@ -201,11 +207,127 @@ def test_a_step_that_is_left_out_teaches_a_robust_loss_nothing_and_a_restart_let
     assert float(step.loss.threshold) == pytest.approx(0.05)
     step.restart(optimizer)
     assert float(step.loss.threshold) == 1.0
-
-
-def test_smaller_batches_hold_whole_squares():
     step = make_step(None, sample_budget=8 * 40)
     step.loss = RobustLoss(MeanSquaredError(), patch=4)
     loader = RayBatches(ball_scene(), step.progress, 0, 64, patch=4)
     step(loader.at(0, 0), step.new_optimizer())
     assert step.progress.batch_rays == 16
+
+
+def test_weights_that_are_not_finite_are_not_saved():
+    system = RadianceFieldSystem(make_step(None), {})
+    system._trainer = type("T", (), {"global_step": 7, "default_root_dir": "outputs/x"})()
+    with torch.no_grad():
+        system.model.levels["fine"].field.color_head.bias[0] = float("inf")
+    with pytest.raises(InputError, match=r"weights of step 7 are not finite.*optimizer\.lr"):
+        system.on_save_checkpoint({})
+
+
+def test_validation_has_no_jitter():
+    system = RadianceFieldSystem(make_step(None), {})
+    logged = {}
+    logger = type("L", (), {"log_metrics": staticmethod(lambda values, step: logged.update(values))})()
+    fits = {"state": TrainerState(fn=TrainerFn.FITTING), "loggers": [logger], "global_step": 3}
+    system._trainer = type("T", (), {"sanity_checking": False} | fits)()
+    system.log_dict = lambda values, **options: None
+    loader = RayBatches(ball_scene(), system.step.progress, 0, 64)
+    values = []
+    for _ in range(2):
+        with torch.no_grad():
+            system.validation_step(loader.at(0, 0), 0)
+            system.on_validation_epoch_end()
+        values.append(dict(logged))
+    assert values[0] == values[1]
+    assert values[0]["val/psnr_standard_error"] > 0
+
+
+def a_step_with_shifts(tile_points=None, model=None, **settings):
+    scene, step = ball_scene(), make_step(tile_points, model)
+    step.rays = LearntShifts(scene.cameras, scene.near, scene.far, **settings)
+    return step
+
+
+def batch_of(step):
+    return RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0)
+
+
+def test_a_part_may_learn_at_its_own_rate_which_the_schedule_scales_or_as_the_model_does():
+    step = a_step_with_shifts(learning_rate=0.25)
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3, weight_decay=0.1)
+    step.schedule = ExponentialDecay(decay_rate=0.5, decay_steps=1)
+    optimizer = step.new_optimizer()
+    for _ in range(3):
+        step(batch_of(step), optimizer)
+    model, own = optimizer.param_groups
+    assert own["params"] == [step.rays.shift]
+    assert not any(parameter is step.rays.shift for parameter in model["params"])
+    assert (own["lr"], own["weight_decay"]) == (0.25 / 4, 0.0)
+    assert (model["lr"], model["weight_decay"]) == (1e-3 / 4, 0.1)
+    (group,) = a_step_with_shifts().new_optimizer().param_groups
+    assert any(parameter.shape == (6, 3) for parameter in group["params"])
+    step = make_step(None, tiny_model())
+    field = step.model.last.field
+    field.learning_rate = 0.5
+    step.build_optimizer = lambda groups: torch.optim.Adam(groups, lr=1e-3)
+    others, quick = step.new_optimizer().param_groups
+    own = {id(each) for each in field.parameters()}
+    assert (quick["lr"], others["lr"]) == (0.5, 1e-3)
+    assert {id(each) for each in quick["params"]} == own
+    assert len(others["params"]) + len(own) == len(list(step.model.parameters()))
+
+
+@pytest.mark.parametrize("tile_points", [None, 16, 200])
+@pytest.mark.parametrize("parts", [[slice(0, 64)], [slice(0, 16), slice(16, 64)]])
+def test_a_penalty_counts_once_however_the_step_is_cut_and_shared_by_processes(tile_points, parts):
+    model = tiny_model(density_bias=0.5).requires_grad_(False)
+    light, heavy = (a_step_with_shifts(tile_points, copy.deepcopy(model), weight=weight) for weight in (0.0, 5.0))
+    for step in (light, heavy):
+        batch = batch_of(step)
+        for part in parts:
+            step.gradients(batch[part], share=Share(part.start, 64, batch.weight.sum()))
+    torch.testing.assert_close(heavy.rays.shift.grad - light.rays.shift.grad, torch.full((6, 3), -10.0))
+
+
+def test_parts_that_are_not_finite_are_seen_and_a_new_attempt_begins_where_the_first_began():
+    step = a_step_with_shifts()
+    with torch.no_grad():
+        step.rays.shift.fill_(3.0)
+    step.restart(step.new_optimizer())
+    assert float(step.rays.shift.detach().abs().max()) == 0
+    step = a_step_with_shifts(weight=1.0)
+    with torch.no_grad():
+        step.rays.shift[:] = float("inf")
+    step(batch_of(step), step.new_optimizer())
+    assert step.guard.skipped == 1
+    assert step.broken_weights() == "rays"
+
+
+@pytest.mark.parametrize("tile_points", [None, 60, 200])
+def test_what_a_level_adds_to_the_loss_of_its_rays_counts_once_however_the_step_is_cut(tile_points):
+    plain, scene = tiny_model(density_bias=0.5), ball_scene()
+
+    class Frowning(type(plain)):
+        def forward(self, rays, background, random):
+            first, last = super().forward(rays, background, random)
+            return [first, replace(last, penalty=rays.photograph * last.depth)]
+
+    frowning = copy.deepcopy(plain)
+    frowning.__class__ = Frowning
+    losses, gradients = [], []
+    for model in (plain, frowning):
+        step = make_step(tile_points, model)
+        batch = RayBatches(scene, step.progress, 0, 64).at(0, 0)
+        seen = step.gradients(batch)
+        losses.append(seen.losses)
+        gradients.append(torch.cat([each.grad.flatten() for each in model.parameters()]))
+    random = batch_random(fold(0, 0, 0), 64)
+    rays = replace(step.rays(batch.pixels), photograph=batch.pixels.view)
+    last = plain(rays, torch.ones(64, 3), random)[-1]
+    penalty = (rays.photograph * last.depth).mean()
+    torch.testing.assert_close(losses[1] - losses[0], torch.stack([torch.zeros(()), penalty.detach()]))
+    plain.zero_grad()
+    penalty.backward()
+    alone = torch.cat(
+        [torch.zeros_like(each).flatten() if each.grad is None else each.grad.flatten() for each in plain.parameters()]
+    )
+    torch.testing.assert_close(gradients[1] - gradients[0], alone, atol=1e-4, rtol=1e-3)

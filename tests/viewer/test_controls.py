@@ -1,9 +1,14 @@
 """The panel: what is saved where it can be, and what is not there is said."""
 
+import re
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.viewer_panel import Panel
 
 from nerf_lightning.viewer import controls
+from nerf_lightning.viewer.error_log import as_plain_markdown, one_line
 
 
 def snapshot(panel):
@@ -64,3 +69,21 @@ def test_without_a_crop_box_it_is_said_why(tmp_path):
     assert "Show only what is in the box" not in panel.gui.made
     assert "Crop box" in panel.gui.made
     assert any("forward-facing capture" in label for label in map(str, panel.gui.made))
+
+
+@given(st.text())
+def test_nothing_ends_the_code_span_early(text):
+    """CommonMark 6.1: a code span ends at the first run of backticks as long as the one that began it."""
+    shown = as_plain_markdown(text)
+    fence = re.match("`+", shown)[0]
+    inner = shown[len(fence) : -len(fence)]
+    assert inner.strip(" ") == one_line(text).strip(" ")
+    assert all(len(run) != len(fence) for run in re.findall("`+", inner))
+    assert not inner.startswith("`")
+    assert not inner.endswith("`")
+    assert inner.isprintable()
+
+
+def test_surrogates_and_line_ends_are_shown_as_something_and_long_texts_are_cut():
+    assert as_plain_markdown("a\udc80\n\nb\u202e") == "`a\ufffd  b\ufffd`"
+    assert one_line("a" * 10**6, 3) == "aaa…"

@@ -1,12 +1,18 @@
 """Several people in front of one page: what one of them sends harms neither the page nor the others."""
 
+import logging
 import math
 import os
+import socket
 import time
 
 import msgspec
 import pytest
 from support.served_page import HEIGHT, served
+
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.viewer import ports
+from nerf_lightning.viewer.ports import free_port
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +84,36 @@ def test_who_leaves_is_seen_off(page):
     assert not page.page.is_empty
     client.close()
     client.wait_until(lambda: page.page.is_empty and page.queue.is_empty)
+
+
+@pytest.fixture
+def taken():
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        yield listening.getsockname()[1]
+
+
+def test_the_next_free_port_is_taken_and_said(taken, caplog):
+    with caplog.at_level(logging.WARNING):
+        found = free_port("127.0.0.1", taken)
+    assert found > taken
+    assert f"port {taken} is in use" in caplog.text
+    assert str(found) in caplog.text
+
+
+def test_no_port_left_is_one_paragraph(taken, monkeypatch):
+    monkeypatch.setattr(ports, "TRIED", 1)
+    with pytest.raises(InputError, match=f"Ports {taken} to {taken} are all in use"):
+        free_port("127.0.0.1", taken)
+
+
+def test_an_address_that_is_not_this_machines_is_named():
+    with pytest.raises(InputError, match=r"host=192\.0\.2\.1: this machine cannot listen there"):
+        free_port("192.0.2.1", 8080)
+
+
+@pytest.mark.parametrize("port", [0, -1, 70_000])
+def test_a_port_that_is_none_is_named(port):
+    with pytest.raises(InputError, match=f"port={port}: give a number"):
+        free_port("127.0.0.1", port)

@@ -20,14 +20,6 @@ def places(panel):
     return [each.position[0] for each in panel.controls.path.keyframes]
 
 
-def test_a_keyframe_comes_after_the_chosen_one(panel):
-    panel.set("Keyframe", "1")
-    panel.client.camera.position = np.array([4.5, 0.0, 2.0])
-    panel.press("Add keyframe")
-    assert places(panel) == [4.0, 4.5, 5.0, 6.0]
-    assert panel.gui.made["Keyframe"].value == "2"
-
-
 def test_keyframes_are_timed_and_deleted(panel):
     panel.set("Keyframe", "2")
     panel.set("Seconds to it", 0.5)
@@ -43,10 +35,15 @@ def test_keyframes_are_timed_and_deleted(panel):
     assert not panel.gui.made["Time"].visible
 
 
-def test_the_time_line_is_as_long_as_the_path(panel):
+def test_a_keyframe_comes_after_the_chosen_one_and_the_time_line_is_as_long_as_the_path(panel):
     assert panel.gui.made["Time"].max == 4.0
     panel.set("Time", 2.0)
     assert panel.client.camera.position.tolist() == pytest.approx([5.0, 0.0, 2.0])
+    panel.set("Keyframe", "1")
+    panel.client.camera.position = np.array([4.5, 0.0, 2.0])
+    panel.press("Add keyframe")
+    assert places(panel) == [4.0, 4.5, 5.0, 6.0]
+    assert panel.gui.made["Keyframe"].value == "2"
 
 
 def test_playing_goes_along_the_path_hides_what_is_drawn_and_ends(panel, monkeypatch):

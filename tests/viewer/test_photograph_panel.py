@@ -41,12 +41,8 @@ def test_a_photograph_is_chosen_by_its_picture_and_looked_through(panel):
 def test_many_photographs_are_turned_like_pages_and_found_by_name(panel):
     turn = panel.gui.made["Pictures"]
     assert list(buttons(panel)) == [f"ball_{view}" for view in range(9)]
-    for way, label in (
-        ("Previous", "1-9 of 20"),
-        ("Next", "10-18 of 20"),
-        ("Next", "19-20 of 20"),
-        ("Next", "19-20 of 20"),
-    ):
+    labels = ("1-9 of 20", "10-18 of 20", "19-20 of 20", "19-20 of 20")
+    for way, label in zip(("Previous", "Next", "Next", "Next"), labels, strict=True):
         panel.set("Pictures", way)
         assert turn.label == label
     assert list(buttons(panel)) == ["ball_18", "ball_19"]

@@ -56,15 +56,6 @@ def test_what_the_page_plays_is_what_a_film_shows(filled):
         assert vertical_field_of_view(film, frame) == pytest.approx(fov, abs=1e-4)
 
 
-def test_without_its_first_keyframe_a_path_begins_at_the_next(filled):
-    filled.legs[1:] = [1.0, 3.0]
-    filled.remove(0)
-    assert filled.times == [0.0, 3.0]
-    filled.remove(0)
-    assert filled.times == [0.0]
-    assert filled.curve() is None
-
-
 def test_a_file_that_was_written_by_hand_is_loaded_with_all_that_it_says(path):
     path.folder.mkdir()
     (path.folder / "mine.yaml").write_text(
@@ -106,10 +97,16 @@ def test_only_plain_files_of_the_folder_are_loaded(filled, tmp_path):
             filled.load(name)
 
 
-def test_a_camera_whose_picture_has_no_top_is_refused(filled):
+def test_a_camera_whose_picture_has_no_top_is_refused_and_without_its_first_keyframe_a_path_begins_at_the_next(filled):
     with pytest.raises(InputError, match="looks straight along its up"):
         filled.insert(1, Keyframe((0.0, 0.0, 5.0), direction=(0.0, 0.0, -1.0), up=(0.0, 0.0, 1.0)))
     assert len(filled.keyframes) == len(filled.legs) == 3
+    filled.legs[1:] = [1.0, 3.0]
+    filled.remove(0)
+    assert filled.times == [0.0, 3.0]
+    filled.remove(0)
+    assert filled.times == [0.0]
+    assert filled.curve() is None
 
 
 def test_many_that_save_at_once_lose_nothing_and_no_link_is_written_through(tmp_path):

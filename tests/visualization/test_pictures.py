@@ -1,10 +1,13 @@
+import gc
 import os
+import warnings
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from nerf_lightning.visualization.figures import epoch_figure, loss_curve
 from nerf_lightning.visualization.pictures import (
     ERROR_SCALE,
     color_map,
@@ -19,28 +22,20 @@ from nerf_lightning.visualization.pictures import (
 )
 
 
-def test_bytes_are_clamped_and_rounded():
+def test_bytes_are_clamped_and_rounded_and_every_byte_survives_the_way_through_floats():
     rgb = torch.tensor([[[-0.2, 0.0, 0.499 / 255], [0.501 / 255, 1.0, 1.7]]])
     assert to_bytes(rgb).tolist() == [[[0, 0, 0], [1, 255, 255]]]
-
-
-def test_every_byte_survives_the_way_through_floats():
     steps = torch.arange(256).repeat(3, 1).T
     assert torch.equal(to_bytes(steps / 255), steps.to(torch.uint8))
     assert to_bytes(torch.full((1, 3), float("nan"))).tolist() == [[0, 0, 0]]
 
 
-def test_a_saved_picture_reads_back_equal(tmp_path):
+def test_a_saved_picture_reads_back_equal_and_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     picture = torch.randint(0, 256, (5, 7, 3), dtype=torch.uint8)
     path = tmp_path / "deep" / "er" / "a.png"
     save_png(path, picture)
     assert np.array_equal(np.asarray(Image.open(path)), picture.numpy())
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
-
-
-def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    save_png(path, torch.zeros(2, 2, 3, dtype=torch.uint8))
     before = path.read_bytes()
 
     def full_disk(self, target, format):
@@ -51,10 +46,10 @@ def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatc
     with pytest.raises(OSError, match="no space"):
         save_png(path, torch.ones(2, 2, 3, dtype=torch.uint8))
     assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["a.png"]
+    assert os.listdir(path.parent) == ["a.png"]
 
 
-def test_colors_grow_brighter_from_low_to_high():
+def test_colors_grow_brighter_from_low_to_high_and_outside_the_range_are_its_ends():
     ramp = color_map(torch.linspace(2, 6, 64)[None], 2.0, 6.0)[0]
     luma = ramp @ torch.tensor([0.2126, 0.7152, 0.0722])
     assert (luma.diff() > 0).all()
@@ -62,9 +57,6 @@ def test_colors_grow_brighter_from_low_to_high():
     assert luma[-1] > 0.9
     reversed_ramp = color_map(torch.linspace(2, 6, 64)[None], 6.0, 2.0)[0]
     torch.testing.assert_close(reversed_ramp, ramp.flip(0))
-
-
-def test_colors_outside_the_range_are_its_ends():
     low, high, inside_out = float("-inf"), float("inf"), float("nan")
     ends = color_map(torch.tensor([[low, 0.0, inside_out, 1.0, 9.0, high]]), 0.0, 1.0)[0]
     assert torch.equal(ends[0], ends[1])
@@ -95,7 +87,7 @@ def test_visible_range_ignores_what_light_passes_through():
     assert visible_range(depth, torch.zeros(10, 10))[1] > 50
 
 
-@pytest.mark.parametrize("size", [24, 100, 301])
+@pytest.mark.parametrize("size", [24, 301])
 def test_the_depth_picture_keeps_the_pixels_left_of_its_scale(size):
     depth = torch.linspace(2, 6, size).expand(size, size)
     picture = depth_picture(depth, 2.0, 6.0)
@@ -109,14 +101,11 @@ def test_the_depth_picture_keeps_the_pixels_left_of_its_scale(size):
     assert bar[-1] < 10
 
 
-def test_depth_fades_to_grey_where_nothing_is():
+def test_depth_fades_to_grey_where_nothing_is_and_error_has_a_fixed_scale():
     opacity = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
     picture = depth_picture(torch.full((2, 2), 6.0), 2.0, 6.0, opacity)
     assert picture[0, 1].tolist() == [237, 237, 237]
     assert picture[0, 0].max() < 10
-
-
-def test_error_has_a_fixed_scale():
     truth = torch.zeros(30, 30, 3)
     render = truth.clone()
     render[:, 10:20] = ERROR_SCALE
@@ -128,7 +117,7 @@ def test_error_has_a_fixed_scale():
     assert torch.equal(picture[0, 25], ends[1])
 
 
-@pytest.mark.parametrize("size", [8, 100, 200])
+@pytest.mark.parametrize("size", [8, 200])
 def test_the_mosaic_shows_truth_and_render_unscaled(size):
     truth, render = torch.rand(size, size, 3), torch.rand(size, size, 3)
     picture = mosaic(panels(truth, render, torch.rand(size, size) + 2, torch.ones(size, size)))
@@ -139,3 +128,53 @@ def test_the_mosaic_shows_truth_and_render_unscaled(size):
     assert any(torch.equal(square, to_bytes(render)) for square in squares)
     assert (picture[:corner] == 255).all()
     assert (picture[:top] < 255).any(), "captions"
+
+
+def ink(picture):
+    return float((picture.float().mean(dim=-1) < 200).float().mean())
+
+
+def test_a_curve_has_the_size_that_was_asked_for():
+    picture = loss_curve(range(100), [1.0 / (i + 1) for i in range(100)], width=320, height=200)
+    assert picture.shape == (200, 320, 3)
+    assert picture.dtype == torch.uint8
+    assert 0.001 < ink(picture) < 0.2
+
+
+def test_the_axis_is_logarithmic():
+    # An exponential decay is a straight line there: blue pixels lie about the diagonal.
+    picture = loss_curve(range(200), [10 ** (-i / 50) for i in range(200)], width=400, height=400).float()
+    rows, columns = torch.where((picture[..., 2] - picture[..., 0]) > 60)
+    line = torch.stack([rows, columns]).double()
+    assert torch.corrcoef(line)[0, 1] > 0.999
+
+
+def test_awkward_values_draw_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for values in ([], [0.1], [0.0, 0.0], [1.0, 0.0, float("nan"), float("inf"), 0.5], [float("nan")]):
+            assert loss_curve(range(len(values)), values, width=200, height=150).shape == (150, 200, 3)
+
+
+def test_the_epoch_shows_three_panels():
+    render, depth = torch.zeros(20, 20, 3), torch.linspace(2, 6, 20).expand(20, 20)
+    render[..., 0] = 1.0
+    picture = epoch_figure(render, depth, range(10), [0.5**i for i in range(10)], height=200).float()
+    assert picture.shape[0] == 200
+    width = picture.shape[1]
+    red = (picture[..., 0] > 240) & (picture[..., 1] < 20)
+    assert red[:, : width // 3].float().mean() > 0.3
+    assert not red[:, width // 2 :].any()
+    middle = picture[:, width // 3 : 2 * width // 3]
+    assert len(torch.unique(middle.reshape(-1, 3), dim=0)) > 20
+    assert ink(picture[:, 2 * width // 3 :]) > 0.002
+
+
+def test_nothing_global_stays_behind():
+    from matplotlib import pyplot
+    from matplotlib.figure import Figure
+
+    loss_curve([0, 1], [1.0, 0.5])
+    gc.collect()
+    assert pyplot.get_fignums() == []
+    assert not [thing for thing in gc.get_objects() if type(thing) is Figure]

@@ -1,6 +1,10 @@
+from dataclasses import replace
+
 import pytest
 import torch
+from support.scenes import ball_scene
 
+from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import (
     all_pixels,
     pinhole_cameras,
@@ -9,6 +13,7 @@ from nerf_lightning.nerf.geometry.cameras import (
     resized,
     seen_at,
 )
+from nerf_lightning.nerf.geometry.photographs import photographs_of
 from nerf_lightning.nerf.geometry.poses import is_rigid, look_at
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -77,16 +82,37 @@ def test_the_focal_length_follows_the_size_of_the_picture(cameras):
     assert float(half.focal[0, 0]) == 15.0
 
 
-def test_look_at_is_rigid_and_looks_at_the_target(cameras):
+def test_look_at_is_rigid_and_looks_at_the_target_and_mirrors_shears_and_nan_are_not(cameras):
     assert bool(is_rigid(cameras.c2w).all())
     middle = project(cameras, 0, torch.zeros(1, 3, dtype=torch.float64))
     torch.testing.assert_close(middle, torch.tensor([[12.0, 8.0]], dtype=torch.float64))
-
-
-def test_mirrors_shears_and_nan_are_not_rigid():
     good = torch.eye(4)[None, :3]
     mirror, shear, nan = good.clone(), good.clone(), good.clone()
     mirror[0, 0, 0] = -1.0
     shear[0, 0, 1] = 0.2
     nan[0, 1, 3] = float("nan")
     assert is_rigid(torch.cat([good, mirror, shear, nan])).tolist() == [True, False, False, False]
+
+
+def test_they_are_the_views_that_were_asked_for():
+    scene = replace(ball_scene(), capture_of=(0, 0, 0, 1, 1, 1), captures=("left", "right"))
+    seen = photographs_of(scene, [4, 1, 3])
+    assert seen.numbers.tolist() == [4, 1, 3]
+    assert seen.capture.tolist() == [1, 0, 1]
+    for place, number in enumerate([4, 1, 3]):
+        assert torch.equal(seen.pixels.view(place), scene.pixels.view(number))
+        assert torch.equal(seen.cameras.c2w[place], scene.cameras.c2w[number])
+
+
+def test_cameras_stand_around_or_face_forward_and_normalised_device_coordinates_are_refused():
+    scene = ball_scene()
+    around = photographs_of(scene, range(6))
+    assert around.around.tolist() == [True]
+    torch.testing.assert_close(around.middle, torch.zeros(1, 3), atol=1e-4, rtol=0)
+    eyes = scene.cameras.c2w.clone()
+    eyes[:, :, :3] = eyes[:1, :, :3]
+    ahead = photographs_of(replace(scene, cameras=replace(scene.cameras, c2w=eyes)), range(6))
+    assert ahead.around.tolist() == [False]
+    bent = replace(scene, cameras=replace(scene.cameras, ndc=torch.ones(6, 2)))
+    with pytest.raises(InputError, match=r"scene\.space=contracted"):
+        photographs_of(bent, [0, 1])

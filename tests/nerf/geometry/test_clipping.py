@@ -1,10 +1,11 @@
-"""Rays cut to a box of the user's frame, through the world and through normalised device coordinates."""
+"""Rays cut to a box of the user's frame or of the scene, through the world and normalised device coordinates."""
 
 from dataclasses import replace
 
 import torch
 from support.scenes import some_rays
 
+from nerf_lightning.nerf.geometry.boxes import distances_in_box, to_unit_cube
 from nerf_lightning.nerf.geometry.cameras import all_pixels, pinhole_cameras, rays_through_pixels
 from nerf_lightning.nerf.geometry.clipping import Clip, CropBox
 from nerf_lightning.nerf.geometry.frames import points_from_user, similarity
@@ -16,7 +17,7 @@ LOWER, UPPER = (-1.0, 0.5, 2.0), (0.5, 3.0, 2.5)
 
 def turned():
     rotation = rotation_from_quaternion(torch.tensor([0.9, 0.1, -0.3, 0.2]))
-    return similarity(rotation, torch.tensor([0.3, 1.5, 2.2]), 0.5)
+    return similarity(rotation, torch.tensor([0.3, 1.5, 2.2]), 0.5).float()
 
 
 def test_points_of_cut_rays_lie_in_the_users_box_and_others_do_not(generator):
@@ -34,10 +35,13 @@ def test_points_of_cut_rays_lie_in_the_users_box_and_others_do_not(generator):
         assert torch.equal(inside | near_a_face, within | near_a_face)
 
 
-def test_a_box_holds_what_the_user_sees_in_it():
+def test_a_box_holds_what_the_user_sees_in_it_and_near_replaces_the_trained_one():
     box = CropBox.from_user(LOWER, UPPER, turned())
     user = torch.tensor([[0.0, 1.0, 2.2], [0.6, 1.0, 2.2], [0.0, 1.0, 2.6]])
     assert box.holds(points_from_user(user, turned())).tolist() == [True, False, False]
+    rays = some_rays(3)
+    assert Clip(near=1.5)(rays, rays, ndc=False).near.tolist() == [1.5] * 3
+    assert Clip(near=9.0)(rays, rays, ndc=False).far.tolist() == [9.0] * 3  # nothing is left
 
 
 def test_a_box_far_from_the_users_origin_is_as_sharp():
@@ -48,12 +52,6 @@ def test_a_box_far_from_the_users_origin_is_as_sharp():
     here, there = CropBox.from_user(LOWER, UPPER, turned()), CropBox.from_user(lower, upper, away)
     torch.testing.assert_close(here.size, there.size)
     torch.testing.assert_close(here.corner, there.corner, atol=0.3, rtol=0)  # float32 holds 1e6 to a sixteenth
-
-
-def test_near_replaces_the_trained_one():
-    rays = some_rays(3)
-    assert Clip(near=1.5)(rays, rays, ndc=False).near.tolist() == [1.5] * 3
-    assert Clip(near=9.0)(rays, rays, ndc=False).far.tolist() == [9.0] * 3  # nothing is left
 
 
 def bent_rays():
@@ -82,3 +80,30 @@ def test_normalised_device_coordinates_are_cut_at_the_same_distances():
     near = Clip(near=3.0)(rays, straight, ndc=True)
     torch.testing.assert_close(world_distance(straight, near.near / rays.far), torch.full_like(near.near, 3.0))
     torch.testing.assert_close(near.far, rays.far)
+
+
+AABB = torch.tensor([[-1.0, -0.5, -2.0], [1.0, 0.5, 0.3]])
+
+
+def test_a_ray_is_in_the_box_between_entering_and_leaving_it():
+    rays = some_rays(500)
+    enter, leave = distances_in_box(rays, AABB)
+    t = torch.linspace(2.0, 6.0, 401)
+    points = rays.origins[:, None] + t[:, None] * rays.directions[:, None]
+    inside = ((points > AABB[0]) & (points < AABB[1])).all(-1)
+    between = (t > enter[:, None]) & (t < leave[:, None])
+    close = ((t - enter[:, None]).abs() < 1e-4) | ((t - leave[:, None]).abs() < 1e-4)
+    assert bool(((inside == between) | close).all())
+    assert 0.1 < float((enter < leave).float().mean()) < 0.99
+
+
+def test_rays_along_the_axes_are_not_lost():
+    rays = some_rays(1)
+    rays.origins.copy_(torch.tensor([[0.2, 0.1, 4.0]]))
+    rays.directions.copy_(torch.tensor([[0.0, 0.0, -1.0]]))
+    enter, leave = distances_in_box(rays, AABB)
+    torch.testing.assert_close(torch.cat([enter, leave]), torch.tensor([3.7, 6.0]))
+
+
+def test_the_unit_cube_has_the_boxes_corners():
+    torch.testing.assert_close(to_unit_cube(AABB, AABB), torch.tensor([[0.0] * 3, [1.0] * 3]))

@@ -6,12 +6,7 @@ import pytest
 import torch
 from support.scenes import ball_scene
 
-from nerf_lightning.nerf.geometry.contraction import (
-    Contracted,
-    contract,
-    from_normalized_distance,
-    normalized_distance,
-)
+from nerf_lightning.nerf.geometry.contraction import Contracted, contract, from_normalized_distance, normalized_distance
 
 
 def test_contraction_keeps_the_unit_ball_and_brings_infinity_to_two():
@@ -49,21 +44,15 @@ def test_from_the_middle_even_steps_are_even_steps_of_the_contraction():
     assert torch.allclose(steps, steps.mean().expand_as(steps), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("fixed", "space", "result"),
-    [
-        (None, "bounded", False),
-        (None, "ndc", False),
-        (None, "contracted", True),
-        (True, "bounded", True),
+def test_the_config_overrules_the_scene():
+    for fixed, space, result in (
+        (None, "bounded", False), (None, "ndc", False), (None, "contracted", True), (True, "bounded", True),
         (False, "contracted", False),
-    ],
-)
-def test_the_config_overrules_the_scene(fixed, space, result):
-    switch = Contracted(fixed)
-    for another in ("contracted", "bounded", space):  # a second scene turns it again
-        switch.fit_to(replace(ball_scene(), space=another))
-    assert switch.is_on() is result
+    ):  # fmt: skip
+        switch = Contracted(fixed)
+        for another in ("contracted", "bounded", space):  # a second scene turns it again
+            switch.fit_to(replace(ball_scene(), space=another))
+        assert switch.is_on() is result
 
 
 @pytest.mark.parametrize("state", [True, False])

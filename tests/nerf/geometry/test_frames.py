@@ -52,11 +52,8 @@ def moved(c2w, turn, unit, shift):
     return torch.cat([turn @ c2w[:, :, :3], (unit * c2w[:, :, 3] @ turn.T + shift)[:, :, None]], dim=-1)
 
 
-def test_the_focus_is_what_all_cameras_look_at():
+def test_the_focus_is_what_all_cameras_look_at_and_finite_for_parallel_ones():
     assert torch.allclose(focus_point(around()), TARGET, atol=1e-4)
-
-
-def test_parallel_cameras_have_a_finite_focus():
     c2w = torch.eye(4, dtype=torch.float64)[:3].repeat(4, 1, 1)
     c2w[:, 0, 3] = torch.arange(4)
     assert torch.allclose(focus_point(c2w)[:2], torch.tensor([1.5, 0.0], dtype=torch.float64))
@@ -68,12 +65,9 @@ def test_up_of_upright_cameras(height, part):
     assert torch.allclose(up_direction(around(height=height, part=part)), Z, atol=1e-6)
 
 
-@pytest.mark.parametrize("degrees", [90.0, -90.0])
-def test_up_of_photographs_that_lie_on_their_side(degrees):
-    assert torch.allclose(up_direction(rolled(around(height=1.5), degrees)), Z, atol=1e-6)
-
-
-def test_up_of_a_forward_facing_capture_is_the_photographers():
+def test_up_of_photographs_that_lie_on_their_side_and_of_a_forward_facing_capture_is_the_photographers():
+    for degrees in (90.0, -90.0):
+        assert torch.allclose(up_direction(rolled(around(height=1.5), degrees)), Z, atol=1e-6)
     assert float(up_direction(forward()) @ Z) > 0.999
     sideways = up_direction(rolled(forward(), 90.0))
     assert abs(float(sideways @ Z)) < 0.01  # nothing tells a sideways wall from an upright one
@@ -86,7 +80,7 @@ def test_a_hand_that_shakes_hardly_tilts_up():
 
 
 @pytest.mark.parametrize("c2w", [around(), rolled(around(), 90.0), forward()], ids=["upright", "sideways", "forward"])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_up_and_focus_turn_with_the_capture(c2w, seed):
     turn, unit, shift = rotation(seed), 7.3, torch.tensor([100.0, -50.0, 3.0], dtype=torch.float64)
     other = moved(c2w, turn, unit, shift)

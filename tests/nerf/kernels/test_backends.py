@@ -1,10 +1,11 @@
-"""What becomes of a kernel that cannot be compiled, or not be kept."""
+"""What becomes of a kernel that cannot be compiled, or not be kept, and when a kept one is compiled again."""
 
 import logging
 import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import ModuleType
 
 import numba
@@ -128,3 +129,52 @@ def test_a_damaged_cache_is_compiled_anew(suffix, tmp_path):
         file.write_bytes(file.read_bytes()[:40])
     mended = found()
     assert found() == mended  # nothing was compiled again
+
+
+KERNEL = """
+from numba import njit
+from {room}.number import NUMBER
+
+@njit(cache=True)
+def kernel():
+    return NUMBER
+"""
+ASKED = """
+import sys
+sys.path.insert(0, {folder!r})
+from nerf_lightning.nerf.kernels import backends
+backends.ROOM = {room!r}
+import {room}.kernel as module
+backends._stamp_with_sources(module)
+print(module.kernel(), sum(module.kernel.stats.cache_hits.values()))
+"""
+
+
+def test_a_change_of_a_number_in_another_file_is_compiled_in(tmp_path):
+    room = tmp_path / "room"
+    room.mkdir()
+    (room / "__init__.py").touch()
+    (room / "kernel.py").write_text(KERNEL.format(room="room"))
+
+    def answer(number):
+        (room / "number.py").write_text(f"NUMBER = {number}\n")
+        asked = [sys.executable, "-c", ASKED.format(folder=str(tmp_path), room="room")]
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
+        return subprocess.run(asked, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+    assert answer(11) == ["11", "0"]
+    assert answer(11) == ["11", "1"]  # kept
+    assert answer(22) == ["22", "0"]
+
+
+@pytest.mark.parametrize(
+    ("kernel", "other"),
+    [
+        ("mlp.cpu", "vectors.py"),
+        ("march.cpu", "grid.py"),
+        ("hash_grid.cpu", "reference.py"),
+        ("render.cpu", "activations.py"),
+    ],
+)
+def test_those_that_are_known_to_take_something_are_found(kernel, other):
+    assert other in {Path(file).name for file in backends._sources(f"nerf_lightning.nerf.kernels.{kernel}")}

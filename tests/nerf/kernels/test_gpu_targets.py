@@ -1,7 +1,10 @@
 """Triton's kernels, compiled for GPUs that are not here: what they need fits, and what does not is left to torch."""
 
 import logging
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -103,11 +106,8 @@ def test_a_kernel_that_does_not_fit_leaves_the_work_to_torch_and_says_so_once(mo
 
 def test_numbers_of_values_may_exceed_32_bits(reachable):
     layout, features = next(iter(reachable[1].items()))
-    table, points, out = (
-        torch.empty(layout.offsets[-1], features),
-        torch.zeros(128, 3),
-        len(layout.resolutions) * features,
-    )
+    table, points = torch.empty(layout.offsets[-1], features), torch.zeros(128, 3)
+    out = len(layout.resolutions) * features
     with compiled_for("sm_89", KERNELS) as made:
         hash_grid.forward(table, points, layout)
         hash_grid.add_table_gradient(table, points, torch.zeros(128, out), layout)
@@ -117,3 +117,27 @@ def test_numbers_of_values_may_exceed_32_bits(reachable):
         assert arrays
         offsets = [re.findall(rf"tt.addptr {array}, .*tensor<128x(i\d+)> ", code) for array in arrays]
         assert set().union(*offsets) == {"i64"}
+
+
+CHECKS = {
+    "hash_grid": """
+from support.triton_twin import check_against_the_reference
+check_against_the_reference("cpu", 140)
+""",
+    "mlp": """
+from nerf_lightning.nerf.kernels.mlp import cuda
+from support.triton_perceptron import check_perceptron
+cuda.PROGRAMS = 2  # so that one takes several blocks
+check_perceptron("cpu", [0, 1, 640])
+""",
+}
+
+
+@pytest.mark.parametrize("kernel", CHECKS)
+def test_through_the_interpreter(kernel):
+    pytest.importorskip("triton", reason="triton is not installed (Linux only)")
+    # The interpreter is chosen when the kernels are defined: a process of its own.
+    code = f"import sys\nsys.path.insert(0, 'tests')\n{CHECKS[kernel]}"
+    environment = os.environ | {"TRITON_INTERPRET": "1"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

@@ -58,16 +58,13 @@ def test_gradients_of_the_reference_are_right():
     assert torch.autograd.gradcheck(lambda t, p: interpolate_torch(t, p, layout), (table, points))
 
 
-def test_a_hashed_level_shares_its_entries_and_stays_in_its_table():
+def test_a_hashed_level_shares_its_entries_and_gradients_are_added_in_place_where_an_optimizer_keeps_them():
     layout = hash_grid_layout(2, 8, 4, 64)
     assert [layout.is_hashed(level) for level in (0, 1)] == [False, True]
     assert layout.offsets == (0, 125, 125 + 256)
     table, points, grad = inputs(layout, 2, count=20_000)
     _, gradient, _ = values_and_gradients(interpolate, table, points, grad, layout)
     assert bool((gradient[125:] != 0).all())  # every shared entry is used
-
-
-def test_gradients_are_added_in_place_where_an_optimizer_keeps_them():
     layout = LAYOUTS[0]
     table, points, grad = inputs(layout, 2)
     kept = table.clone().requires_grad_()

@@ -1,24 +1,33 @@
+from dataclasses import replace
+
 import pytest
 import torch
-from support.scenes import some_rays, tiny_field, tiny_model
+from support.known_fields import SolidField, ball
+from support.scenes import ball_scene, some_rays, tiny_field, tiny_model
+from support.static_models import fast_model
 
+from nerf_lightning.nerf.kernels.ragged.integrate import num_visible
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.masked_level import MaskedLevel
 from nerf_lightning.nerf.models.proposal_level import ProposalLevel
 from nerf_lightning.nerf.models.radiance_model import RadianceModel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.tiles import tile_rays_for, tiles
 from nerf_lightning.nerf.randomness import batch_random
+from nerf_lightning.nerf.rendering.ragged import first_of_each_ray
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
+from nerf_lightning.nerf.samplers.early_termination import visible_samples
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
 from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 
 
-def test_levels_run_in_order_and_the_fine_one_sees_the_union():
+def test_levels_run_in_order_ray_by_ray_and_the_fine_one_sees_the_union():
     model = tiny_model()
     renderings = model(some_rays(5), torch.ones(5, 3), batch_random(0, 5))
     assert model.level_names == ("coarse", "fine")
     assert [r.weights.shape[-1] for r in renderings] == [8, 16]
     assert model.points_per_ray(training=True) == 16
     assert isinstance(model, RadianceModel)
-
-
-def test_rays_are_rendered_one_by_one():
     model, rays, background = tiny_model(), some_rays(7), torch.rand(7, 3)
     whole = model(rays, background, batch_random(4, 7))[-1]
     one = model(rays[3:4], background[3:4], batch_random(4, 7)[3:4])[-1]
@@ -45,3 +54,181 @@ def test_after_the_first_steps_proposals_learn_now_and_then(step, learns):
     assert rendering.weights.requires_grad == learns
     again = ProposalLevel(StratifiedSampler(8), proposal.field)
     assert torch.equal(again(rays, None, [], batch_random(0, 5, rays.near.device)).weights, rendering.weights)
+
+
+def both(**sampler):
+    """The same field and grid in both forms, with some cells empty."""
+    scene = ball_scene(num_views=12)
+    packed, masked = (
+        fast_model(level, num_steps=96, **({"opaque_below": 0.0} | sampler)) for level in (RaggedLevel, MaskedLevel)
+    )
+    packed.fit_to(scene)
+    torch.nn.init.normal_(packed.levels["fine"].field.position_encoder.table, std=1.0)
+    for step in (4, 8, 12):
+        packed.update(step, step)
+    grid = packed.levels["fine"].sampler.grid
+    grid.occupy(grid.density > grid.density.quantile(0.7))
+    state = packed.state_dict()
+    masked.fit_to(scene)
+    masked.load_state_dict({key: state[key] for key in masked.state_dict()})
+    return packed, masked
+
+
+@pytest.mark.parametrize("background", ["a colour", "none"])
+@pytest.mark.parametrize("training", [True, False])
+def test_it_renders_what_the_packed_level_renders(background, training):
+    packed, masked = both()
+    rays, behind = some_rays(60), None if background == "none" else torch.rand(60, 3)
+    random = batch_random(3, 60) if training else None
+    (expected,), (found,) = packed(rays, behind, random), masked(rays, behind, random)
+    assert float(expected.opacity.detach().std()) > 0.05
+    for name in ("rgb", "foreground", "opacity", "depth"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=2e-5)
+
+
+def test_it_learns_what_the_packed_level_learns():
+    """The same gradients."""
+    packed, masked = both()
+    rays, random = some_rays(60), batch_random(3, 60)
+    for model in (packed, masked):
+        model(rays, torch.ones(60, 3), random)[0].rgb.square().mean().backward()
+    for (name, expected), found in zip(packed.named_parameters(), masked.parameters(), strict=True):
+        torch.testing.assert_close(found.grad, expected.grad, rtol=1e-3, atol=1e-6, msg=name)
+
+
+def test_what_lies_behind_opaque_samples_makes_no_visible_difference():
+    packed, masked = both(opaque_below=1e-3)
+    rays, white = some_rays(60), torch.ones(60, 3)
+    found, expected = (model(rays, white, batch_random(3, 60))[0].rgb for model in (masked, packed))
+    assert float((found - expected).detach().abs().max()) < 2e-3
+
+
+def test_the_grid_keeps_up_with_the_field():
+    packed, masked = both()
+    for model in (packed, masked):
+        for step in (16, 20):
+            model.update(step, step)
+    pairs = zip(packed.levels["fine"].sampler.buffers(), masked.levels["fine"].sampler.buffers(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    assert masked.statistics()["train/occupied"] == packed.statistics()["train/occupied"]
+
+
+def a_level(**settings):
+    torch.manual_seed(1)
+    field = tiny_field(density_activation="softplus", density_bias=1.0)
+    sampler = OccupancySampler(**({"resolution": 8, "num_steps": 200, "opaque_below": 1e-6} | settings))
+    level = RaggedLevel(sampler, field)
+    level.fit_to(ball_scene(num_views=12))
+    level.sampler.grid.occupy(torch.ones_like(level.sampler.grid.possible))
+    return level
+
+
+def test_with_every_cell_occupied_it_sees_what_dense_samples_see():
+    level, rays, background = a_level(), some_rays(60), torch.rand(60, 3)
+    inside = level.sampler.start(rays, None)
+    hit = inside.enter < inside.leave
+    near, far = inside.enter, torch.maximum(inside.leave, inside.enter + 1e-3)
+    dense = DenseLevel(StratifiedSampler(400), level.field)
+    boxed = replace(rays, near=near, far=far)
+    expected = dense(boxed, background, [], None)
+    with torch.no_grad():
+        found = level(rays, background, [], None)
+    torch.testing.assert_close(found.rgb[hit], expected.rgb[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.opacity[hit], expected.opacity[hit].detach(), atol=0.02, rtol=0)
+    torch.testing.assert_close(found.rgb[~hit], background[~hit])
+
+
+@pytest.mark.parametrize(("opaque_below", "apart"), [(1e-6, 2e-5), (1e-3, 4e-3)])
+def test_rendering_in_rounds_equals_rendering_at_once(opaque_below, apart):
+    """The same lattice, once with gradients (all samples of a ray in one go), once round by round.
+
+    Rounds leave out the colour of what is transparent: no difference is as large as one of 255 steps.
+    """
+    level, rays, background = a_level(opaque_below=opaque_below), some_rays(80), torch.rand(80, 3)
+    whole = level(rays, background, [], None)
+    with torch.no_grad():
+        rounds = level(rays, background, [], None)
+    for name in ("rgb", "foreground", "opacity"):
+        torch.testing.assert_close(getattr(rounds, name), getattr(whole, name).detach(), atol=apart, rtol=1e-4)
+    torch.testing.assert_close(rounds.depth, whole.depth.detach(), atol=10 * apart, rtol=1e-4)
+
+
+@pytest.mark.parametrize("level", [RaggedLevel, MaskedLevel])
+@pytest.mark.parametrize("distance", [2.5, 3.0, 8.0, 800.0])
+def test_a_scene_looks_the_same_from_wherever_it_is_seen(level, distance):
+    """Rays that lie on the same lines, of photographs 4 units away and of a camera elsewhere, see the same."""
+    packed = a_level(resolution=8, num_steps=200, opaque_below=0.0)
+    level = packed if level is RaggedLevel else MaskedLevel(packed.sampler, packed.field)
+    rays = some_rays(60)
+    moved = distance - 4.0
+    elsewhere = replace(
+        rays, origins=rays.origins - moved * rays.directions,
+        near=(rays.near + moved).clamp(min=0.01), far=rays.far + moved,
+    )  # fmt: skip
+    background = torch.zeros(60, 3)
+    with torch.no_grad():
+        here, there = level(rays, background, [], None), level(elsewhere, background, [], None)
+    assert float(here.opacity.max()) > 0.5
+    torch.testing.assert_close(there.opacity, here.opacity, atol=0.03, rtol=0)
+    torch.testing.assert_close(there.depth - moved, here.depth, atol=0.05, rtol=0)
+
+
+def test_samples_end_where_the_ray_is_opaque():
+    level, rays = a_level(opaque_below=1e-3), some_rays(300)
+    level.field = SolidField(ball(0.5), inside=80.0)
+    samples, features = visible_samples(level.sampler, level.field, rays, batch_random(1, 300))
+    assert features is None
+    assert int(samples.found) > samples.starts.numel()  # something was left out behind the surface
+    density, _ = level.field.density(ragged_points(rays, samples, None))
+    optical = torch.zeros(300).index_add(0, samples.ray_index, density * samples.deltas)
+    longest = 80.0 * level.sampler.step_size
+    assert 1.0 < float(optical.max()) <= -torch.tensor(1e-3).log() + longest + 1e-3
+
+
+@pytest.mark.parametrize("opaque_below", [0.5, 1e-6])
+def test_asking_in_rounds_keeps_what_asking_at_once_keeps(opaque_below, monkeypatch):
+    level, rays, random, asked = a_level(opaque_below=opaque_below), some_rays(300), batch_random(1, 300), []
+    plain = level.field.density
+
+    def density_of(points):  # noise is drawn for each sample by its number in its ray
+        return plain(points)[0] * (0.5 + points.random.uniform("noise")), None
+
+    monkeypatch.setattr(level.field, "density", lambda points: asked.append(points) or density_of(points))
+    found, _ = visible_samples(level.sampler, level.field, rays, random)
+    samples = level.sampler(rays, random)
+    with torch.no_grad():
+        density, _ = density_of(ragged_points(rays, samples, random))
+    kept, bounds = first_of_each_ray(samples, num_visible(density, samples, opaque_below))
+    for ours, theirs in zip(found.tensors(), samples.at(kept, bounds).tensors(), strict=True):
+        assert torch.equal(ours, theirs)
+    number = sum(points.positions.shape[0] for points in asked)
+    assert len(asked) > 3
+    assert kept.numel() <= number
+    if opaque_below == 0.5:
+        assert number < 0.8 * samples.starts.numel(), "what lies behind opaque samples is not asked about"
+    else:
+        assert number == samples.starts.numel(), "no sample is asked about twice"
+
+
+def test_tiles_change_nothing_but_rounding():
+    level, rays, random = a_level(), some_rays(50), batch_random(3, 50)
+    background = torch.rand(50, 3)
+    whole = level(rays, background, [], random).rgb
+    parts = [level(rays[part], background[part], [], random[part]).rgb for part in (slice(0, 20), slice(20, 50))]
+    torch.testing.assert_close(torch.cat(parts), whole)
+
+
+def test_samples_per_ray_are_measured_kept_and_loaded():
+    level = a_level()
+    model = RadianceModel({"fine": level})
+    assert model.points_per_ray(training=True) == 200  # nothing known yet: the most there can be
+    model(some_rays(50), torch.ones(50, 3), batch_random(0, 50))
+    model.update(16, 0)
+    counted = model.points_per_ray(training=True)
+    assert 5 < counted < 150
+    other = RadianceModel({"fine": a_level()})
+    other.load_state_dict(model.state_dict())
+    assert other.points_per_ray(training=True) == counted
+    assert model.statistics()["speed/samples_per_ray"] == pytest.approx(counted)
+    model.reset_statistics()
+    assert model.points_per_ray(training=True) == 200

@@ -13,17 +13,13 @@ from nerf_lightning.nerf.geometry.cameras import all_pixels, rays_through_pixels
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 
 
-def test_a_pixel_has_the_ray_of_its_camera_and_the_weights_know_no_camera():
+def test_a_pixel_has_the_ray_of_its_camera_and_rays_through_the_world_are_not_bent():
     scene = ball_scene()
     rays_of_scene, pixels = rays_of(scene), all_pixels(scene.cameras, 2)
     rays = rays_through_pixels(scene.cameras, pixels, scene.near, scene.far)
     assert torch.equal(rays_of_scene(pixels).directions, rays.directions)
     assert rays_of_scene(pixels).photograph is None
     assert not rays_of_scene.state_dict()
-
-
-def test_rays_through_the_world_are_not_bent():
-    scene = ball_scene()
     forward = replace(scene.cameras, c2w=torch.eye(4)[:3].expand(len(scene.near), 3, 4))
     bent = RayGenerator(replace(forward, ndc=torch.ones(len(scene.near), 2)), scene.near, scene.far)
     pixels = all_pixels(forward, 0)

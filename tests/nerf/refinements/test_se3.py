@@ -1,5 +1,6 @@
 """Cameras that learn: what may move, what does not, and where it ends."""
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -11,14 +12,26 @@ from support.steps import make_step
 from support.wrong_cameras import mean_errors, with_noise
 
 from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
+from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
+from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.geometry.alignment import carried, similarity_between
-from nerf_lightning.nerf.geometry.cameras import project
+from nerf_lightning.nerf.geometry.cameras import all_pixels, project
 from nerf_lightning.nerf.geometry.lenses import unproject
+from nerf_lightning.nerf.models.dense_level import DenseLevel
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
 from nerf_lightning.nerf.models.ray_generator import RayGenerator
 from nerf_lightning.nerf.optimizers.schedule import ExponentialDecay
+from nerf_lightning.nerf.part import StepContext
+from nerf_lightning.nerf.randomness import batch_random
 from nerf_lightning.nerf.refinements.displacements import camera_displacements, far_displaced
 from nerf_lightning.nerf.refinements.none import NoRefinement
 from nerf_lightning.nerf.refinements.se3 import SE3Delta
+from nerf_lightning.nerf.rendering.ragged import composite_ragged
+from nerf_lightning.nerf.rendering.sample_points import ragged_points
+from nerf_lightning.nerf.samplers.early_termination import visible_samples
+from nerf_lightning.nerf.samplers.occupancy import OccupancySampler
+from nerf_lightning.nerf.samplers.stratified import StratifiedSampler
 from nerf_lightning.nerf.types.rays import PixelIndex
 
 
@@ -51,14 +64,6 @@ def test_at_first_every_ray_is_as_it_was_to_the_bit(refinement):
     pixels = PixelIndex(torch.arange(6), torch.arange(6), torch.arange(6))
     assert torch.equal(step.rays(pixels).directions, plain(pixels).directions)
     assert torch.equal(step.rays(pixels).origins, plain(pixels).origins)
-
-
-def test_without_a_refinement_nothing_learns_and_nothing_is_kept():
-    rays = a_step(ball_scene(), NoRefinement()).rays
-    assert not list(rays.parameters())
-    assert not rays.state_dict()
-    assert rays.penalty() is None
-    assert rays.refined((0, 1, 2)) is None
 
 
 def test_only_photographs_that_are_trained_on_move():
@@ -95,7 +100,7 @@ def test_wrong_cameras_before_a_known_scene_find_their_place():
     assert after[1] < before[1] / 4, (before, after)
 
 
-def test_photographs_of_one_camera_share_its_focal_length():
+def test_photographs_of_one_camera_share_its_focal_length_and_a_pinhole_may_turn_out_to_have_a_lens():
     scene = ball_scene()
     scene = replace(scene, cameras=replace(scene.cameras, focal=scene.cameras.focal.clone()))
     scene.cameras.focal[4:] *= 2.0
@@ -104,6 +109,13 @@ def test_photographs_of_one_camera_share_its_focal_length():
     assert refinement.log_focal.shape == (2,)
     torch.nn.init.constant_(refinement.log_focal, 0.1)
     torch.testing.assert_close(refinement(scene.cameras).focal, scene.cameras.focal * torch.tensor(0.1).exp())
+    scene = ball_scene()
+    refinement = SE3Delta(poses=False, lens=True)
+    refinement.fit_to(scene)
+    assert refinement(scene.cameras).lens_model == "radial_tangential"
+    with torch.no_grad():
+        refinement.radial[:] = torch.tensor([0.1, -0.02])
+    assert refinement(scene.cameras).lens[0].tolist() == pytest.approx([0.1, -0.02, 0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_wrong_focal_length_is_found_before_a_known_scene():
@@ -128,16 +140,6 @@ def test_a_wrong_lens_is_found_before_a_known_scene(model):
     assert after < before / 5, (before, after)
 
 
-def test_a_pinhole_may_turn_out_to_have_a_lens():
-    scene = ball_scene()
-    refinement = SE3Delta(poses=False, lens=True)
-    refinement.fit_to(scene)
-    assert refinement(scene.cameras).lens_model == "radial_tangential"
-    with torch.no_grad():
-        refinement.radial[:] = torch.tensor([0.1, -0.02])
-    assert refinement(scene.cameras).lens[0].tolist() == pytest.approx([0.1, -0.02, 0.0, 0.0, 0.0, 0.0])
-
-
 @pytest.mark.parametrize(
     ("refinement", "changes", "cameras", "parts"),
     [
@@ -152,12 +154,17 @@ def test_captures_whose_cameras_cannot_be_learnt_are_refused(refinement, changes
     refused(refinement.fit_to, scene, parts=(*parts, "refinement=none"))
 
 
-def test_the_penalty_is_the_mean_square_of_what_has_moved():
+def test_the_penalty_is_the_mean_square_of_what_has_moved_and_without_a_refinement_nothing_learns():
     refinement = SE3Delta(weight=0.5)
     refinement.fit_to(ball_scene())  # three photographs
     torch.nn.init.constant_(refinement.rotation[:1], 0.1)
     assert float(refinement.penalty().detach()) == pytest.approx(0.5 * 3 * 0.01 / 3)
     assert SE3Delta(weight=0.0).penalty() is None
+    rays = a_step(ball_scene(), NoRefinement()).rays
+    assert not list(rays.parameters())
+    assert not rays.state_dict()
+    assert rays.penalty() is None
+    assert rays.refined((0, 1, 2)) is None
 
 
 @pytest.mark.parametrize(("settings", "said"), [
@@ -215,3 +222,73 @@ def test_a_restart_puts_the_cameras_back():
     step.restart(torch.optim.SGD(step.rays.parameters(), lr=1.0))
     assert torch.equal(step.rays.cameras.c2w, scene.cameras.c2w)
     assert torch.equal(step.rays.refined((0, 1, 2)).c2w[:3], scene.cameras.c2w[:3])
+
+
+@pytest.mark.parametrize("blended", [1.0, 0.5])
+def test_a_camera_before_packed_samples_has_the_gradient_of_the_reference_in_float64(blended):
+    torch.manual_seed(0)
+    scene = replace(ball_scene(), refined=True)
+    encoder = HashGridEncoder(
+        num_levels=3, log2_table_size=10, min_resolution=4, max_resolution=16, blend_in=0.0 if blended == 1.0 else 0.5
+    )
+    field = NGPField(encoder, SphericalHarmonicsEncoder(3), width=16)
+    level = RaggedLevel(OccupancySampler(resolution=8, num_steps=32, opaque_below=0.1), field)
+    level.sampler.fit_to(scene)
+    field.fit_to(scene)
+    torch.nn.init.normal_(encoder.table, std=0.3)
+    encoder.on_step(StepContext(0.5 * blended, 0, 0))
+    motion = SE3Delta()
+    motion.fit_to(scene)
+    rays = RayGenerator(scene.cameras, scene.near, scene.far, motion)
+    pixels = all_pixels(scene.cameras, 1).map(torch.Tensor.flatten)
+    random = batch_random(7, pixels.x.shape[0], torch.device("cpu"))
+    weight = torch.rand(pixels.x.shape[0], 3)
+
+    (weight * level(rays(pixels), None, [], random).rgb).sum().backward()
+
+    exact_rays, exact_field = copy.deepcopy(rays).double(), copy.deepcopy(field).double()
+    exact_rays.zero_grad()
+    samples, features = visible_samples(level.sampler, level.field, rays(pixels), random)
+    assert features is not None
+    samples = replace(samples, starts=samples.starts.double(), ends=samples.ends.double())
+    bundle = exact_rays(pixels)
+    output = exact_field(ragged_points(bundle, samples, None))
+    output = replace(output, density=output.density.double(), rgb=output.rgb.double())
+    (weight * composite_ragged(output, samples, bundle, None).rgb).sum().backward()
+    for found, exact in zip(rays.parameters(), exact_rays.parameters(), strict=True):
+        assert float(exact.grad[1].abs().min()) > 1e-3
+        torch.testing.assert_close(found.grad.double(), exact.grad, rtol=1e-3, atol=1e-4)
+
+
+STEP = 1e-3
+
+
+def test_a_camera_has_the_gradients_of_finite_differences():
+    torch.manual_seed(0)
+    scene = ball_scene(size=16)
+    encoder = HashGridEncoder(num_levels=2, log2_table_size=12, min_resolution=4, max_resolution=6)
+    # Contracted, so that no ray has an end that moves with it.
+    field = NGPField(encoder, SphericalHarmonicsEncoder(3), width=16, density_bias=0.5, contraction=True)
+    torch.nn.init.normal_(encoder.table, std=0.5)
+    level, refinement = DenseLevel(StratifiedSampler(48), field), SE3Delta()
+    refinement.fit_to(scene)
+    rays = RayGenerator(scene.cameras, scene.near, scene.far, refinement)
+    y, x = torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij")
+    pixels = PixelIndex(torch.zeros(256, dtype=torch.int64), x.flatten(), y.flatten())
+    weight = torch.rand(256, 3)
+
+    def loss():
+        return (weight * level(rays(pixels), torch.ones(256, 3), [], None).rgb).mean()
+
+    loss().backward()
+    for parameter in (refinement.rotation, refinement.shift):
+        for axis in range(3):
+            ends = []
+            for step in (STEP, -2 * STEP):
+                with torch.no_grad():
+                    parameter[0, axis] += step
+                    ends.append(float(loss()))
+            with torch.no_grad():
+                parameter[0, axis] += STEP
+            slope = (ends[0] - ends[1]) / (2 * STEP)
+            assert abs(float(parameter.grad[0, axis]) - slope) < 6e-5 + 0.03 * abs(slope), (axis, slope)

@@ -1,11 +1,14 @@
 import logging
+import signal
 from types import SimpleNamespace
 
 import torch
-from lightning.pytorch import Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from nerf_lightning.nerf.types.rays import PixelIndex
 from nerf_lightning.training.callbacks.collapse_guard import CollapseGuard, is_constant
+from nerf_lightning.training.callbacks.stop_signals import StopSignals
+from nerf_lightning.training.launch.preemption import stop_signals
 from nerf_lightning.training.step_output import StepOutput
 
 
@@ -81,12 +84,40 @@ def test_the_end_of_the_crop_is_watched_too():
     assert system.restarts == 1
 
 
-def test_constant_photographs_are_no_collapse():
+def test_constant_photographs_are_no_collapse_and_a_random_background_does_not_hide_one():
     flat = torch.full((64, 3), 0.5)
     assert not is_constant({"target": flat, "foreground": torch.zeros(64, 3), "weight": torch.ones(64)}, 0.02)
-
-
-def test_a_random_background_does_not_hide_a_collapse():
-    """The rendered colour varies with the background; the field's own light does not."""
+    # The rendered colour varies with the background; the field's own light does not.
     step = {"target": torch.rand(64, 3), "foreground": torch.full((64, 3), 0.3), "weight": torch.ones(64)}
     assert is_constant(step, 0.02)
+
+
+class Line(LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(1, 1)
+
+    def training_step(self, batch, index):
+        return self.layer(batch).sum()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+class Batches:
+    def __len__(self):
+        return 3
+
+    def __iter__(self):
+        return iter([torch.ones(1)] * 3)
+
+
+def test_after_a_training_every_signal_does_what_it_did_before(tmp_path):
+    before = {number: signal.getsignal(number) for number in stop_signals()}
+    trainer = Trainer(
+        default_root_dir=tmp_path, max_steps=2, accelerator="cpu", logger=False, callbacks=[StopSignals()],
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(Line(), Batches())
+    assert trainer.global_step == 2
+    assert {number: signal.getsignal(number) for number in stop_signals()} == before

@@ -75,7 +75,7 @@ def test_a_failure_is_raised_once_somebody_asks(tmp_path, monkeypatch, ask):
     ask(writer)
 
 
-def test_a_failure_is_raised_at_the_next_save(tmp_path, monkeypatch):
+def test_a_failure_is_raised_at_the_next_save_or_told_at_the_very_end(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(checkpoint_io, "write_checkpoint", fail)
     writer = AtomicCheckpointIO()
     writer.save_checkpoint({}, tmp_path / "last.ckpt")
@@ -83,10 +83,6 @@ def test_a_failure_is_raised_at_the_next_save(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"no space for last\.ckpt"):
         writer.save_checkpoint({}, tmp_path / "best.ckpt")
     writer.teardown()
-
-
-def test_at_the_very_end_a_failure_is_told_and_hides_no_other_error(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(checkpoint_io, "write_checkpoint", fail)
     writer = AtomicCheckpointIO()
     writer.save_checkpoint({}, tmp_path / "last.ckpt")
     writer.teardown()

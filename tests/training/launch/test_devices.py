@@ -1,16 +1,21 @@
-"""Machines that we do not have: GPUs that cannot be used, CPUs that nobody knows."""
+"""Machines that we do not have: GPUs that cannot be used, CPUs that nobody knows, and which precision suits them."""
 
 import logging
 import platform
 
 import pytest
 import torch
+from support.scenes import tiny_model
+from support.static_models import fast_model
 
+from nerf_lightning.compute import devices
 from nerf_lightning.compute.devices import working_device
 from nerf_lightning.config.messages import paragraph
 from nerf_lightning.evaluation import protocol as environment
 from nerf_lightning.messages.errors import InputError
+from nerf_lightning.nerf import matmul_precision
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
+from nerf_lightning.training.launch.trainer import TrainerSettings
 
 CHOSEN = ("cuda", "Old GPU, found")
 
@@ -39,21 +44,16 @@ def test_a_gpu_that_cannot_be_used_leaves_the_work_to_the_cpu_unless_it_was_aske
     assert "trainer=cpu" in str(refused.value)
 
 
-def test_a_cpu_is_not_tried(monkeypatch):
+def test_a_cpu_is_not_tried_and_one_that_nobody_knows_has_no_bfloat16_and_no_name(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", too_new)
     assert working_device(("cpu", "as asked"), "cpu") == ("cpu", "as asked")
 
-
-def test_a_cpu_that_torch_does_not_know_has_no_bfloat16(monkeypatch):
     def unknown():
         raise RuntimeError("unsupported CPU")
 
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", unknown)
     monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported")
     assert not cpu_multiplies_bfloat16.__wrapped__()
-
-
-def test_a_cpu_without_a_name_is_unknown(monkeypatch):
     monkeypatch.setattr(environment.Path, "read_text", lambda *given, **options: "flags: none\n")
     monkeypatch.setattr(platform, "processor", lambda: "")
     monkeypatch.setattr(platform, "machine", lambda: "")
@@ -63,10 +63,7 @@ def test_a_cpu_without_a_name_is_unknown(monkeypatch):
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
-        (
-            torch.OutOfMemoryError("CUDA out of memory. GPU 0 has\n a total"),
-            "CUDA out of memory",
-        ),
+        (torch.OutOfMemoryError("CUDA out of memory. GPU 0 has\n a total"), "CUDA out of memory"),
         (MemoryError(), "Python got none"),
         (MemoryError("Unable to allocate 8.00 TiB for an array"), "Unable to allocate 8.00 TiB for an array"),
     ],
@@ -77,3 +74,64 @@ def test_a_machine_that_runs_out_of_memory_ends_with_one_paragraph(error, reason
     assert told.startswith(f"There is no memory for this: {reason}. Use a smaller model")
     assert "\n" not in told
     assert paragraph(RuntimeError("a mistake of ours"), "train") is None
+
+
+@pytest.fixture
+def slow_bfloat16(monkeypatch):
+    """A CPU that multiplies bfloat16 natively, and wide matrices slower than in float32."""
+    monkeypatch.setattr(devices, "cpu_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(devices, "cpu_gains_by_bfloat16", lambda: False)
+
+
+def products_of(model):
+    return {level.field.matmul_precision for level in model.levels.values()}
+
+
+def test_wide_layers_are_multiplied_in_float32_where_bfloat16_is_slower(slow_bfloat16):
+    settings = TrainerSettings(accelerator="cpu")
+    assert products_of(settings.prepare(fast_model())) == {"bfloat16"}
+    assert products_of(settings.prepare(tiny_model())) == {"float32"}
+    assert (settings.precision, "slower for layers as wide as this model's" in settings.describe()) == ("32-true", True)
+    assert products_of(settings.prepare(fast_model())) == {"bfloat16"}  # whatever was prepared before
+
+
+def test_what_was_asked_for_or_begun_stays(slow_bfloat16, monkeypatch):
+    assert products_of(TrainerSettings(accelerator="cpu", precision="bf16-mixed").prepare(tiny_model())) == {"bfloat16"}
+    resumed = TrainerSettings(accelerator="cpu")
+    resumed.keep_precision("bf16-mixed")
+    assert products_of(resumed.prepare(tiny_model())) == {"bfloat16"}
+    monkeypatch.setenv("NERF_LIGHTNING_PRECISION", "bf16-mixed")
+    assert products_of(TrainerSettings(accelerator="cpu").prepare(tiny_model())) == {"bfloat16"}
+
+
+@pytest.mark.parametrize(
+    ("name", "native", "amx", "gains"),
+    [
+        ("Intel Xeon", True, False, False),
+        ("Intel Xeon", True, True, True),
+        ("AMD EPYC 9004", True, False, True),
+        ("Intel Core i7", False, False, False),
+    ],
+)
+def test_who_gains_by_bfloat16(name, native, amx, gains, monkeypatch):
+    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: native)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": name}, raising=False)
+    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__() == gains
+
+
+def test_a_torch_that_names_no_cpu_takes_bfloat16_where_it_is_native(monkeypatch):
+    monkeypatch.setattr(matmul_precision, "cpu_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
+    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
+    assert matmul_precision.cpu_gains_by_bfloat16.__wrapped__()
+
+
+@pytest.mark.parametrize(("native", "used"), [(False, "32-true"), (True, "bf16-mixed")])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_gpu_without_bfloat16_takes_float32_and_says_so_once(native, used, begun, monkeypatch, caplog):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
+    asked = ("bf16-mixed", "as the run began") if begun else devices.choose_precision("bf16-mixed", "cuda")
+    assert devices.suited(*asked, "cuda", tiny_model())[0] == used
+    said = ["trainer.precision=bf16-mixed: this device has no native bfloat16, so float32 is used instead."]
+    assert caplog.messages == ([] if native or begun else said)

@@ -30,11 +30,15 @@ def test_a_missing_torch_xla_is_named_with_the_way_to_install_it_and_a_missing_t
         TrainerSettings(accelerator="tpu")
 
 
-def test_settings_of_other_devices_are_refused(tpu):
+def test_settings_and_models_that_do_not_fit_are_refused(tpu):
     with pytest.raises(InputError, match=r"trainer\.compile=true.*XLA compiles"):
         TrainerSettings(accelerator="tpu", compile=True)
     with pytest.raises(InputError, match=r"launched_by=torchrun.*one process drives all cores"):
         TrainerSettings(accelerator="tpu", launched_by="torchrun")
+    for model in MODELS.values():
+        xla.require_static_shapes(model())
+    with pytest.raises(InputError, match="model=fast_dense"):
+        xla.require_static_shapes(fast_model(RaggedLevel))
 
 
 def test_one_process_multiplies_in_bfloat16_and_tries_no_tiles(tpu):
@@ -42,10 +46,3 @@ def test_one_process_multiplies_in_bfloat16_and_tries_no_tiles(tpu):
     assert (settings.device_type, settings.precision, settings.measures_tile) == ("xla", "bf16-mixed", False)
     assert choose_precision("32-true", "xla")[0] == "32-true"
     assert num_processes(8, "xla") == num_processes("auto", "xla") == 1
-
-
-def test_models_whose_shapes_depend_on_data_are_refused():
-    for model in MODELS.values():
-        xla.require_static_shapes(model())
-    with pytest.raises(InputError, match="model=fast_dense"):
-        xla.require_static_shapes(fast_model(RaggedLevel))

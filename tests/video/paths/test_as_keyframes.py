@@ -1,20 +1,26 @@
-"""Any path as keyframes: the curve through them is the path."""
+"""Any path as keyframes, the curve through which is the path; what can be filmed of a forward-facing capture."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
+from support.posed_captures import Known, read, wall, write_llff
 from test_chosen_paths import frame, keyframe_file, keys
 
+from nerf_lightning.nerf.geometry.cameras import pinhole_cameras
 from nerf_lightning.nerf.geometry.frames import similarity
 from nerf_lightning.nerf.geometry.poses import rotation_from_quaternion
 from nerf_lightning.video.paths.as_keyframes import MOST, as_keyframes
+from nerf_lightning.video.paths.auto import AutoPath
+from nerf_lightning.video.paths.base import frame_of
 from nerf_lightning.video.paths.keyframe_curve import KeyframeCurve
 from nerf_lightning.video.paths.keyframe_path import KeyframePath
 from nerf_lightning.video.paths.keyframes import Keyframe
 from nerf_lightning.video.paths.orbit import Orbit
 from nerf_lightning.video.paths.pan import Pan
 from nerf_lightning.video.paths.spiral import Spiral
+from nerf_lightning.video.shots import in_front_of_near_plane
 
 
 def elsewhere():
@@ -69,3 +75,20 @@ def test_a_file_may_leave_out_what_a_player_needs(tmp_path):
 def test_one_camera_makes_no_path(tmp_path):
     assert as_keyframes(Orbit(1), frame()) == []
     assert as_keyframes(KeyframePath(keys(tmp_path), 1), frame()) == []
+
+
+def test_cameras_turn_away_step_over_the_plane_or_see_something():
+    # 90 degrees of view: turned by 40 its border still looks ahead, by 50 no longer.
+    c2w = torch.eye(4)[:3].repeat(4, 1, 1)
+    for view, degrees in enumerate((0.0, 40.0, 50.0)):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        c2w[view, :, :3] = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    c2w[3, 2, 3] = -1.01
+    assert in_front_of_near_plane(pinhole_cameras(c2w, 32.0, 64, 48)).tolist() == [True, True, False, False]
+
+
+def test_the_path_of_a_forward_facing_capture_can_be_filmed_and_a_circle_cannot(tmp_path):
+    scene = read("llff", write_llff(tmp_path, Known(c2w=wall())), space="ndc")
+    around = frame_of(scene.cameras, scene.aabb)
+    assert bool(in_front_of_near_plane(AutoPath(num_frames=8).cameras(around)).all())
+    assert not bool(in_front_of_near_plane(Orbit(num_frames=8).cameras(around)).all())

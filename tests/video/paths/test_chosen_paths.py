@@ -30,16 +30,9 @@ def frame(count=8, long=4.0, short=2.0, height=1.0) -> PathFrame:
     c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
     turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
     eyes = MIDDLE + flat @ turn.mT
-    return PathFrame(
-        center=MIDDLE,
-        up=UP,
-        radius=4.0,
-        focal=140.0,
-        width=100,
-        height=80,
-        poses=look_at(eyes, MIDDLE.expand_as(eyes), UP),
-        view_names=tuple(f"IMG_{number:02d}.jpg" for number in range(count)),
-    )
+    poses, names = look_at(eyes, MIDDLE.expand_as(eyes), UP), tuple(f"IMG_{number:02d}.jpg" for number in range(count))
+    size = {"radius": 4.0, "focal": 140.0, "width": 100, "height": 80}
+    return PathFrame(center=MIDDLE, up=UP, poses=poses, view_names=names, **size)
 
 
 def keyframe_file(tmp_path, *keyframes):
@@ -180,14 +173,11 @@ def test_a_closed_path_is_smooth_where_it_closes():
     assert float(velocity.norm(dim=-1).max() / velocity.norm(dim=-1).min()) < 2.5
 
 
-def test_a_far_photograph_takes_longer_to_reach():
+def test_a_far_photograph_takes_longer_to_reach_and_fov_is_a_setting_of_every_path():
     eyes = MIDDLE + torch.tensor([[0.0, 9.0, 0.0], [1.0, 9.0, 0.0], [11.0, 9.0, 0.0]], dtype=torch.float64)
     along_x = look_at(eyes, eyes - torch.tensor([0.0, 1.0, 0.0]).double(), UP)
     x = PhotographPath(111).cameras(replace(frame(), poses=along_x)).c2w[:, 0, 3]
     torch.testing.assert_close(x.diff(), torch.full((110,), 0.1, dtype=torch.float64))
-
-
-def test_fov_is_a_setting_of_every_path():
     cameras = PhotographPath(3, fov=90.0, width=60).cameras(frame())
     assert cameras.focal[0].tolist() == pytest.approx([30.0, 30.0])
 
@@ -195,10 +185,7 @@ def test_fov_is_a_setting_of_every_path():
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        (
-            PhotographPath(views=["IMG_99.jpg", 1]),
-            r"no photograph IMG_99.jpg. It has 8, numbered from 0, with names like",
-        ),
+        (PhotographPath(views=["IMG_99.jpg", 1]), r"no photograph IMG_99.jpg. It has 8, numbered from 0, with names"),
         (PhotographPath(views=[0, 8]), "no photograph 8. It has 8"),
         (PhotographPath(views=[3]), r"names 1 photograph\(s\), and a path needs two"),
         (Pan(view="IMG_7"), "path.view: the capture has no photograph IMG_7"),

@@ -17,7 +17,7 @@ from nerf_lightning.video.paths.keyframes import Keyframe, read_keyframes, write
 from nerf_lightning.video.paths.spline import hermite, rotations_along
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_what_is_written_is_read_back_and_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
     keyframes = [
         Keyframe((1.0, 2.0, 3.0), look_at=(0.0, 0.0, 0.5), up=(0.0, 1.0, 0.0), fov=40.0, time=0.0),
         Keyframe((1e-7, 2.0, 3.25), direction=(0.0, -1.0, 0.0), focal=123.5, time=1.5),
@@ -25,9 +25,6 @@ def test_what_is_written_is_read_back(tmp_path):
     write_keyframes(tmp_path / "keys.yaml", keyframes)
     assert read_keyframes(tmp_path / "keys.yaml") == keyframes
     assert [file.name for file in tmp_path.iterdir()] == ["keys.yaml"]
-
-
-def test_a_file_by_hand_may_be_a_bare_list_of_whole_numbers(tmp_path):
     (tmp_path / "keys.yaml").write_text(
         "- {position: [1, 0, 0], look_at: [0, 0, 0]}\n- {position: [0, 1, 0], direction: [0, -1, 0]}"
     )

@@ -20,26 +20,16 @@ from nerf_lightning.video.paths.sweep import Sweep
 
 def frame(up=(0.0, 0.0, 1.0), dtype=torch.float64, poses=None):
     poses = torch.eye(4, dtype=dtype)[None, :3] if poses is None else poses
-    return PathFrame(
-        center=torch.tensor([1.0, 2.0, 3.0], dtype=dtype),
-        up=torch.tensor(up, dtype=dtype),
-        radius=4.0,
-        focal=140.0,
-        width=100,
-        height=80,
-        poses=poses,
-    )
+    center, up = torch.tensor([1.0, 2.0, 3.0], dtype=dtype), torch.tensor(up, dtype=dtype)
+    return PathFrame(center=center, up=up, radius=4.0, focal=140.0, width=100, height=80, poses=poses)
 
 
-def test_the_first_cameras_stand_where_geometry_says():
+def test_the_first_cameras_stand_where_geometry_start_and_direction_say():
     cameras = Orbit(num_frames=4, elevation=30.0).cameras(frame())
     level, up = 4 * math.cos(math.pi / 6), 2.0
     offsets = [[level, 0, up], [0, level, up], [-level, 0, up], [0, -level, up]]
     wanted = torch.tensor(offsets, dtype=torch.float64) + frame().center
     torch.testing.assert_close(cameras.c2w[:, :, 3], wanted)
-
-
-def test_start_and_direction():
     eyes = Orbit(num_frames=4, elevation=0.0, start=90.0, turns=-1.0).cameras(frame()).c2w[:, :, 3] - frame().center
     wanted = torch.tensor([[0.0, 4, 0], [4, 0, 0], [0, -4, 0], [-4, 0, 0]], dtype=torch.float64)
     torch.testing.assert_close(eyes, wanted)
@@ -190,30 +180,24 @@ def test_a_sweep_stays_where_most_photographs_are():
     assert 198 < azimuth.max() < 200
 
 
-def test_what_looks_outwards_is_not_circled():
+def test_what_looks_outwards_is_not_circled_and_a_forward_facing_capture_is_looked_at_from_in_front():
     outwards = ring(range(0, 360, 30))
     outwards[:, :, 0], outwards[:, :, 2] = -outwards[:, :, 0], -outwards[:, :, 2]
     assert looks_at_center(frame(poses=ring(range(0, 360, 30))))
     assert not looks_at_center(frame(poses=outwards))
-
-
-def test_a_forward_facing_capture_is_looked_at_from_in_front():
     cameras = replace(pinhole_cameras(torch.eye(4)[None, :3], 70.0, 64, 48), ndc=torch.ones(1, 2))
     around = frame_of(cameras, torch.tensor([[-1.0] * 3, [1.0] * 3]))
     assert around.center.tolist() == [0.0, 0.0, -5.0]
     assert around.up.tolist() == [0.0, 1.0, 0.0]
 
 
-def test_a_film_is_no_larger_than_asked():
+def test_a_film_is_no_larger_than_asked_and_has_no_more_frames_than_agreed():
     large = replace(frame(), width=4000, height=3000, focal=3000.0)
     cameras = AutoPath(num_frames=2).cameras(large)
     assert (int(cameras.width[0]), int(cameras.height[0])) == (480, 360)
     assert float(cameras.focal[0, 0]) == pytest.approx(360.0)
     assert int(AutoPath(num_frames=2, width=800).cameras(large).height[0]) == 600
     assert int(AutoPath(num_frames=2).cameras(frame()).width[0]) == 100
-
-
-def test_a_film_has_no_more_frames_than_agreed():
     with pytest.raises(
         InputError, match=r"num_frames is 1000000000, .* at most 100,000 \(more with budgets\.film_frames\)"
     ):

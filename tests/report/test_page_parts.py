@@ -1,0 +1,93 @@
+import base64
+import io
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerf_lightning.messages.errors import InputError
+from nerf_lightning.report.curves import curve_drawings
+from nerf_lightning.report.embedding import LONGEST_SIDE, embedded, embedded_file, embedded_video
+from nerf_lightning.report.metrics import WITHOUT_LPIPS, tables, views_on_page
+from nerf_lightning.report.page import Report, write_report
+
+
+def decoded(picture):
+    content = base64.b64decode(picture.source.removeprefix("data:image/webp;base64,"))
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_small_pictures_are_kept_exactly_and_large_ones_shrunk():
+    random = np.random.default_rng(0)
+    picture = random.integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    assert (decoded(embedded(picture)) == picture).all()
+    assert embedded(picture).is_small
+    wide = embedded(np.zeros((10, 2 * LONGEST_SIDE, 3), dtype=np.uint8))
+    assert decoded(wide).shape == (5, LONGEST_SIDE, 3)
+    assert not wide.is_small
+
+
+def test_nothing_of_a_file_but_its_pixels_comes_into_a_page(tmp_path):
+    path = tmp_path / "a.png"
+    Image.new("RGB", (8, 8), "red").save(path)
+    path.write_bytes(path.read_bytes() + b"planted behind the end")
+    content = base64.b64decode(embedded_file(path).source.partition(",")[2])
+    assert b"planted" not in content
+
+
+def test_what_is_no_film_is_refused(tmp_path):
+    path = tmp_path / "a.mp4"
+    with pytest.raises(InputError, match="cannot be read"):
+        embedded_video(path, 100)
+    path.write_bytes(b"<html>")
+    with pytest.raises(InputError, match="not an mp4"):
+        embedded_video(path, 100)
+    path.write_bytes(b"\0\0\0\x18ftypisom")
+    assert embedded_video(path, 100).startswith("data:video/mp4;base64,")
+    with pytest.raises(InputError, match="max_megabytes"):
+        embedded_video(path, 5)
+
+
+def test_known_curves_are_drawn_together_and_unknown_names_are_not():
+    steps = [1, 2, 3]
+    curves = {
+        "train/psnr_fine": (steps, [10.0, 20.0, 25.0]),
+        "val/psnr": (steps, [10.0, 19.0, 23.0]),
+        "train/loss": (steps, [0.5, 0.0, math.nan]),
+        "memory/resident_gigabytes": ([], []),
+        "train/loss_$\\evil": (steps, [1.0, 1.0, 1.0]),
+        "<script>": (steps, [1.0, 1.0, 1.0]),
+    }
+    drawings = {drawing.label: drawing.address for drawing in curve_drawings(curves)}
+    assert [drawing.note for drawing in curve_drawings(curves)] == ["", ""]
+    assert list(drawings) == ["PSNR (dB)", "loss"]
+    kind, _, content = drawings["loss"].partition(",")
+    assert kind == "data:image/svg+xml;base64"
+    assert base64.b64decode(content).startswith(b"<?xml")
+    assert curve_drawings({}) == []
+
+
+def test_a_few_curves_are_drawn_of_thousands_and_it_is_said(tmp_path):
+    curves = {f"train/loss_{number}": ([1, 2], [1.0, 2.0]) for number in range(3000)}
+    (drawing,) = curve_drawings(curves)
+    assert len(drawing.address) < 200_000
+    assert drawing.note == "2988 more curves are in the run's TensorBoard files."
+    write_report(Report("a run", curves=[drawing]), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "<figcaption>2988 more curves are in the run&#x27;s TensorBoard files.</figcaption>" in text
+
+
+@pytest.mark.parametrize("name", [[], {}, "x" * 5000, "a\x00", 10**400], ids=lambda name: str(name)[:9])
+def test_views_of_no_name_are_missing(tmp_path, name):
+    metrics = {"per_image": [{"name": name}], "worst_views": [name], "pictures": [name]}
+    worst, spread, missing = views_on_page(metrics, tmp_path)
+    assert (worst, spread) == ([], [])
+    assert len(missing) == 2
+
+
+def test_the_page_says_what_lpips_needs_where_it_was_not_computed():
+    protocol = {"protocol": {"split": "test"}}
+    assert ("LPIPS", WITHOUT_LPIPS) in dict(tables(protocol | {"lpips": None}))["Protocol"]
+    assert ("LPIPS", WITHOUT_LPIPS) not in dict(tables(protocol | {"lpips": 0.1}))["Protocol"]
+    assert dict(tables({}))["Protocol"] == []

@@ -1,0 +1,97 @@
+"""Training time is that of the steps: no set-up, no pause; a budget of it ends a run, and days are said."""
+
+import json
+import os
+import signal
+import time
+from types import SimpleNamespace
+from unittest.mock import create_autospec
+
+import pytest
+from filelock import FileLock
+from lightning.pytorch import Trainer
+
+from nerf_lightning.commands.train_job.live_view import Clocked
+from nerf_lightning.runs import folder as folders
+from nerf_lightning.runs.folder import RunFolder
+from nerf_lightning.training.callbacks import training_time
+from nerf_lightning.training.callbacks.progress_bar import TrainingProgress
+from nerf_lightning.training.callbacks.time_budget import TimeBudget
+from nerf_lightning.training.callbacks.training_time import TrainingTime
+
+
+def test_steps_are_counted_and_pauses_are_not(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(training_time.time, "monotonic", lambda: now[0])
+    clock = TrainingTime()
+    assert isinstance(clock, Clocked)
+    trainer = create_autospec(Trainer, instance=True)
+    clock.on_train_start(trainer, None)
+    for passed, paused in ((2.0, 0.0), (62.0, 60.0)):
+        now[0] += passed
+        clock.leave_out(paused)
+        clock.on_train_batch_end(trainer, None, None, None, 0)
+    now[0] += 30.0
+    assert clock.seconds == 4.0
+
+
+def test_set_up_stands_beside_training_and_a_run_that_goes_on_counts_on(monkeypatch, tmp_path):
+    now = [0.0]
+    monkeypatch.setattr(folders.time, "monotonic", lambda: now[0])
+    (tmp_path / "run.json").write_text("{}")
+    for _ in range(2):
+        run = RunFolder(tmp_path, FileLock(tmp_path / "lock"), None, began=now[0])
+        now[0] += 29.5
+        run.trained(20.0)
+        now[0] += 5.0
+        run.note(finished_at_step=10)
+    note = json.loads((tmp_path / "run.json").read_text())
+    assert (note["training_seconds"], note["setup_seconds"], note["seconds"]) == (40.0, 19.0, 69.0)
+
+
+def trainer():
+    return create_autospec(Trainer, instance=True, estimated_stepping_batches=200_000)
+
+
+def a_system(step):
+    return SimpleNamespace(step=SimpleNamespace(progress=SimpleNamespace(step=step), num_steps=200_000))
+
+
+def test_a_resumed_run_takes_up_its_schedule_at_once_and_a_new_one_keeps_its_length():
+    # The fault: until the next estimate the learning rate would jump back to its start.
+    budget = TimeBudget(seconds=10.0)
+    budget.load_state_dict({"used": 5.0})
+    system = a_system(step=103)
+    budget.on_train_start(trainer(), system)
+    assert system.step.num_steps == 206
+    system = a_system(step=0)
+    TimeBudget(seconds=10.0).on_train_start(trainer(), system)
+    assert system.step.num_steps == 200_000
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGCONT"), reason="no process is stopped there")
+def test_a_stopped_process_uses_no_time(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    budget, system = TimeBudget(seconds=10.0), a_system(step=1)
+    former = signal.getsignal(signal.SIGCONT)
+    budget.on_train_start(trainer(), system)
+    for passed, woken in ((1.0, False), (3600.0, True), (1.0, False)):
+        now[0] += passed
+        if woken:
+            os.kill(os.getpid(), signal.SIGCONT)
+            now[0] += 2.0
+        budget.on_train_batch_end(trainer(), system, None, None, 0)
+    assert budget.used == 1.0 + 2.0 + 1.0
+    budget.teardown(trainer(), system, "fit")
+    assert signal.getsignal(signal.SIGCONT) == former
+
+
+def test_a_training_of_days_says_once_what_takes_minutes(caplog):
+    progress = TrainingProgress()
+    progress._warn_of_days(3600.0)
+    assert caplog.text == ""
+    for left in (3_265_128.0, 3_265_000.0):
+        progress._warn_of_days(left)
+    assert caplog.text.count("the training takes another 38 days") == 1
+    assert "budget.seconds=300 ends it in five" in caplog.text

@@ -1,0 +1,109 @@
+"""Tiles beside each other: the same gradients as in turn, the same bits every time; and which one is taken."""
+
+import copy
+
+import pytest
+import torch
+from support.scenes import ball_scene, tiny_model
+from support.static_models import fast_model
+from support.steps import make_step
+
+from nerf_lightning.data.ray_batches import RayBatches
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import add_all, defer_table_grads, interpolate
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.models.ragged_level import RaggedLevel
+from nerf_lightning.training.tile_size import fastest
+
+MODELS = {"nerf": lambda: tiny_model(density_bias=0.5), "fast": lambda: fast_model(RaggedLevel)}
+
+
+@pytest.fixture(params=MODELS)
+def model(request):
+    made = MODELS[request.param]()
+    made.fit_to(ball_scene())
+    made.update(0, 0)
+    return made
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def gradients_of(model, count, threads, backward=torch.Tensor.backward, tile_points=200):
+    """What a step of 64 rays leaves in the parameters' gradients, and what it has lost, on so many threads."""
+    threads(count)
+    step = make_step(tile_points, copy.deepcopy(model))
+    optimizer = step.new_optimizer()
+    optimizer.zero_grad()
+    seen = step.gradients(RayBatches(ball_scene(), step.progress, 0, 64).at(0, 0), backward)
+    counts = torch.cat([count.float() for count in step.model.sample_counts()] or [torch.zeros(1)])
+    return torch.cat([p.grad.flatten() for p in step.model.parameters()]), seen, counts
+
+
+def test_beside_each_other_they_are_those_of_one_after_the_other(model, threads):
+    alone, seen_alone, counts_alone = gradients_of(model, 1, threads)
+    beside, seen, counts = gradients_of(model, 3, threads)
+    assert float(alone.norm()) > 0
+    torch.testing.assert_close(beside, alone, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(seen.losses, seen_alone.losses)
+    torch.testing.assert_close(seen.foreground, seen_alone.foreground)
+    assert torch.equal(counts, counts_alone)
+
+
+def test_their_bits_are_the_same_every_time(model, threads):
+    first, *_ = gradients_of(model, 3, threads)
+    for _ in range(5):
+        assert torch.equal(gradients_of(model, 3, threads)[0], first)
+
+
+def test_a_trainer_that_scales_the_loss_scales_the_gradients(model, threads):
+    wanted, *_ = gradients_of(model, 2, threads)
+    got, *_ = gradients_of(model, 2, threads, lambda loss: (4.0 * loss).backward())
+    assert torch.equal(got, 4.0 * wanted)
+
+
+def test_the_gradients_of_a_table_can_be_held_back_and_added_later():
+    layout = hash_grid_layout(3, 8, 2, 16)
+    generator = torch.Generator().manual_seed(0)
+    table = torch.nn.Parameter(torch.rand(layout.offsets[-1], 2, generator=generator))
+    points = torch.rand(40, 3, generator=generator)
+    interpolate(table, points, layout).square().sum().backward()
+    wanted, table.grad = table.grad, None
+    with defer_table_grads() as held:
+        interpolate(table, points, layout).square().sum().backward()
+    assert table.grad is None
+    add_all(held)
+    assert torch.equal(table.grad, wanted)
+    add_all([*held, *held], scale=2.0)
+    torch.testing.assert_close(table.grad, 5.0 * wanted)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "best", "tried"),
+    [
+        # Overhead alone: the largest, and the next one shows that smaller ones are hopeless.
+        ({4: 8.0, 16: 2.0, 64: 1.0}, 64, [64, 64, 16, 16]),
+        # Large ones do not fit into the caches.
+        ({4: 1.2, 16: 1.0, 64: 5.0}, 16, [64, 64, 16, 16, 4, 4]),
+        # Hardly any gain: the smallest takes the least memory.
+        ({4: 1.03, 16: 1.0, 64: 1.0}, 4, [64, 64, 16, 16, 4, 4]),
+        ({4: 1.0}, 4, [4, 4]),
+    ],
+)
+def test_the_fastest_tile_is_found_without_trying_hopeless_ones(seconds, best, tried):
+    asked = []
+
+    def measured(tile):
+        asked.append(tile)
+        return seconds[tile]
+
+    assert fastest(tuple(seconds), measured) == best
+    assert asked == tried
+
+
+def test_one_slow_moment_does_not_decide():
+    moments = {4: [1.5, 1.5], 16: [9.0, 1.0], 64: [1.1, 9.0]}
+    assert fastest((4, 16, 64), lambda tile: moments[tile].pop(0)) == 16
