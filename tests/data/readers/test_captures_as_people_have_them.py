@@ -248,7 +248,7 @@ def model(where, pictures, kind=".bin"):
 
 
 ROOTS = {
-    "sparse/1 has more": (model("sparse/1", "images"), many_features, "", r"of 2 models the one with most photographs"),
+    "sparse/1 has more": (model("sparse/1", "images"), many_features, "", r"sparse/1 is read, of 2 models"),
     "flat": (model("", "", ".txt"), None, "", r"read as scene=colmap"),
     "undistorted": (model("distorted/sparse/0", "input"), None, "", r"read as scene=colmap"),
     "the model given": (write_colmap, None, "c/sparse/0", r"c: read as scene=colmap, for it has sparse/0"),
@@ -415,7 +415,7 @@ def test_the_cameras_size_tells_how_a_photograph_lies(tmp_path, plain, caplog, o
     assert_plain(scene, plain)
     assert torch.equal(scene.pixels.kept(4), torch.from_numpy(mask == 255))
     if orientation in (3, 6, 8):
-        said_once(caplog, rf"by the cameras' sizes, {9 if quarter else 0} are read turned")
+        said_once(caplog, rf"{9 if quarter else 0} are read so, since only then")
 
 
 def named_in(text):
