@@ -77,11 +77,7 @@ class SweepWatch(Callback):
         os.environ[NUM_JOBS] = _num_jobs(config.hydra)
         launcher = config.hydra.launcher._target_
         if launcher.endswith(LOCAL_LAUNCHERS):
-            # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local
-            # jobs are told nothing.
-            os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
-            if launcher.endswith(".LocalLauncher"):
-                os.environ.setdefault("OMP_NUM_THREADS", str(config.hydra.launcher.cpus_per_task or 1))
+            _share_cores(launcher, config.hydra.launcher)
             _pass_signals_on(sweep)
         _begun.append(sweep)
 
@@ -186,6 +182,14 @@ def _complain(bad: list[JobRecord], total: int, error: Exception | None) -> None
         raise InputError(message)
     log.error("nerf: %s", message)
     raise SystemExit(1)
+
+
+def _share_cores(launcher: str, settings: DictConfig) -> None:
+    # joblib divides them by its number of jobs and tells each job through OMP_NUM_THREADS; submitit's local jobs are
+    # told nothing.
+    os.environ.setdefault("LOKY_MAX_CPU_COUNT", str(num_cores()))
+    if launcher.endswith(".LocalLauncher"):
+        os.environ.setdefault("OMP_NUM_THREADS", str(settings.cpus_per_task or 1))
 
 
 def _pass_signals_on(sweep: Sweep) -> None:
