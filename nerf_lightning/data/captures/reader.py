@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar, get_args
 
@@ -92,7 +93,6 @@ class CaptureReader(Reader):
     allow_outside: bool = False
     verify: bool = False
     name: str = "capture"
-    _is_said = False
 
     @abstractmethod
     def capture(self) -> Capture:
@@ -171,14 +171,17 @@ class CaptureReader(Reader):
         Raises:
             InputError: there is no such folder, or several are such captures.
         """
+        return self._located_folder
+
+    @cached_property
+    def _located_folder(self) -> Path:
         folder = self.named_folder()
         found = located(folder, lambda path: path if self.found_in(path) else None)
         if len(found) > 1:
             choice = listed((f"scene.root={path}" for path in found), 4)
             raise InputError(f"{self.root} holds {len(found)} captures. Choose one of them: {choice}.")
-        if found and found[0] != folder and not self._is_said:
+        if found and found[0] != folder:
             log.info("%s holds no capture of scene=%s; %s, which does, is read", self.root, self.name, found[0])
-            self._is_said = True
         return found[0] if found else folder
 
     def named_folder(self) -> Path:

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from nerf_lightning.data.sfm.settings import (
     tiles_of,
 )
 from nerf_lightning.files.made_folders import make_folder
-from nerf_lightning.messages.errors import InputError
+from nerf_lightning.messages.errors import InputError, require_extra
 from nerf_lightning.messages.escaping import listed
 
 Report = Callable[[str, float], None]
@@ -60,13 +59,7 @@ class SparseModel:
 
 def require_pycolmap() -> Any:
     """Return pycolmap, or say how it is installed."""
-    try:
-        return import_module("pycolmap")
-    except ImportError as error:
-        raise InputError(
-            "Finding camera poses needs pycolmap, which is not installed or does not load here "
-            f"({error}). Install it with: pip install 'nerf-lightning[colmap]'"
-        ) from error
+    return require_extra("pycolmap", "colmap", "Finding camera poses")
 
 
 def reconstruct(
