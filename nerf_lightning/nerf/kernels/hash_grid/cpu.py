@@ -211,8 +211,23 @@ def _find(p, resolution, hashed, mask, e, w):
         _find_dense(p, resolution, e, w)
 
 
-# Four features are kept in registers as one vector: written one by one, the compiler must fear that what it stores is
-# what it loads next, and takes a third longer. An unsigned index needs no test for a negative one.
+# Two or four features are kept in registers as one vector: written one by one, the compiler must fear that what it
+# stores is what it loads next, and takes up to seven times as long. An unsigned index needs no test for a negative one.
+@njit(fastmath=True)
+@no_type_check
+def _take_two(table, index, weight, a, b):
+    entry = np.uintp(index)
+    return a + weight * table[entry, 0], b + weight * table[entry, 1]
+
+
+@njit(fastmath=True)
+@no_type_check
+def _give_two(into, index, weight, a, b):
+    entry = np.uintp(index)
+    p, q = into[entry, 0], into[entry, 1]
+    into[entry, 0], into[entry, 1] = p + weight * a, q + weight * b
+
+
 @njit(fastmath=True)
 @no_type_check
 def _take(table, index, weight, a, b, c, d):
@@ -249,6 +264,18 @@ def _gather(table, offset, e, w, i, out, row, column, lanes):
         a, b, c, d = _take(table, offset + e[7 * POINTS + i], w[7 * POINTS + i], a, b, c, d)
         out[row, column], out[row, column + 1], out[row, column + 2], out[row, column + 3] = a, b, c, d
         return
+    if len(lanes) == 2:
+        a = b = ZERO
+        a, b = _take_two(table, offset + e[i], w[i], a, b)
+        a, b = _take_two(table, offset + e[POINTS + i], w[POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[2 * POINTS + i], w[2 * POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[3 * POINTS + i], w[3 * POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[4 * POINTS + i], w[4 * POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[5 * POINTS + i], w[5 * POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[6 * POINTS + i], w[6 * POINTS + i], a, b)
+        a, b = _take_two(table, offset + e[7 * POINTS + i], w[7 * POINTS + i], a, b)
+        out[row, column], out[row, column + 1] = a, b
+        return
     for f in range(len(lanes)):
         total = ZERO
         for k in range(i, 8 * POINTS, POINTS):
@@ -263,6 +290,11 @@ def _scatter(into, offset, e, w, i, grad, row, column, lanes):
         a, b, c, d = grad[row, column], grad[row, column + 1], grad[row, column + 2], grad[row, column + 3]
         for k in range(i, 8 * POINTS, POINTS):
             _give(into, offset + e[k], w[k], a, b, c, d)
+        return
+    if len(lanes) == 2:
+        a, b = grad[row, column], grad[row, column + 1]
+        for k in range(i, 8 * POINTS, POINTS):
+            _give_two(into, offset + e[k], w[k], a, b)
         return
     for k in range(i, 8 * POINTS, POINTS):
         for f in range(len(lanes)):

@@ -30,7 +30,7 @@ PRODUCT = ("vdpbf16ps $3, $2, $0", "=v,0,v,v")
 ROUND = ("vcvtneps2bf16 $1, $0", "=v,v")
 
 
-def _at(builder: Any, address: Any, kind: Any, byte: Any = None) -> Any:
+def pointer_to(builder: Any, address: Any, kind: Any, byte: Any = None) -> Any:
     """A pointer to what stands at an address, so many bytes on."""
     return builder.inttoptr(address if byte is None else builder.add(address, byte), kind.as_pointer())
 
@@ -86,7 +86,10 @@ def multiply_block(
             three = ir.FunctionType(FLOATS, [FLOATS, FLOATS, FLOATS])
             fused = cgutils.get_or_insert_function(builder.module, three, "llvm.fmuladd.v16f32")
         addresses = [
-            [_at(builder, y, FLOATS, builder.add(_times(builder, row, r), row.type(64 * b))) for b in range(width)]
+            [
+                pointer_to(builder, y, FLOATS, builder.add(_times(builder, row, r), row.type(64 * b)))
+                for b in range(width)
+            ]
             for r in range(count)
         ]
         sums = [[cgutils.alloca_once(builder, FLOATS) for _ in range(width)] for _ in range(count)]
@@ -98,9 +101,11 @@ def multiply_block(
         with cgutils.for_range(builder, words) as loop:
             from_w = builder.add(w, builder.mul(loop.index, row))
             from_x = builder.add(x, builder.mul(loop.index, next_word))
-            columns = [builder.load(_at(builder, from_w, numbers, w.type(64 * b)), align=4) for b in range(width)]
+            columns = [
+                builder.load(pointer_to(builder, from_w, numbers, w.type(64 * b)), align=4) for b in range(width)
+            ]
             for r in range(count):
-                one = builder.load(_at(builder, from_x, number, _times(builder, next_row, r)), align=4)
+                one = builder.load(pointer_to(builder, from_x, number, _times(builder, next_row, r)), align=4)
                 spread = builder.shuffle_vector(builder.insert_element(undefined, one, WORD(0)), undefined, lanes)
                 for b in range(width):
                     before = builder.load(sums[r][b])
@@ -122,9 +127,9 @@ def _write(builder: Any, kind: Any, numbers: Any, address: Any) -> None:
     """Write 16 float32 as numbers of a kind."""
     if _is_bfloat16(kind):
         rounded = builder.call(ir.InlineAsm(ir.FunctionType(HALVES, [FLOATS]), *ROUND), [numbers])
-        builder.store(rounded, _at(builder, address, HALVES), align=4)
+        builder.store(rounded, pointer_to(builder, address, HALVES), align=4)
     else:
-        builder.store(numbers, _at(builder, address, FLOATS), align=4)
+        builder.store(numbers, pointer_to(builder, address, FLOATS), align=4)
 
 
 @intrinsic
@@ -132,7 +137,7 @@ def round_vector(context: Any, kind: Any, source: Any, target: Any) -> Any:
     """Round 16 float32 to numbers of a kind."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        _write(builder, kind, builder.load(_at(builder, arguments[1], FLOATS), align=4), arguments[2])
+        _write(builder, kind, builder.load(pointer_to(builder, arguments[1], FLOATS), align=4), arguments[2])
         return context.get_dummy_value()
 
     return types.void(kind, ADDRESS, ADDRESS), code
@@ -143,7 +148,7 @@ def round_positive(context: Any, kind: Any, source: Any, target: Any) -> Any:
     """Round 16 float32 to numbers of a kind, the negative ones to 0."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        numbers = builder.load(_at(builder, arguments[1], FLOATS), align=4)
+        numbers = builder.load(pointer_to(builder, arguments[1], FLOATS), align=4)
         zeros = ir.Constant(FLOATS, [0.0] * LANES)
         negative = builder.fcmp_ordered("<", numbers, zeros)  # what is not a number stays that
         _write(builder, kind, builder.select(negative, zeros, numbers), arguments[2])
@@ -158,8 +163,8 @@ def round_where_on(context: Any, kind: Any, source: Any, active: Any, target: An
     lanes = HALVES if _is_bfloat16(kind) else WORDS
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        numbers = builder.load(_at(builder, arguments[1], FLOATS), align=4)
-        active = builder.load(_at(builder, arguments[2], lanes), align=4)
+        numbers = builder.load(pointer_to(builder, arguments[1], FLOATS), align=4)
+        active = builder.load(pointer_to(builder, arguments[2], lanes), align=4)
         off = builder.icmp_unsigned("==", active, ir.Constant(lanes, [0] * LANES))
         _write(builder, kind, builder.select(off, ir.Constant(FLOATS, [0.0] * LANES), numbers), arguments[3])
         return context.get_dummy_value()
@@ -172,13 +177,13 @@ def pair_rows(context: Any, upper: Any, lower: Any, target: Any) -> Any:
     """Write 16 words, each a number of one row and that below it, from 16 bfloat16 numbers of each."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        rows = [builder.load(_at(builder, address, HALVES), align=4) for address in arguments[:2]]
+        rows = [builder.load(pointer_to(builder, address, HALVES), align=4) for address in arguments[:2]]
         order = ir.Constant(
             ir.VectorType(ir.IntType(32), 2 * LANES), [n // 2 + LANES * (n % 2) for n in range(2 * LANES)]
         )
         pairs = builder.shuffle_vector(*rows, order)
         both = ir.VectorType(ir.IntType(16), 2 * LANES)
-        builder.store(pairs, _at(builder, arguments[2], both), align=4)
+        builder.store(pairs, pointer_to(builder, arguments[2], both), align=4)
         return context.get_dummy_value()
 
     return types.void(ADDRESS, ADDRESS, ADDRESS), code
