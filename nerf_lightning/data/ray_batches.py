@@ -17,6 +17,7 @@ from nerf_lightning.data.pixels.placement import sent
 from nerf_lightning.data.target_views import rays_of_few_views
 from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.geometry.cameras import all_pixels
+from nerf_lightning.nerf.kernels.threads import torch_on_one_thread
 from nerf_lightning.nerf.randomness import fold, permute
 from nerf_lightning.nerf.types.progress import Progress
 from nerf_lightning.nerf.types.rays import Batch, PixelIndex
@@ -201,6 +202,7 @@ class RayBatches:
         for batch in made_ahead(make, lambda: (progress.attempt, progress.rays_seen, progress.batch_rays)):
             yield batch.to(device, non_blocking=device.type == "cuda")
 
+    @torch_on_one_thread()
     def at(self, attempt: int, rays_seen: int, batch_rays: int | None = None) -> Batch:
         """Return the batch that follows `rays_seen` rays of an attempt; None: as large as batches are now."""
         pixels = self.pixels_at(attempt, rays_seen, batch_rays)

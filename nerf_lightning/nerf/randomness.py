@@ -8,18 +8,22 @@ and every device agrees.
 
 import zlib
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
+
+Word = TypeVar("Word", int, Tensor)
 
 WORD = 0xFFFFFFFF
 FEISTEL_ROUNDS = 6
 
 
-def mix(word: Int[Tensor, "*n"]) -> Int[Tensor, "*n"]:
+def mix(word: Word) -> Word:
     """Scramble 32-bit words: a bijection in which each input bit changes half of the output bits.
 
     >>> mix(torch.tensor([0, 1, 2])).unique().numel()
@@ -45,11 +49,11 @@ def fold(*parts: int | str) -> int:
     >>> fold(0, "rays") != fold(1, "rays")
     True
     """
-    key = torch.tensor(0x243F6A88)
+    key = 0x243F6A88
     for part in parts:
         word = purpose_word(part) if isinstance(part, str) else part & WORD
-        key = mix(key ^ mix(torch.tensor(word)) ^ 0x5A5A5A5A)
-    return int(key)
+        key = mix(key ^ mix(word) ^ 0x5A5A5A5A)
+    return key
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,9 @@ class RayRandom(TensorStruct):
 
     def uniform(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
         """Return `count` numbers per ray, uniform on [0, 1), in steps of 2^-24."""
+        kernels = cpu_backend("random.cpu", self.slots.device) if self.slots.dim() == 1 else None
+        if kernels is not None:
+            return kernels.uniform(self.key, self.slots, purpose_word(purpose), count)
         return self.along(count).uniform(purpose)
 
     def normal(self, purpose: str, count: int) -> Float[Tensor, "*rays {count}"]:
@@ -118,6 +125,9 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
     """
     rows = max(1, int(size**0.5))
     columns = -(-size // rows)
+    kernels = cpu_backend("random.cpu", index.device) if key.numel() == 1 and index.dim() == 1 else None
+    if kernels is not None:
+        return kernels.permute(index, rows, columns, size, _round_words(key.view(())))
     position = _feistel(index, rows, columns, key)
     while (outside := (position >= size).nonzero(as_tuple=True))[0].numel():
         position[outside] = _feistel(position[outside], rows, columns, key.expand(position.shape)[outside])
@@ -127,11 +137,15 @@ def permute(index: Int[Tensor, "*n"], size: int, key: Int[Tensor, "*#n"]) -> Int
 def _feistel(index: Tensor, rows: int, columns: int, key: Tensor) -> Tensor:
     row = index // columns
     column = index - row * columns
-    # As many words as there are keys: a batch that lies in one epoch has one.
-    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
-    for number, round_key in enumerate(mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)):
+    for number, round_key in enumerate(_round_words(key)):
         if number % 2:
             column = (column + mix(round_key ^ row)) % columns
         else:
             row = (row + mix(round_key ^ column)) % rows
     return row * columns + column
+
+
+def _round_words(key: Int[Tensor, "*n"]) -> Int[Tensor, "rounds *n"]:
+    # As many words as there are keys: a batch that lies in one epoch has one.
+    rounds = torch.arange(FEISTEL_ROUNDS, device=key.device) * 0x1B873593
+    return mix((key + rounds.view(-1, *[1] * key.dim())) & WORD)

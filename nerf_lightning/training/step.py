@@ -5,6 +5,7 @@ What a tile of rays needs stays in the cache, and the sum of the tiles' gradient
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from nerf_lightning.messages.errors import InputError
 from nerf_lightning.nerf.corrections.base import Correction
 from nerf_lightning.nerf.corrections.none import NoCorrection
 from nerf_lightning.nerf.encoders.base import tables_of
-from nerf_lightning.nerf.kernels.threads import threads_on
+from nerf_lightning.nerf.kernels.threads import threads_on, torch_on_one_thread
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
 from nerf_lightning.nerf.models.base import Model
@@ -253,6 +254,12 @@ class TrainStep:
             backward: adds a loss's gradients to the parameters'.
             measure_gradients: whether to measure the gradients' norms, before they are clipped.
         """
+        # Whole batches are for torch's threads; what is cut into tiles is shared out here.
+        alone = self.tile_points is not None and self.device.type == "cpu"
+        with torch_on_one_thread() if alone else nullcontext():
+            return self._take(batch, optimizer, backward, measure_gradients)
+
+    def _take(self, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool) -> StepOutput:
         progress = self.progress
         optimizer.zero_grad()
         if self.num_steps is not None:
@@ -400,11 +407,11 @@ class TrainStep:
 
         together = self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
-        if threads > 1:
+        if threads > 1 and not self.model.shares_out_rays(device, self.rays.refinement.moves()):
             parts = list(tiles(num_rays, tile_rays, together, multiple=threads))
             lost = parallel_backward(lose, parts, backward, self._parameters())
         else:
-            lost = sequential_backward(lose, list(tiles(num_rays, tile_rays, together)), backward)
+            lost = sequential_backward(lose, list(tiles(num_rays, threads * tile_rays, together)), backward)
         return StepOutput(
             losses=torch.stack([each.levels for each in lost]).sum(0),
             terms={name: torch.stack([each.terms[name] for each in lost]).sum(0) for name in lost[0].terms},

@@ -11,6 +11,8 @@ from nerf_lightning.training.step import TrainStep
 
 CPU_TILES = (4_096, 8_192, 16_384, 65_536, 262_144)
 GPU_TILES = (1 << 18, 1 << 20, 1 << 22)
+# Points of a tile whose rays kernels take one after the other through their caches: it bounds memory alone.
+WHOLE_RAYS_TILE = 262_144
 # A tile must be better by so much to be preferred to a smaller one, which takes less memory.
 GAIN = 0.95
 # Smaller tiles than one that takes so much longer than the fastest are not tried: they only add to what made it slow.
@@ -26,6 +28,8 @@ log = logging.getLogger(__name__)
 def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> int:
     """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
     step.to(settings.device)
+    if step.model.shares_out_rays(step.device, step.rays.refinement.moves()):
+        return WHOLE_RAYS_TILE
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = _rays_in_time(settings, step, batch)
     points = num_rays * step.model.points_per_ray(training=True)

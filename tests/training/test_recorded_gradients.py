@@ -18,7 +18,7 @@ from nerf_lightning.training.recorded_gradients import cuda_graph
 from nerf_lightning.training.step_output import StepOutput
 
 CPU = torch.device("cpu")
-KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "ragged.cpu")
+KERNELS = ("adam.cpu", "hash_grid.cpu", "march.cpu", "mlp.cpu", "ragged.cpu", "random.cpu")
 SETTING = "trainer.cuda_graph=true"
 
 

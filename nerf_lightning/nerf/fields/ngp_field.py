@@ -149,14 +149,21 @@ class NGPField(Field):
         return [*density, *_layer_by_layer(self.color_mlp, self._with_direction(features, points))[:-1]]
 
     def parts(self) -> FieldParts | None:
-        """Return table and weights, of a field over a box whose colours are the same for all photographs."""
-        grid, directions = self.position_encoder.grid(), self.direction_encoder
-        if type(self) is not NGPField:  # which may compute something else
+        """Return what kernels of whole rays compute with; None while the encoder does not look up a grid alone."""
+        grid = self.position_encoder.grid()
+        if grid is None or type(self) is not NGPField:  # a class of another name may compute something else
             return None
-        if grid is None or self.contracted.is_on() or self.appearance or list(directions.parameters()):
-            return None
-        density, color = list(self.density_mlp), list(self.color_mlp)
-        return FieldParts(self.aabb, *grid, float(self.bias), density, color, directions, self.least_slope)
+        return FieldParts(
+            self.aabb,
+            *grid,
+            float(self.bias),
+            list(self.density_mlp),
+            list(self.color_mlp),
+            lambda rays: self._shared_along(Points(rays.origins, rays.view_directions, rays.photograph)),
+            self.least_slope,
+            self.contracted.is_on(),
+            ray_features_learn=bool(self.appearance or list(self.direction_encoder.parameters())),
+        )
 
     def reset_parameters(self) -> None:
         """Draw every parameter anew from torch's generator."""
@@ -169,9 +176,16 @@ class NGPField(Field):
 
     def _with_direction(self, features: Tensor, points: Points) -> Tensor:
         """Return what the colour is made of: what the density's MLP hands over, the direction, and the code."""
-        direction = self.direction_encoder(points.directions).to(features.dtype)
-        seen = [direction] if not self.appearance else [direction, self._code(points).to(features.dtype)]
-        return torch.cat([features, *(each.expand(*features.shape[:-1], each.shape[-1]) for each in seen)], dim=-1)
+        shared = self._shared_along(points).to(features.dtype)
+        return torch.cat([features, shared.expand(*features.shape[:-1], shared.shape[-1])], dim=-1)
+
+    def _shared_along(self, points: Points) -> Float[Tensor, "*#points features"]:
+        """Return what all samples of a ray share: the features of the direction, and the code."""
+        direction = self.direction_encoder(points.directions)
+        if not self.appearance:
+            return direction
+        code = self._code(points).to(direction.dtype)
+        return torch.cat([direction, code.expand(*direction.shape[:-1], self.appearance)], dim=-1)
 
     def _code(self, points: Points) -> Tensor:
         return self.codes[self.trained].mean(dim=0) if points.photograph is None else self.codes[points.photograph]

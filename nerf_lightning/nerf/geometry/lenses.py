@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.panoramas import panorama_stretches, project_panorama, unproject_panorama
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.types.scene import LensModel
 
 NEWTON_STEPS = 8
@@ -131,6 +132,10 @@ def _distorted(plane: Tensor, lens: Tensor) -> tuple[Tensor, tuple[Tensor, Tenso
 def _undistorted(plane: Tensor, lens: Tensor) -> Tensor:
     # Newton's iteration in two dimensions. From the distorted point on it cannot overshoot a lens that bends one way
     # only (barrel: from below a concave function; pincushion: from above a convex one).
+    kernels = cpu_backend("lenses.cpu", plane.device)
+    if kernels is not None and not (plane.requires_grad or lens.requires_grad):
+        rows = plane.reshape(-1, 2), lens.expand(*plane.shape[:-1], 6).reshape(-1, 6)
+        return kernels.undistort(*rows, NEWTON_STEPS).view(plane.shape)
     found = plane
     for _ in range(NEWTON_STEPS):
         bent, (along_x, across, along_y) = _distorted(found, lens)

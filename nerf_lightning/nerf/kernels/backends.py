@@ -23,7 +23,8 @@ ROOM = "nerf_lightning"
 KERNELS = "nerf_lightning.nerf.kernels"
 CPU_BACKENDS = (
     *("hash_grid.cpu", "march.cpu", "ragged.cpu", "adam.cpu", "carving.cpu", "mlp.cpu"),
-    *("render.cpu", "render.gradients"),
+    *("render.cpu", "render.gradients", "render.dense"),
+    *("random.cpu", "histograms.cpu", "lenses.cpu"),
 )
 """The modules of this room that numba compiles."""
 LONG_SECONDS = 2.0

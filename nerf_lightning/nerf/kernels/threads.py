@@ -7,9 +7,10 @@ which thread takes what: parts and their order are fixed.
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import torch
@@ -23,12 +24,41 @@ PARTS_PER_THREAD = 4
 """More parts than threads, since some take longer than others."""
 
 
+class _Kept(threading.local):
+    threads: int | None = None
+
+
+_kept = _Kept()
+
+
+def num_threads() -> int:
+    """Return how many threads work is shared out over: as many as torch has, or had before `torch_on_one_thread`."""
+    return torch.get_num_threads() if _kept.threads is None else _kept.threads
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Within, torch's own operations take one thread, and what is shared out here as many as before.
+
+    Between kernels of ours torch has little to do, and its threads wait for one another in each operation: where
+    another program has one of the cores for a moment, all of them wait, which made steps four times as slow.
+    """
+    former, threads = _kept.threads, num_threads()
+    _kept.threads = threads
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _kept.threads = former
+        torch.set_num_threads(threads if former is None else 1)
+
+
 def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Do the work on each part, on as many threads as torch has here, and return the results in order.
 
     Within a part torch has one thread, and so has whatever is called there. Raises what the work raises.
     """
-    threads = torch.get_num_threads()
+    threads = num_threads()
     if threads == 1 or len(parts) < 2:
         return [work(part) for part in parts]
     # A thread's own settings, which those of the pool do not share.
@@ -43,12 +73,12 @@ def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[R
 
 def threads_on(device: torch.device) -> int:
     """Return how many parts of the work on a device run beside each other: on the CPU as many as torch has threads."""
-    return torch.get_num_threads() if device.type == "cpu" else 1
+    return num_threads() if device.type == "cpu" else 1
 
 
 def over_rows(kernel: Callable[..., Any], rows: int, *arrays: Any) -> None:
     """Call kernel(first, last, *arrays) for parts of the rows that together are all of them."""
-    in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, torch.get_num_threads()))
+    in_parallel(lambda part: kernel(*part, *arrays), parts_of(rows, num_threads()))
 
 
 def parts_of(rows: int, threads: int, fewest: int = FEWEST_ROWS) -> list[tuple[int, int]]:
@@ -63,9 +93,10 @@ def parts_of(rows: int, threads: int, fewest: int = FEWEST_ROWS) -> list[tuple[i
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    pool, all_there = ThreadPoolExecutor(threads, "tiles", initializer=_compute_alone), Barrier(threads)
+    pool, all_there = ThreadPoolExecutor(threads, "tiles", initializer=_compute_alone), threading.Barrier(threads)
+    former = torch.get_num_threads()
     list(pool.map(lambda _: all_there.wait(), range(threads)))
-    torch.set_num_threads(threads)  # the calling thread's and what threads begin with: those of the pool changed that
+    torch.set_num_threads(former)  # the calling thread's and what threads begin with: those of the pool changed that
     return pool
 
 

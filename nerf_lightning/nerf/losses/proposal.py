@@ -3,11 +3,14 @@
 Letters: edges t, weights w of the last level; edges u, weights v of a proposal.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.geometry.contraction import normalized_distance
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.kernels.search import search
 from nerf_lightning.nerf.losses.base import Loss
 from nerf_lightning.nerf.losses.mse import squared_error
@@ -54,8 +57,11 @@ def interlevel_loss(last: DenseRendering, proposal: DenseRendering) -> Float[Ten
     bound_i is the weight of all intervals of the proposal that touch interval i (Eq. 12): a proposal may claim too
     much, but what the last level sees must lie within it. Only the proposal receives gradients.
     """
-    weights = last.weights.detach()
-    bound = outer_weights(last.samples.edges.detach(), proposal.samples.edges.detach(), proposal.weights)
+    weights, edges = last.weights.detach(), last.samples.edges.detach()
+    kernels = _kernels_for(weights)
+    if kernels is not None:
+        return kernels.interlevel(edges, weights, proposal.samples.edges, proposal.weights)
+    bound = outer_weights(edges, proposal.samples.edges.detach(), proposal.weights)
     excess = (weights - bound).clamp(min=0.0)
     return (excess.square() / (weights + 1e-7)).sum(dim=-1)
 
@@ -85,9 +91,18 @@ def distortion_loss(rendering: DenseRendering) -> Float[Tensor, "*rays"]:
     edges, w = rendering.samples.edges, rendering.weights
     if rendering.samples.contracted_spacing:
         edges = normalized_distance(edges)
+    kernels = _kernels_for(w)
+    if kernels is not None and not edges.requires_grad:
+        return kernels.distortion(edges, w)
     span = (edges[..., -1:] - edges[..., :1]).clamp(min=1e-6)
     m = (0.5 * (edges[..., :-1] + edges[..., 1:]) - edges[..., :1]) / span
     before, moment = w.cumsum(dim=-1) - w, (w * m).cumsum(dim=-1) - w * m
     pairs = 2.0 * (w * (m * before - moment)).sum(dim=-1)
     own = (w.square() * edges.diff(dim=-1) / span).sum(dim=-1) / 3.0
     return pairs + own
+
+
+def _kernels_for(weights: Tensor) -> Any:
+    # Everything else takes the plain way, which is the reference.
+    suits = weights.dim() == 2 and weights.dtype == torch.float32
+    return cpu_backend("histograms.cpu", weights.device) if suits else None

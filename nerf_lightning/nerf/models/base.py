@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
@@ -67,6 +68,15 @@ class Model(nn.Module, ABC):
             background: colour behind each ray; None closes the ray.
             random: the step's numbers for these rays; None for evaluation.
         """
+
+    def shares_out_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+        """Return whether kernels share out the rays of a training step over threads; otherwise tiles of it are.
+
+        Args:
+            device: of the parameters.
+            learns_cameras: whether gradients of rays are wanted.
+        """
+        return False
 
     @abstractmethod
     def points_per_ray(self, training: bool) -> float:

@@ -1,14 +1,17 @@
 """A level in which every ray has the same number of samples, as in the original NeRF."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.whole_rays import has_dense_kernel, render_dense_rays
 from nerf_lightning.nerf.models.level import Level
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
 from nerf_lightning.nerf.rendering.near_gradients import soften_near_gradients
-from nerf_lightning.nerf.rendering.quadrature import composite
+from nerf_lightning.nerf.rendering.quadrature import composite, rendering_of
 from nerf_lightning.nerf.rendering.sample_points import points_along
 from nerf_lightning.nerf.samplers.base import DenseSampler, Sampler
 from nerf_lightning.nerf.types.points import Points
@@ -59,12 +62,36 @@ class DenseLevel(Level):
         history: list[DenseRendering],
         random: RayRandom | None,
     ) -> DenseRendering:
-        """Sample, ask the field at the midpoints, composite."""
+        """Sample, ask the field at the midpoints, composite.
+
+        Rays are first offered to a kernel that does the last two in one; the way below is its reference.
+        """
         samples = self.sampler(rays, history, random)
+        whole_from = 0.0 if random is None else self.gradient_scaling_distance
+        parts = self._parts_on(rays.near.device)
+        if parts is not None:
+            weights, foreground = render_dense_rays(
+                rays, samples.edges, parts, self.field.matmul_precision, background is None, whole_from
+            )
+            return rendering_of(weights, foreground, samples, rays, background)
         seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
-        if random is not None:
-            seen = soften_near_gradients(seen, samples.midpoints, self.gradient_scaling_distance)
-        return composite(seen, samples, rays, background)
+        return composite(soften_near_gradients(seen, samples.midpoints, whole_from), samples, rays, background)
+
+    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+        """Return whether there is a kernel for the field; it has gradients of rays, too."""
+        return self._parts_on(device) is not None
+
+    def field_parts(self) -> FieldParts | None:
+        """Return what kernels of whole rays compute with; None where `field_output` is something else than the field's.
+
+        A level that changes `field_output` says here what it makes of the field.
+        """
+        return self.field.parts() if type(self).field_output is DenseLevel.field_output else None
+
+    def _parts_on(self, device: torch.device) -> FieldParts | None:
+        """Return the field's parts where there is a kernel for them."""
+        parts = self.field_parts() if device.type == "cpu" else None  # elsewhere reading them would wait for the device
+        return parts if has_dense_kernel(parts, self.field.matmul_precision, device) else None
 
     def field_output(self, points: Points) -> FieldOutput:
         """Return what the field says of the samples."""

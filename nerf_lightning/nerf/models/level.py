@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -63,6 +64,10 @@ class Level(nn.Module):
     @abstractmethod
     def points_per_ray(self, before: float, training: bool) -> float:
         """Return how many points a ray sends through the field at once, given how many the level before had."""
+
+    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+        """Return whether a kernel takes the rays of training steps from end to end (`Model.shares_out_rays`)."""
+        return False
 
     def fit_to(self, scene: Scene) -> None:
         """Take note of where the scene's content lies, once, before training; a checkpoint carries it."""

@@ -1,10 +1,13 @@
 """A level that only proposes where to look: density without colour."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.fields.base import Field
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.models.dense_level import DenseLevel
 from nerf_lightning.nerf.randomness import RayRandom
 from nerf_lightning.nerf.ranges import require_ranges
@@ -59,6 +62,11 @@ class ProposalLevel(DenseLevel):
         """Sample, ask the field for its density, and return the weights; without gradients where it does not learn."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and self._learns):
             return super().forward(rays, background, history, random)
+
+    def field_parts(self) -> FieldParts | None:
+        """Return the field's, without colours."""
+        parts = self.field.parts()
+        return None if parts is None else replace(parts, color_weights=[])
 
     def field_output(self, points: Points) -> FieldOutput:
         """Return the density, and black."""

@@ -2,6 +2,7 @@
 
 from typing import cast
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -60,6 +61,10 @@ class RadianceModel(PointField):
     def replays(self) -> bool:  # type: ignore[override]
         """Whether every level does."""
         return all(level.replays for level in self._in_order())
+
+    def shares_out_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+        """Return whether every level takes whole rays."""
+        return all(level.takes_whole_rays(device, learns_cameras) for level in self._in_order())
 
     def points_per_ray(self, training: bool) -> float:
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""

@@ -53,25 +53,19 @@ class RaggedLevel(Level):
         output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
         return composite_ragged(output, samples, rays, background)
 
-    def takes_whole_rays(self, rays: RayBundle) -> bool:
-        """Return whether training renders rays in one kernel, where cameras are not learnt."""
-        return self._trains_whole(rays) and has_kernel(
-            self.field.parts(), self.field.matmul_precision, rays.near.device, True
-        )
-
-    def _trains_whole(self, rays: RayBundle) -> bool:
-        # The kernel keeps no weights and knows no gradients of rays; off the CPU the field's parts would be read.
-        return torch.is_grad_enabled() and not (
-            self.returns_weights or rays.origins.requires_grad or rays.near.device.type != "cpu"
-        )
+    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+        """Return whether training renders rays in one kernel: it keeps no weights, and knows no gradients of rays."""
+        if self.returns_weights or learns_cameras or device.type != "cpu":  # elsewhere the field's parts would be read
+            return False
+        return has_kernel(self.field.parts(), self.field.matmul_precision, device, gradients=True)
 
     def _whole_rays(
         self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None, evaluates: bool
     ) -> Rendering | None:
-        if not (evaluates or self._trains_whole(rays)):
-            return None
-        parts, matmul_precision, sampler = self.field.parts(), self.field.matmul_precision, self.sampler
-        if parts is None or not has_kernel(parts, matmul_precision, rays.near.device, not evaluates):
+        device, matmul_precision, sampler = rays.near.device, self.field.matmul_precision, self.sampler
+        trains = torch.is_grad_enabled() and self.takes_whole_rays(device, rays.origins.requires_grad)
+        parts = self.field.parts() if evaluates or trains else None
+        if parts is None or not has_kernel(parts, matmul_precision, device, gradients=trains):
             return None
         march = sampler.marcher(rays).grid_march() if evaluates else sampler.grid_march(rays, random)
         if march is None:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.nerf.kernels.backends import cpu_backend
 from nerf_lightning.nerf.kernels.search import search
 
 
@@ -21,7 +22,7 @@ def sample_histogram(
     Args:
         edges: fenceposts; exactly one more than there are weights.
         weights: mass of each bin, need not sum to one.
-        u: numbers in [0, 1).
+        u: numbers in [0, 1), in order.
         floor: mass added to each bin, so that an empty ray is sampled evenly and no bin has zero width in the
             distribution.
 
@@ -30,6 +31,9 @@ def sample_histogram(
     """
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(f"{weights.shape[-1]} weights need {weights.shape[-1] + 1} edges, not {edges.shape[-1]}")
+    kernels = cpu_backend("histograms.cpu", u.device) if u.dim() == 2 and edges.dtype == torch.float32 else None
+    if kernels is not None and not (edges.requires_grad or weights.requires_grad):
+        return kernels.sample(edges, weights, u, floor)
     mass = weights + floor
     cdf = torch.cumsum(mass / mass.sum(dim=-1, keepdim=True), dim=-1)
     cdf = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1)

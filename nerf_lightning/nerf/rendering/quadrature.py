@@ -56,9 +56,22 @@ def composite(
     weights = weights_from_density(output.density, samples.deltas)
     if background is None:
         weights = closed_weights(weights)
+    foreground = (weights[..., None] * output.rgb).sum(dim=-2)
+    channels = {name: (weights[..., None] * each).sum(dim=-2) for name, each in output.channels.items()}
+    return rendering_of(weights, foreground, samples, rays, background, channels)
+
+
+def rendering_of(
+    weights: Float[Tensor, "*rays samples"],
+    foreground: Float[Tensor, "*rays 3"],
+    samples: RaySamples,
+    rays: RayBundle,
+    background: Float[Tensor, "*#rays 3"] | None,
+    channels: dict[str, Tensor] | None = None,
+) -> DenseRendering:
+    """Return what is seen, given the weights and sum of w rgb; the other arguments are those of `composite`."""
     opacity = weights.sum(dim=-1)
     escaped = 1.0 - opacity
-    foreground = (weights[..., None] * output.rgb).sum(dim=-2)
     return DenseRendering(
         rgb=foreground if background is None else foreground + escaped[..., None] * background,
         foreground=foreground,
@@ -66,5 +79,5 @@ def composite(
         depth=(weights * samples.midpoints).sum(dim=-1) + escaped * rays.far,
         weights=weights,
         samples=samples,
-        channels={name: (weights[..., None] * each).sum(dim=-2) for name, each in output.channels.items()},
+        channels=channels or {},
     )

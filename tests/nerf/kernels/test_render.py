@@ -11,6 +11,7 @@ from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import gradients as kernels
+from nerf_lightning.nerf.kernels.render import workspace
 from nerf_lightning.nerf.kernels.render.whole_rays import has_kernel
 from nerf_lightning.nerf.matmul_precision import cpu_multiplies_bfloat16
 from nerf_lightning.nerf.part import StepContext
@@ -78,9 +79,16 @@ def test_nothing_lies_outside_of_the_fields_box():
 
 
 def test_fields_of_other_kinds_are_not_taken():
-    assert a_level().field.parts() is not None
-    assert a_level(contraction=True).field.parts() is None
-    assert a_level(appearance=4).field.parts() is None
+    takes = [
+        has_kernel(a_level(**each).field.parts(), "float32", torch.device("cpu"), gradients)
+        for each, gradients in (
+            ({}, True),
+            ({"contraction": True}, False),
+            ({"appearance": 4}, False),
+            ({"appearance": 4}, True),
+        )
+    ]
+    assert takes == [True, False, True, False]
     level = a_level()
     level.field.position_encoder = HashGridEncoder(num_levels=4, log2_table_size=8, max_resolution=32, blend_in=0.5)
     assert level.field.parts() is not None
@@ -148,7 +156,7 @@ def test_what_a_part_has_no_room_for_is_rendered_again(monkeypatch):
     level.returns_weights = False
     weight = torch.randn(300, 8)
     seen, gradients = learnt(level, rays, None, weight)
-    monkeypatch.setattr(kernels, "_spare", [])
+    monkeypatch.setattr(workspace, "_spare", [])
     monkeypatch.setattr(kernels, "SPARE_BLOCKS", 1)
     monkeypatch.setattr(level, "points_per_ray", lambda before, training: 0.0)
     again, of_again = learnt(level, rays, None, weight)
@@ -177,11 +185,12 @@ def test_many_rays_are_shared_out_and_nothing_changes(threads):
 
 
 def test_it_goes_the_other_way_where_something_else_is_wanted():
-    level, rays = a_level(density_bias=3.0), some_rays(50)
+    level, rays, cpu = a_level(density_bias=3.0), some_rays(50), torch.device("cpu")
     assert isinstance(level(rays, None, [], None), RaggedRendering)  # as a notebook wants it
-    assert not level.takes_whole_rays(rays)
+    assert not level.takes_whole_rays(cpu, learns_cameras=False)
     level.returns_weights = False
-    assert level.takes_whole_rays(rays)
+    assert level.takes_whole_rays(cpu, learns_cameras=False)
+    assert not level.takes_whole_rays(cpu, learns_cameras=True)
     assert not isinstance(level(rays, None, [], None), RaggedRendering)
     with torch.no_grad():
         assert isinstance(level(rays, None, [], batch_random(0, 50)), RaggedRendering)

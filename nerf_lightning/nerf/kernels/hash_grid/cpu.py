@@ -77,7 +77,7 @@ def point_gradient(
     out = torch.empty_like(points)
     lanes = (0,) * table.shape[1]
     arrays = (table.numpy(), points.numpy(), grad.numpy(), *level_arrays(layout), lanes, out.numpy())
-    over_rows(_point_gradient, points.shape[0], *arrays)
+    over_rows(write_point_gradient, points.shape[0], *arrays)
     return out
 
 
@@ -331,7 +331,8 @@ def _add_table_gradient(level, into, points, grad, resolutions, offsets, hashed,
 
 @njit(nogil=True, fastmath=True, cache=True)
 @no_type_check
-def _point_gradient(first, last, table, points, grad, resolutions, offsets, hashed, mask, lanes, out):
+def write_point_gradient(first, last, table, points, grad, resolutions, offsets, hashed, mask, lanes, out):
+    """Write the gradients with respect to the points from first to last."""
     width = len(lanes)
     for i in range(first, last):
         gx = gy = gz = np.float32(0.0)

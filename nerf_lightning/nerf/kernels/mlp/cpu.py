@@ -40,9 +40,15 @@ WIDE = bool(CPU.get("avx512f"))
 """Whether there are 32 registers of a whole vector each."""
 
 
-def takes(weights: Sequence[Tensor], dtype: torch.dtype) -> bool:
-    """Tell whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors."""
-    return dtype in dtypes() and all(weight.shape[1] % LANES == 0 for weight in weights)
+def takes(weights: Sequence[Tensor], dtype: torch.dtype, pads: bool = False) -> bool:
+    """Tell whether the kernels take a perceptron with products of a dtype: one whose inputs are whole vectors.
+
+    Args:
+        weights: of all layers.
+        dtype: float32 or bfloat16.
+        pads: whether whoever calls fills the first layer's inputs up with zeros.
+    """
+    return dtype in dtypes() and all(weight.shape[1] % LANES == 0 for weight in weights[1 if pads else 0 :])
 
 
 def dtypes() -> list[torch.dtype]:
@@ -96,7 +102,8 @@ def unpadded(total: Tensor, weights: Sequence[Tensor], widths: Sequence[int]) ->
     """Return the gradients of all layers' weights, which lie one after the other, without what was padded."""
     grads, offset = [], 0
     for weight, (inner, outer) in zip(weights, pairwise(widths), strict=True):
-        grads.append(total[offset : offset + inner * outer].view(outer, inner)[: weight.shape[0]])
+        of_layer = total[offset : offset + inner * outer].view(outer, inner)
+        grads.append(of_layer[: weight.shape[0], : weight.shape[1]])
         offset += inner * outer
     return grads
 

@@ -92,7 +92,7 @@ def trial_arguments() -> Iterator[tuple[RayBundle, FieldParts, MarchState, Tenso
         layout = hash_grid_layout(16 // features, 4, 2, 8)
         weights = [torch.ones(16, 16), torch.ones(16, 16)], [torch.ones(16, 32), torch.ones(3, 16)]
         table = torch.zeros(layout.offsets[-1], features)
-        field = FieldParts(aabb, table, layout, 0.0, *weights, encode_directions=lambda x: torch.ones(len(x), 16))
+        field = FieldParts(aabb, table, layout, 0.0, *weights, lambda rays: torch.ones(len(rays.near), 16))
         yield rays, field, state, lattice, grid
 
 
@@ -101,7 +101,7 @@ def along(
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
     """Return what kernels take of rays: the march, where they run through the world, and features of directions."""
     march = (*in_box(rays, grid), state.enter, state.leave, state.jitter, lattice, grid.cells, grid.leaps)
-    world, directions = (rays.origins, rays.directions, field.aabb), field.encode_directions(rays.view_directions)
+    world, directions = (rays.origins, rays.directions, field.aabb), field.ray_features(rays)
     return arrays_of(march), arrays_of(world), arrays_of((directions.float(),))[0]
 
 

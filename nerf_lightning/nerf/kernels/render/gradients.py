@@ -7,8 +7,6 @@ those samples come first that lie farthest, and sums up what lies behind each.
 Letters as in `kernels.ragged.integrate`. Where the samples lie has no gradient.
 """
 
-import threading
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, no_type_check
 
@@ -49,7 +47,8 @@ from nerf_lightning.nerf.kernels.render.cpu import (
     trial_arguments,
 )
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
-from nerf_lightning.nerf.kernels.threads import in_parallel, parts_of
+from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
+from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -59,66 +58,7 @@ SLOTS = 64
 """So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
 asked about in vain."""
 SPARE_BLOCKS, FEWEST_RAYS = 8, 64
-NUMBERS = 8
-"""Of each sample: length, distance, light behind it, weight, slope of the density, three colours."""
-
-
-@dataclass
-class Room:
-    """What the way back needs of some blocks of samples; steps take it from one another, since fresh memory is slow."""
-
-    owners: Tensor
-    """Number of each sample's ray; negative: none."""
-    numbers: Tensor
-    points: Tensor
-    """In the unit cube."""
-    density_words: Tensor
-    """Inputs of all layers of the density's perceptron."""
-    color_words: Tensor
-
-    @classmethod
-    def of(cls, blocks: int, density_words: int, color_words: int) -> "Room":
-        """Return room for so many blocks."""
-        rows = blocks * ROWS
-        return cls(
-            torch.empty(rows, dtype=torch.int32),
-            torch.empty(rows, NUMBERS),
-            torch.empty(rows, 3),
-            torch.empty(rows, density_words, dtype=torch.int32),
-            torch.empty(rows, color_words, dtype=torch.int32),
-        )
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Words per sample: rooms of one size may take each other's place."""
-        return self.density_words.shape[1], self.color_words.shape[1]
-
-    @property
-    def blocks(self) -> int:
-        """How many there is room for."""
-        return self.owners.shape[0] // ROWS
-
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """Return what the kernels take."""
-        return arrays_of((self.owners, self.numbers, self.points, self.density_words, self.color_words))
-
-
-_spare: list[Room] = []
-_spare_lock = threading.Lock()
-
-
-def _take_room(blocks: int, size: tuple[int, int]) -> Room:
-    with _spare_lock:
-        for number, room in enumerate(_spare):
-            if room.size == size and room.blocks >= blocks:
-                return _spare.pop(number)
-        _spare.clear()  # of another field, or too small
-    return Room.of(blocks, *size)
-
-
-def _give_back(rooms: list[Room]) -> None:
-    with _spare_lock:
-        _spare.extend(rooms)
+# Of each sample the workspace keeps: length, distance, light behind it, weight, slope of the density, three colours.
 
 
 def render(
@@ -178,8 +118,8 @@ class _Given:
         self.march, self.world, self.directions = along(rays, field, state, lattice, grid)
         self.limits = np.float32(field.bias), np.float32(opaque_below)
         self.rays, self.samples_per_ray, self.asked = rays.near.shape[0], samples_per_ray, 0
-        self.parts = parts_of(self.rays, torch.get_num_threads(), FEWEST_RAYS)
-        self.rooms: list[Room] = []
+        self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
+        self.workspaces: list[Workspace] = []
         self.used: list[int] = []
 
     def networks(self, density: list[Tensor], color: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
@@ -192,19 +132,19 @@ class _Given:
         given = self.march, self.world, self.directions, *of_field, self.networks(density, color, False), self.limits
         of_density, of_color = (words_of(sum(padded_widths(weights)[:-1]), self.dtype) for weights in (density, color))
 
-        def part(bounds: tuple[int, int]) -> tuple[Room, int, int]:
+        def part(bounds: tuple[int, int]) -> tuple[Workspace, int, int]:
             blocks = SPARE_BLOCKS + int(1.25 * self.samples_per_ray * (bounds[1] - bounds[0])) // ROWS
             while True:
-                room = _take_room(blocks, (of_density, of_color))
-                used, asked = _see(self.kind, *bounds, *given, room.arrays(), arrays_of(out))
-                if used <= room.blocks:
-                    return room, used, asked
-                blocks = 2 * room.blocks
+                workspace = take_workspace(blocks, (of_density, of_color))
+                used, asked = _see(self.kind, *bounds, *given, workspace.arrays(), arrays_of(out))
+                if used <= workspace.blocks:
+                    return workspace, used, asked
+                blocks = 2 * workspace.blocks
                 for each in out:
                     each[bounds[0] : bounds[1]] = 0.0
 
         found = in_parallel(part, self.parts)
-        self.rooms, self.used = [room for room, _, _ in found], [used for _, used, _ in found]
+        self.workspaces, self.used = [workspace for workspace, _, _ in found], [used for _, used, _ in found]
         self.asked = sum(asked for _, _, asked in found)
 
     def go_back(
@@ -218,20 +158,20 @@ class _Given:
         points, features = torch.empty(int(ends[-1]), 3), torch.empty(int(ends[-1]), widths[0][0])
 
         def part(number: int) -> None:
-            room, end, count = self.rooms[number], int(ends[number]), self.used[number] * ROWS
+            workspace, end, count = self.workspaces[number], int(ends[number]), self.used[number] * ROWS
             totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
             slope = np.float32(self.field.least_slope)
             hidden = widths[1][0] - self.directions.shape[1]
-            given = self.parts[number], self.used[number], hidden, networks, slope, arrays, room.arrays()
+            given = self.parts[number], self.used[number], hidden, networks, slope, arrays, workspace.arrays()
             _go_back(self.kind, *given, features[end - count : end].numpy(), *totals)
-            points[end - count : end] = room.points[:count]
+            points[end - count : end] = workspace.points[:count]
 
         in_parallel(part, range(len(self.parts)))
         total = sums.sum(dim=0)
         of_density = unpadded(total[: counts[0]], density, widths[0])
         of_color = unpadded(total[counts[0] :], color, widths[1])
-        _give_back(self.rooms)
-        self.rooms = []
+        give_back(self.workspaces)
+        self.workspaces = []
         return [*of_density, *of_color], points, features
 
 

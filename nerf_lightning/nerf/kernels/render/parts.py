@@ -7,24 +7,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.nerf.kernels.hash_grid.layout import HashGridLayout
+from nerf_lightning.nerf.types.rays import RayBundle
 
 
 @dataclass(frozen=True)
 class FieldParts:
-    """A hash grid over a box, and two perceptrons without biases: density, and colour by what that hands on."""
+    """A hash grid, and two perceptrons without biases: density, and colour by what that hands on."""
 
     aabb: Float[Tensor, "2 3"]
-    """The box, outside of which there is nothing."""
+    """The box, outside of which there is nothing; where space is contracted, what is not."""
     table: Float[Tensor, "entries features"]
     layout: HashGridLayout
     bias: float
     """Added to the raw density, before the exponential."""
     density_weights: list[Tensor]
     color_weights: list[Tensor]
-    """Of the colour's; its inputs are the density's outputs and the features of the direction."""
-    encode_directions: Callable[[Float[Tensor, "rays 3"]], Float[Tensor, "rays features"]]
+    """Of the colour's; its inputs are the density's outputs and what all samples of a ray share. None: no colours."""
+    ray_features: Callable[[RayBundle], Float[Tensor, "rays features"]]
+    """Return what all samples of a ray share: the features of its direction, and a photograph's code."""
     least_slope: float = 0.0
     """Of a colour over its raw value on the way back from black or full, in training."""
+    contracted: bool = False
+    """Whether all space, contracted around the box, is mapped to the unit cube (`geometry.contraction`)."""
+    ray_features_learn: bool = False
+    """Whether there is anything to learn in `ray_features`."""
 
     @property
     def weights(self) -> tuple[list[Tensor], list[Tensor]]:

@@ -1,4 +1,7 @@
-"""Rays rendered from end to end in one kernel: the one front of these kernels, for any level that has a march."""
+"""Rays rendered from end to end in one kernel: the one front of these kernels, for any level that offers its rays.
+
+There are kernels for levels that march through an occupancy grid, and for those with as many samples on each ray.
+"""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +15,7 @@ from nerf_lightning.nerf.kernels.render.parts import FieldParts
 from nerf_lightning.nerf.matmul_precision import MatmulPrecision
 from nerf_lightning.nerf.types.rays import RayBundle
 
-LEARNING, RENDERING = "render.gradients", "render.cpu"
+LEARNING, RENDERING, DENSE = "render.gradients", "render.cpu", "render.dense"
 
 
 class WholeRays(NamedTuple):
@@ -30,19 +33,32 @@ class WholeRays(NamedTuple):
 def has_kernel(
     field: FieldParts | None, matmul_precision: MatmulPrecision, device: torch.device, gradients: bool
 ) -> bool:
-    """Return whether there is a kernel for a field.
+    """Return whether there is a kernel for rays that march through a box.
 
     Args:
         field: None: of a kind that no kernel knows.
         matmul_precision: the precision of its products.
         device: of its parameters, and the rays.
-        gradients: whether they are wanted, for the field's parameters alone.
+        gradients: whether they are wanted, for the field's table and weights alone.
     """
-    module = LEARNING if gradients else RENDERING
-    perceptrons = cpu_backend("mlp.cpu", device) if field is not None and is_on(module) else None
-    if field is None or perceptrons is None or field.table.dtype != torch.float32:
+    if field is None or field.contracted or (gradients and field.ray_features_learn):
         return False
-    if not all(perceptrons.takes(each, _dtype(matmul_precision)) for each in field.weights):
+    return _has(LEARNING if gradients else RENDERING, field, matmul_precision, device)
+
+
+def has_dense_kernel(field: FieldParts | None, matmul_precision: MatmulPrecision, device: torch.device) -> bool:
+    """Return whether there is a kernel for rays with equally many samples; it has gradients for all that may learn.
+
+    The arguments are those of `has_kernel`.
+    """
+    return field is not None and _has(DENSE, field, matmul_precision, device)
+
+
+def _has(module: str, field: FieldParts, matmul_precision: MatmulPrecision, device: torch.device) -> bool:
+    perceptrons = cpu_backend("mlp.cpu", device) if is_on(module) else None
+    if perceptrons is None or field.table.dtype != torch.float32:
+        return False
+    if not all(perceptrons.takes(each, _dtype(matmul_precision), pads=True) for each in field.weights if each):
         return False
     return cpu_backend(module, device) is not None
 
@@ -72,6 +88,28 @@ def render_whole_rays(
         rgb, opacity, depth = kernels.render(rays, field, *march, least_alpha, opaque_below, _dtype(matmul_precision))
         return WholeRays(rgb, opacity, depth, samples=0)
     return WholeRays(*kernels.render(rays, field, *march, opaque_below, _dtype(matmul_precision), samples_per_ray))
+
+
+def render_dense_rays(
+    rays: RayBundle,
+    edges: Float[Tensor, "rays edges"],
+    field: FieldParts,
+    matmul_precision: MatmulPrecision,
+    closed: bool,
+    whole_from: float,
+) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
+    """Render rays with the kernel that `has_dense_kernel` found; return all weights, and sums of weights times colour.
+
+    Args:
+        rays: unit directions.
+        edges: the intervals, in whose midpoints the field is asked.
+        field: table and weights.
+        matmul_precision: the precision of the field's products.
+        closed: whether the last interval takes all the light that is left.
+        whole_from: gradients of samples nearer than this are smaller (`rendering.near_gradients`); 0: none are.
+    """
+    kernels: Any = cpu_backend(DENSE, rays.near.device)
+    return kernels.render(rays, edges, field, _dtype(matmul_precision), closed, whole_from)
 
 
 def _dtype(matmul_precision: MatmulPrecision) -> torch.dtype:

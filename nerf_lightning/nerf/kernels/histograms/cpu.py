@@ -1,0 +1,140 @@
+"""Histograms along rays for the CPU: samples drawn from them, and the losses that compare and narrow them.
+
+Letters as in `rendering.histograms` and `losses.proposal`, whose functions these are in one pass over each ray.
+"""
+
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.threads import over_rows
+
+ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+
+
+def sample(
+    edges: Float[Tensor, "rays edges"],
+    weights: Float[Tensor, "rays bins"],
+    u: Float[Tensor, "rays count"],
+    floor: float,
+) -> Float[Tensor, "rays count"]:
+    """Return where the cumulative distribution of a histogram reaches `u`, which increases along each row."""
+    out = torch.empty(u.shape)
+    arrays = (each.detach().contiguous().numpy() for each in (edges, weights, u))
+    over_rows(_sample, len(u), *arrays, np.float32(floor), out.numpy())
+    return out
+
+
+def interlevel(
+    t: Float[Tensor, "rays edges"],
+    w: Float[Tensor, "rays samples"],
+    u: Float[Tensor, "rays outer"],
+    v: Float[Tensor, "rays bins"],
+) -> Float[Tensor, "rays"]:
+    """Return sum_i max(0, w_i - bound_i)^2 / w_i of each ray, with gradients for v."""
+    return _Loss.apply(_interlevel, v, *(each.detach().contiguous() for each in (t, w, u)))
+
+
+def distortion(edges: Float[Tensor, "rays edges"], w: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays"]:
+    """Return sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 d_i / 3 of each ray, with gradients for w."""
+    return _Loss.apply(_distortion, w, edges.detach().contiguous())
+
+
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    edges, weights = torch.tensor([[0.0, 1.0, 2.0]]), torch.ones(1, 2)
+    sample(edges, weights, torch.tensor([[0.5]]), 0.01)
+    interlevel(edges, weights, edges, weights)
+    distortion(edges, weights)
+
+
+class _Loss(torch.autograd.Function):
+    """A number per ray whose gradient for some weights is found with it."""
+
+    @staticmethod
+    def forward(ctx: Any, kernel: Any, weights: Tensor, *given: Tensor) -> Tensor:
+        weights = weights.contiguous()
+        out, grad = weights.new_empty(len(weights)), torch.empty_like(weights)
+        arrays = (each.numpy() for each in (weights, *given, out, grad))
+        over_rows(kernel, len(weights), *arrays)
+        ctx.save_for_backward(grad)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+        (own,) = ctx.saved_tensors
+        return None, own * grad[:, None], None, None, None
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _sample(first, last, edges, weights, u, floor, out):
+    bins = weights.shape[1]
+    for r in range(first, last):
+        total = ZERO
+        for i in range(bins):
+            total += weights[r, i] + floor
+        i, below, above = 0, ZERO, (weights[r, 0] + floor) / total
+        for k in range(u.shape[1]):
+            while i < bins - 1 and above <= u[r, k]:
+                i += 1
+                below, above = above, above + (weights[r, i] + floor) / total
+            span = above - below
+            part = min(max((u[r, k] - below) / span, ZERO), ONE) if span > ZERO else HALF
+            out[r, k] = edges[r, i] + part * (edges[r, i + 1] - edges[r, i])
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _interlevel(first, last, v, t, w, u, out, grad):
+    bins, samples = v.shape[1], w.shape[1]
+    total = np.zeros(bins + 1, np.float32)
+    for r in range(first, last):
+        for j in range(bins):
+            total[j + 1] = total[j] + v[r, j]
+            grad[r, j] = ZERO
+        loss, low, high = ZERO, 0, 0
+        for i in range(samples):
+            while low <= bins and u[r, low] <= t[r, i]:
+                low += 1
+            while high <= bins and u[r, high] < t[r, i + 1]:
+                high += 1
+            start, end = min(max(low - 1, 0), bins), min(high, bins)
+            excess = max(w[r, i] - (total[end] - total[start]), ZERO)
+            if excess > ZERO:
+                share = excess / (w[r, i] + np.float32(1e-7))
+                loss += excess * share
+                for j in range(start, end):
+                    grad[r, j] -= TWO * share
+        out[r] = loss
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _distortion(first, last, w, edges, out, grad):
+    samples = w.shape[1]
+    for r in range(first, last):
+        start = edges[r, 0]
+        span = max(edges[r, samples] - start, np.float32(1e-6))
+        before = moment = pairs = own = ZERO
+        for i in range(samples):
+            m = (HALF * (edges[r, i] + edges[r, i + 1]) - start) / span
+            length = (edges[r, i + 1] - edges[r, i]) / span
+            nearer = m * before - moment
+            pairs += w[r, i] * nearer
+            own += w[r, i] * w[r, i] * length
+            grad[r, i] = TWO * nearer + TWO * w[r, i] * length / np.float32(3.0)
+            before += w[r, i]
+            moment += w[r, i] * m
+        behind = later = ZERO
+        for i in range(samples - 1, -1, -1):
+            m = (HALF * (edges[r, i] + edges[r, i + 1]) - start) / span
+            grad[r, i] += TWO * (later - m * behind)
+            behind += w[r, i]
+            later += w[r, i] * m
+        out[r] = TWO * pairs + own / np.float32(3.0)

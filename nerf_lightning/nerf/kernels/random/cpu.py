@@ -1,0 +1,77 @@
+"""Random numbers and permutations for the CPU, bit for bit those of `nerf.randomness`."""
+
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numba import njit
+from torch import Tensor
+
+from nerf_lightning.nerf.kernels.threads import over_rows
+
+
+def uniform(
+    keys: Int[Tensor, "rays"], slots: Int[Tensor, "rays"], purpose: int, count: int
+) -> Float[Tensor, "rays {count}"]:
+    """Return `count` numbers per ray, uniform on [0, 1)."""
+    out = torch.empty(len(slots), count)
+    over_rows(_uniform, len(slots), keys.numpy(), slots.numpy(), np.uint32(purpose), out.numpy())
+    return out
+
+
+def permute(index: Int[Tensor, "n"], rows: int, columns: int, size: int, words: Int[Tensor, "rounds"]) -> Tensor:
+    """Return where a permutation of range(size) sends each index, given the words of its rounds."""
+    out = torch.empty_like(index)
+    arrays = index.contiguous().numpy(), rows, columns, size, words.numpy(), out.numpy()
+    over_rows(_permute, len(index), *arrays)
+    return out
+
+
+def trial() -> None:
+    """Run every kernel once on next to nothing; it raises whatever its compiler raises."""
+    one = torch.ones(1, dtype=torch.int64)
+    uniform(one, one, 1, 1)
+    permute(one, 1, 2, 2, one)
+
+
+@njit
+@no_type_check
+def _mix(word):
+    word = np.uint32(word)
+    word ^= word >> np.uint32(16)
+    word = np.uint32(word * np.uint32(0x7FEB352D))
+    word ^= word >> np.uint32(15)
+    word = np.uint32(word * np.uint32(0x5BD1E995))
+    word ^= word >> np.uint32(16)
+    word = np.uint32(word * np.uint32(0x6C50B47D))
+    return np.uint32(word ^ (word >> np.uint32(15)))
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _uniform(first, last, keys, slots, purpose, out):
+    for r in range(first, last):
+        ray = _mix(np.uint32(_mix(np.uint32(keys[r]) ^ purpose) ^ _mix(np.uint32(slots[r]))))
+        for k in range(out.shape[1]):
+            word = _mix(np.uint32(ray + np.uint32(k) * np.uint32(0x3C6EF35F)))
+            out[r, k] = np.float32(word >> np.uint32(8)) * np.float32(2.0**-24)
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _permute(first, last, index, rows, columns, size, words, out):
+    for i in range(first, last):
+        position = index[i]
+        while True:
+            row, column = position // columns, position % columns
+            for number in range(words.shape[0]):
+                word = np.int64(words[number])
+                if number % 2:
+                    column = (column + np.int64(_mix(np.uint32(word ^ row)))) % columns
+                else:
+                    row = (row + np.int64(_mix(np.uint32(word ^ column)))) % rows
+            position = row * columns + column
+            if position < size:
+                break
+        out[i] = position

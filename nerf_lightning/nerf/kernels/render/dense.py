@@ -1,0 +1,492 @@
+"""Whole rays with equally many samples in one kernel per pass: hash grid, perceptrons, quadrature, and the way back.
+
+The samples of a part of the rays follow one another, ray by ray, and ROWS of them go from positions to light while they
+are in the cache. The way back takes the blocks from the last to the first, so that of each ray those samples come first
+that lie farthest, and sums up what lies behind each.
+
+Letters as in `rendering.quadrature`. Where the samples lie has no gradient.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from nerf_lightning.nerf.activations import LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
+from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays, write_point_gradient
+from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
+from nerf_lightning.nerf.kernels.hash_grid.layout import hash_grid_layout
+from nerf_lightning.nerf.kernels.mlp.cpu import (
+    KINDS,
+    ROWS,
+    address,
+    back_through,
+    dtypes,
+    padded_widths,
+    round_rows,
+    through,
+    unpadded,
+    words_of,
+)
+from nerf_lightning.nerf.kernels.mlp.vectors import LANES, bytes_of, round_vector
+from nerf_lightning.nerf.kernels.render.cpu import LARGEST_RAW, arrays_of, is_inside, network
+from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponentials, sigmoids
+from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
+from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
+from nerf_lightning.nerf.types.rays import RayBundle
+
+HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
+LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
+FEWEST_RAYS = 32
+BACK, LIGHT, WEIGHT, SHARE, COLOR = 0, 1, 2, 3, 4
+"""What the workspace keeps of each sample: length times slope of the density times SHARE; the light behind it; its
+weight; the share of its gradients that counts; three colours."""
+OWN_FLOATS = np.float32(0)
+"""Tells `round_vector` to copy."""
+
+
+def render(
+    rays: RayBundle,
+    edges: Float[Tensor, "rays edges"],
+    field: FieldParts,
+    dtype: torch.dtype,
+    closed: bool,
+    whole_from: float,
+) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays 3"]]:
+    """Return the weights of all samples, and per ray sum of w rgb (nothing, for a field without colours).
+
+    Gradients go to the field's table and weights, to the features of directions, and to the rays' origins and
+    directions.
+
+    Args:
+        rays: unit directions, scene units.
+        edges: the intervals, in whose midpoints the field is asked.
+        field: what is asked.
+        dtype: what the factors of the perceptrons' products are rounded to: float32 or bfloat16.
+        closed: whether the last interval takes all the light that is left.
+        whole_from: `rendering.near_gradients`; 0: gradients are whole everywhere.
+    """
+    features = field.ray_features(rays) if field.color_weights else torch.zeros(len(edges), 0)
+    given = rays.origins, rays.directions, features, field.table, *field.density_weights, *field.color_weights
+    keep = torch.is_grad_enabled() and any(each.requires_grad for each in given)
+    return _DenseRays.apply(_Call(edges, field, dtype, closed, whole_from, keep), *given)
+
+
+def trial() -> None:
+    """Run the kernels once on next to nothing, for the widths that conf/model uses; it raises what compilers raise."""
+    origins, along = torch.zeros(2, 3, requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    rays = RayBundle(origins, along, torch.zeros(2), torch.ones(2), along)
+    aabb, edges = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.linspace(0.0, 1.0, 4).expand(2, 4)
+    for features in (2, 4):
+        layout = hash_grid_layout(2, 4, 2, 8)
+        table = torch.zeros(layout.offsets[-1], features, requires_grad=True)
+        density = [torch.ones(16, 2 * features, requires_grad=True), torch.ones(16, 16, requires_grad=True)]
+        color = [torch.ones(16, 32, requires_grad=True), torch.ones(3, 16, requires_grad=True)]
+        field = FieldParts(
+            aabb, table, layout, 0.0, density, color, lambda rays: torch.ones(len(rays.near), 16), contracted=True
+        )
+        for dtype in dtypes()[-1:]:
+            weights, foreground = render(rays, edges, field, dtype, False, 1.0)
+            (weights.sum() + foreground.sum()).backward()
+
+
+@dataclass
+class _Call:
+    """All that a pass needs besides what has gradients."""
+
+    edges: Tensor
+    field: FieldParts
+    dtype: torch.dtype
+    closed: bool
+    whole_from: float
+    keep: bool
+    """Whether a backward pass follows."""
+
+    def __post_init__(self) -> None:
+        self.kind, self.edges = KINDS[self.dtype], self.edges.detach().float().contiguous()
+        self.rays, self.samples = len(self.edges), self.edges.shape[1] - 1
+        self.parts = parts_of(self.rays, num_threads(), FEWEST_RAYS)
+        self.workspaces: list[Workspace] = []
+        # To the unit cube, or to the cube that the unit ball just holds (`geometry.contraction`).
+        low, high = self.field.aabb
+        side, shift = high - low, 0.0
+        if self.field.contracted:
+            side, shift = side * (3**0.5 / 2), 3**-0.5
+        self.scale, self.offset = 1.0 / side, -low / side - shift
+
+    def networks(self, weights: list[Tensor], transposed: bool) -> tuple[np.ndarray, ...]:
+        """Return the words and widths of both perceptrons; no widths where there are no colours."""
+        density, color = self.split(weights)
+        none = np.zeros(0, np.int32), np.zeros(0, np.int64)
+        return (*network(density, self.dtype, transposed), *(network(color, self.dtype, transposed) if color else none))
+
+    def split(self, weights: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the weights of the density's perceptron, and of the colours'."""
+        layers = len(self.field.density_weights)
+        return weights[:layers], weights[layers:]
+
+    def space(self, origins: Tensor, directions: Tensor) -> tuple[Any, ...]:
+        """Return the rays in the coordinates that are contracted, their intervals, and whether space is contracted."""
+        scaled = origins.float() * self.scale + self.offset, directions.float() * self.scale
+        return (*arrays_of((*scaled, self.edges)), self.field.contracted)
+
+    def grid(self, table: Tensor) -> tuple[Any, ...]:
+        """Return what looks features up."""
+        return arrays_of((table,))[0], *level_arrays(self.field.layout), (0,) * table.shape[1]
+
+    def forward(self, origins: Tensor, directions: Tensor, features: Tensor, table: Tensor, *given: Tensor) -> Any:
+        """Render, and keep what the backward pass needs."""
+        weights = list(given)
+        density, color = self.split(weights)
+        out = torch.empty(self.rays, self.samples), torch.zeros(self.rays, 3)
+        words = [words_of(sum(padded_widths(each)[:-1]), self.dtype) if each else 0 for each in (density, color)]
+        space, grid, networks = self.space(origins, directions), self.grid(table), self.networks(weights, False)
+        numbers = np.float32(self.field.bias), np.float32(self.whole_from), self.closed, _handed_over(color, features)
+        of_rays, shown = arrays_of((features.float(),))[0], arrays_of(out)
+
+        def part(bounds: tuple[int, int]) -> Workspace:
+            blocks = -(-(bounds[1] - bounds[0]) * self.samples // ROWS) if self.keep else 1
+            workspace = take_workspace(blocks, (words[0], words[1]))
+            kept = workspace.arrays()[1:]
+            _forward(self.kind, *bounds, self.keep, space, of_rays, grid, networks, numbers, kept, shown)
+            return workspace
+
+        workspaces = in_parallel(part, self.parts)
+        if self.keep:
+            self.workspaces = workspaces
+        else:
+            give_back(workspaces)
+        return out
+
+    def backward(
+        self, wants_rays: bool, rays: tuple[Tensor, ...], table: Tensor, weights: list[Tensor], grads: Any
+    ) -> tuple[list[Tensor], Tensor, Tensor, list[Tensor]]:
+        """Return the gradients of rays, all points and the gradients of their features, and those of the weights.
+
+        Args:
+            wants_rays: whether origins and directions have gradients; those of what all samples share are cheap.
+            rays: origins, directions, features.
+            table: of the grid.
+            weights: of both perceptrons.
+            grads: of what `forward` returned.
+        """
+        density, color = self.split(weights)
+        widths = padded_widths(density), padded_widths(color) if color else []
+        counts = [sum(a * b for a, b in pairwise(each)) for each in widths]
+        sums = torch.zeros(len(self.parts), sum(counts))
+        found = len(self.field.layout.resolutions) * table.shape[1]
+        points, of_points = torch.empty(self.rays * self.samples, 3), torch.empty(self.rays * self.samples, found)
+        of_rays = [torch.zeros(each.shape) for each in rays]
+        space, grid, networks = self.space(*rays[:2]), self.grid(table), self.networks(weights, transposed=True)
+        numbers = np.float32(self.field.least_slope), _handed_over(color, rays[2]), wants_rays
+        out, of_light = arrays_of((points, of_points, *of_rays)), arrays_of(tuple(each.float() for each in grads))
+
+        def part(number: int) -> None:
+            totals = sums[number, : counts[0]].numpy(), sums[number, counts[0] :].numpy()
+            kept = self.workspaces[number].arrays()[1:]
+            _backward(self.kind, *self.parts[number], space, grid, networks, numbers, of_light, kept, out, totals)
+
+        in_parallel(part, range(len(self.parts)))
+        total = sums.sum(dim=0)
+        of_weights = unpadded(total[: counts[0]], density, widths[0])
+        of_weights += unpadded(total[counts[0] :], color, widths[1]) if color else []
+        give_back(self.workspaces)
+        self.workspaces = []
+        of_rays[0] *= self.scale
+        of_rays[1] *= self.scale
+        return of_rays, points, of_points, of_weights
+
+
+def _handed_over(color: list[Tensor], features: Tensor) -> int:
+    """Return how many of its outputs the density's perceptron hands to the colours'."""
+    return color[0].shape[1] - features.shape[1] if color else 0
+
+
+class _DenseRays(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, call: _Call, *given: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.call = call
+        if call.keep:
+            ctx.save_for_backward(*given)
+        return call.forward(*given)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
+        *rays, table = ctx.saved_tensors[:4]
+        weights = list(ctx.saved_tensors[4:])
+        wants_rays = any(ctx.needs_input_grad[1:3])
+        of_rays, points, of_points, of_weights = ctx.call.backward(wants_rays, tuple(rays), table, weights, grads)
+        of_table = None
+        if ctx.needs_input_grad[4]:
+            of_table = table_gradient(table, points, of_points, ctx.call.field.layout, hash_grid)
+        return None, *of_rays, of_table, *of_weights
+
+
+@njit(fastmath={"contract"})
+@no_type_check
+def _place(space, first, start, count, block, points):
+    # Which ray each sample of a block is on, and its distance, length and place, in the unit cube.
+    origins, directions, edges, contracted = space
+    owner, t, delta, x, y, z = block
+    samples = edges.shape[1] - 1
+    r, k = first + start // samples, start % samples
+    for i in range(count):
+        begin, end = edges[r, k], edges[r, k + 1]
+        middle = HALF * (begin + end)
+        owner[i], t[i], delta[i] = r, middle, end - begin
+        x[i] = origins[r, 0] + middle * directions[r, 0]
+        y[i] = origins[r, 1] + middle * directions[r, 1]
+        z[i] = origins[r, 2] + middle * directions[r, 2]
+        k += 1
+        if k == samples:
+            r, k = r + 1, 0
+    for i in range(count):
+        factor, shift = ONE, ZERO
+        if contracted:
+            norm = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), ONE)
+            factor, shift = (TWO - ONE / norm) / norm * QUARTER, HALF
+        points[i, 0], points[i, 1], points[i, 2] = x[i] * factor + shift, y[i] * factor + shift, z[i] * factor + shift
+
+
+@njit
+@no_type_check
+def _absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, numbers, rooms):
+    # From raw densities to what each sample absorbs of the light that reaches it; and what their gradients need.
+    biased, density, alpha, bits = rooms
+    for i in range(count):
+        biased[i] = min(raw[i * outer] + bias, LARGEST_RAW)
+    exponentials(biased[:count], density[:count], bits[:count])
+    for i in range(count):
+        slope = density[i]
+        if abs(biased[i]) > LARGEST_SLOPE:
+            slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
+        if not (everywhere or is_inside(points, i)):
+            density[i] = slope = ZERO
+        share = ONE
+        if whole_from > ZERO:
+            share = min((t[i] / whole_from) ** 2, ONE)
+        numbers[i, BACK], numbers[i, SHARE] = delta[i] * slope * share, share
+        density[i] *= delta[i]
+    absorbed(density[:count], alpha[:count], bits[:count])
+
+
+@njit
+@no_type_check
+def _composite(count, start, samples, closed, alpha, light, numbers, weights):
+    # Ray by ray from front to back; returns the light behind the last of these samples.
+    k = start % samples
+    for i in range(count):
+        if k == 0:
+            light = ONE
+        w = light * alpha[i]
+        if closed and k == samples - 1:
+            w, numbers[i, BACK] = light, ZERO
+        light -= w
+        numbers[i, LIGHT], numbers[i, WEIGHT], weights[i] = light, w, w
+        k = k + 1 if k < samples - 1 else 0
+    return light
+
+
+@njit
+@no_type_check
+def _copy_numbers(source, target, count):
+    # Whole vectors while there are any.
+    done = 0
+    while count - done >= LANES:
+        round_vector(OWN_FLOATS, source + 4 * done, target + 4 * done)
+        done += LANES
+    return done
+
+
+@njit
+@no_type_check
+def _color_inputs(count, hidden, flat, outer, owner, of_rays, inputs):
+    # What the density hands over, and behind it what all samples of a ray share.
+    given, shared = address(flat), of_rays.shape[1]
+    for i in range(count):
+        r, to = owner[i], address(inputs) + 4 * i * inputs.shape[1]
+        for c in range(_copy_numbers(given + 4 * i * outer, to, hidden), hidden):
+            inputs[i, c] = flat[i * outer + c]
+        for c in range(_copy_numbers(address(of_rays) + 4 * r * shared, to + 4 * hidden, shared), shared):
+            inputs[i, hidden + c] = of_rays[r, c]
+
+
+@njit
+@no_type_check
+def _shade(count, flat, outer, owner, numbers, rooms, foreground):
+    raw, shades, _, bits = rooms
+    for c in range(3):
+        for i in range(count):
+            raw[i] = flat[i * outer + c]
+        sigmoids(raw[:count], shades[:count], bits[:count])
+        for i in range(count):
+            numbers[i, COLOR + c] = shades[i]
+            foreground[owner[i], c] += numbers[i, WEIGHT] * shades[i]
+
+
+@njit
+@no_type_check
+def _new_block():
+    floats = np.zeros((5, ROWS), np.float32)
+    return np.zeros(ROWS, np.int64), floats[0], floats[1], floats[2], floats[3], floats[4]
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of_call, kept, out):
+    table, resolutions, offsets, hashed, mask, lanes = grid
+    density_words, dims, color_words, color_dims = networks
+    bias, whole_from, closed, hidden = numbers_of_call
+    all_numbers, all_points, density_kept, color_kept = kept
+    all_weights, foreground = out[0].reshape(-1), out[1]
+    samples, colored = space[2].shape[1] - 1, color_dims.shape[0] > 0
+    block, floats, bits = _new_block(), np.zeros((3, ROWS), np.float32), np.zeros(ROWS, np.int32)
+    rooms, features = (floats[0], floats[1], floats[2], bits), np.zeros((ROWS, dims[0]), np.float32)
+    inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
+    sums, light = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32), ONE
+    flat, outer = sums.reshape(-1), dims[-1]
+    stride, color_stride = bytes_of(kind) * dims[:-1].sum(), bytes_of(kind) * color_dims[:-1].sum()
+    total = (last - first) * samples
+    for start in range(0, total, ROWS):
+        count, row = min(ROWS, total - start), start if keep else 0
+        numbers, points = all_numbers[row : row + ROWS], all_points[row : row + ROWS]
+        _place(space, first, start, count, block, points)
+        encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
+        x, y = address(density_kept) + row * stride, address(sums)
+        round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
+        through(kind, x, stride, address(density_words), dims, y, y)
+        _absorb(count, flat, outer, bias, space[3], whole_from, block[2], block[1], points, numbers, rooms)
+        weights = all_weights[first * samples + start : first * samples + start + count]
+        light = _composite(count, start, samples, closed, floats[2], light, numbers, weights)
+        if colored:
+            _color_inputs(count, hidden, flat, outer, block[0], of_rays, inputs)
+            x = address(color_kept) + row * color_stride
+            round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
+            through(kind, x, color_stride, address(color_words), color_dims, y, y)
+            _shade(count, flat, color_dims[-1], block[0], numbers, rooms, foreground)
+
+
+@njit
+@no_type_check
+def _composite_back(count, start, first, samples, colored, least_slope, grads, numbers, behind, outer, flat, raw):
+    # Gradients of a block's raw colours, side by side in `flat`, and of its raw densities; from back to front. Returns
+    # what lies behind the first of these samples.
+    of_weights, of_light = grads
+    flat[: ROWS * outer] = ZERO
+    raw[count:] = ZERO
+    last = start + count - 1
+    r, k = first + last // samples, last % samples
+    for i in range(count - 1, -1, -1):
+        if k == samples - 1:
+            behind = ZERO
+        w, g = numbers[i, WEIGHT], of_weights[r, k]
+        for c in range(3 if colored else 0):
+            shade, toward = numbers[i, COLOR + c], of_light[r, c] * w
+            g += of_light[r, c] * shade
+            slope = shade * (ONE - shade)
+            if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
+                slope = max(slope, least_slope)
+            flat[i * outer + c] = toward * slope * numbers[i, SHARE]
+        raw[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind)
+        behind += w * g
+        k -= 1
+        if k < 0:
+            r, k = r - 1, samples - 1
+    return behind
+
+
+@njit
+@no_type_check
+def _hand_back(count, hidden, owner, passed, of_density, outer, flat, of_rays):
+    # From the gradients of the colours' inputs to those of what the density's perceptron gave, and of what rays share.
+    flat[: ROWS * outer] = ZERO
+    for i in range(count):
+        for c in range(
+            _copy_numbers(address(passed) + 4 * i * passed.shape[1], address(flat) + 4 * i * outer, hidden), hidden
+        ):
+            flat[i * outer + c] = passed[i, c]
+        flat[i * outer] += of_density[i]
+        r = owner[i]
+        for c in range(of_rays.shape[1] if hidden else 0):
+            of_rays[r, c] += passed[i, hidden + c]
+
+
+@njit
+@no_type_check
+def _move_rays(count, contracted, block, toward, of_origins, of_directions):
+    # From gradients of points in the unit cube to those of rays: y = x f / 4 + 1/2, with f = 2 / |x| - 1 / |x|^2.
+    owner, t, _, x, y, z = block
+    for i in range(count):
+        r, gx, gy, gz = owner[i], toward[i, 0], toward[i, 1], toward[i, 2]
+        if contracted:
+            norm = max(np.float32(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])), ONE)
+            factor, slope = QUARTER * (TWO - ONE / norm) / norm, ZERO
+            if norm > ONE:
+                slope = QUARTER * (TWO / norm - TWO) / (norm * norm * norm) * (x[i] * gx + y[i] * gy + z[i] * gz)
+            gx, gy, gz = factor * gx + slope * x[i], factor * gy + slope * y[i], factor * gz + slope * z[i]
+        of_origins[r, 0] += gx
+        of_origins[r, 1] += gy
+        of_origins[r, 2] += gz
+        of_directions[r, 0] += t[i] * gx
+        of_directions[r, 1] += t[i] * gy
+        of_directions[r, 2] += t[i] * gz
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def _backward(kind, first, last, space, grid, networks, numbers_of_call, grads, kept, out, totals):
+    table, resolutions, offsets, hashed, mask, lanes = grid
+    density_words, dims, color_words, color_dims = networks
+    least_slope, hidden, wants_rays = numbers_of_call
+    all_numbers, all_points, density_kept, color_kept = kept
+    points_out, of_points, of_origins, of_directions, of_rays = out
+    of_density, of_color = totals
+    size, samples, colored = bytes_of(kind), space[2].shape[1] - 1, color_dims.shape[0] > 0
+    widest, color_outer = max(dims.max(), color_dims.max() if colored else 0), color_dims[-1] if colored else 0
+    passed = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
+    stride, color_stride = size * dims[:-1].sum(), size * color_dims[:-1].sum()
+    sums, words = np.zeros((ROWS, widest), np.float32), np.zeros((3, ROWS, widest * size // 4), np.int32)
+    raw, features, toward = (
+        np.zeros(ROWS, np.float32),
+        np.zeros((ROWS, dims[0]), np.float32),
+        np.zeros((ROWS, 3), np.float32),
+    )
+    block, flat, next_room, outer, behind = _new_block(), sums.reshape(-1), size * ROWS * widest, dims[-1], ZERO
+    total, width = (last - first) * samples, of_points.shape[1]
+    for start in range((total - 1) // ROWS * ROWS, -1, -ROWS):
+        count, row = min(ROWS, total - start), first * samples + start
+        numbers, points = all_numbers[start : start + ROWS], all_points[start : start + ROWS]
+        _place(space, first, start, count, block, points)
+        behind = _composite_back(
+            count, start, first, samples, colored, least_slope, grads, numbers, behind, color_outer, flat, raw
+        )
+        y, dy = address(sums), address(words)
+        if colored:
+            round_rows(kind, y, 4 * color_outer, dy, size * color_outer, ROWS, color_outer)
+            back_through(
+                kind, address(color_kept) + start * color_stride, color_stride, address(color_words), color_dims, dy,
+                y, dy + next_room, dy + 2 * next_room, address(of_color), True, address(passed),
+            )  # fmt: skip
+        _hand_back(count, hidden, block[0], passed, raw, outer, flat, of_rays)
+        round_rows(kind, y, 4 * outer, dy, size * outer, ROWS, outer)
+        back_through(
+            kind, address(density_kept) + start * stride, stride, address(density_words), dims, dy,
+            y, dy + next_room, dy + 2 * next_room, address(of_density), True, address(features),
+        )  # fmt: skip
+        for i in range(count):
+            for axis in range(3):
+                points_out[row + i, axis] = points[i, axis]
+            to = address(of_points) + 4 * (row + i) * width
+            for c in range(_copy_numbers(address(features) + 4 * i * dims[0], to, width), width):
+                of_points[row + i, c] = features[i, c]
+        if wants_rays:
+            write_point_gradient(0, count, table, points, features, resolutions, offsets, hashed, mask, lanes, toward)
+            _move_rays(count, space[3], block, toward, of_origins, of_directions)
