@@ -6,10 +6,11 @@ which thread takes what: parts and their order are fixed.
 """
 
 import functools
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -37,38 +38,55 @@ def num_threads() -> int:
 
 
 @contextmanager
-def torch_on_one_thread() -> Iterator[None]:
+def torch_on_one_thread(shares_out: bool = True) -> Iterator[None]:
     """Within, torch's own operations take one thread, and what is shared out here as many as before.
 
     Between kernels of ours torch has little to do, and its threads wait for one another in each operation: where
     another program has one of the cores for a moment, all of them wait, which made steps four times as slow.
+
+    Args:
+        shares_out: False: that takes one, too.
+
     """
-    former, threads = _kept.threads, num_threads()
-    _kept.threads = threads
-    torch.set_num_threads(1)
+    former, threads = _kept.threads, torch.get_num_threads()
+    _kept.threads = num_threads() if shares_out else 1
+    if threads > 1:
+        torch.set_num_threads(1)
     try:
         yield
     finally:
         _kept.threads = former
-        torch.set_num_threads(threads if former is None else 1)
+        if threads > 1:
+            torch.set_num_threads(threads)
 
 
 def in_parallel(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """Do the work on each part, on as many threads as torch has here, and return the results in order.
 
-    Within a part torch has one thread, and so has whatever is called there. Raises what the work raises.
+    The calling thread takes parts, too, so that small work is done before another thread has woken up. Within a part
+    torch has one thread, and so has whatever is called there. Raises what the work raises.
     """
-    threads = num_threads()
-    if threads == 1 or len(parts) < 2:
+    threads = min(num_threads(), len(parts))
+    if threads < 2:
         return [work(part) for part in parts]
+    numbers, results = itertools.count(), [None] * len(parts)
     # A thread's own settings, which those of the pool do not share.
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
 
-    def alone(part: Part) -> Result:
+    def take_parts() -> None:
         with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            return work(part)
+            while (number := next(numbers)) < len(parts):
+                results[number] = work(parts[number])  # type: ignore[call-overload]
 
-    return list(_pool(threads).map(alone, parts))
+    others = [_pool(num_threads() - 1).submit(take_parts) for _ in range(threads - 1)]
+    try:
+        with torch_on_one_thread(shares_out=False):
+            take_parts()
+    finally:
+        wait(others)
+    for other in others:
+        other.result()
+    return results  # type: ignore[return-value]
 
 
 def threads_on(device: torch.device) -> int:

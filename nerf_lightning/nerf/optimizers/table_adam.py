@@ -41,7 +41,8 @@ class TableAdam(Optimizer):
                 "and eps, betas from 0 to below 1, and no negative weight_decay."
             )
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps, "weight_decay": weight_decay})
-        self._clean = False
+        # Shared with whatever copies this optimizer's attributes, as Lightning's wrapper does.
+        self._gradients = {"are_zero": False}
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Set the gradients to zero where the last step has not; they stay allocated whatever is asked for."""
@@ -49,9 +50,9 @@ class TableAdam(Optimizer):
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
                 parameter.grad_in_place = True  # type: ignore[attr-defined]
-            elif not self._clean:
+            elif not self._gradients["are_zero"]:
                 parameter.grad.zero_()
-        self._clean = False
+        self._gradients["are_zero"] = False
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
@@ -83,7 +84,7 @@ class TableAdam(Optimizer):
                     betas=(beta1, beta2),
                     eps=group["eps"],
                 )
-        self._clean = True
+        self._gradients["are_zero"] = True
         return loss
 
     def _parameters(self) -> Iterable[Tensor]:

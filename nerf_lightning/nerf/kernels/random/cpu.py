@@ -23,8 +23,7 @@ def uniform(
 def permute(index: Int[Tensor, "n"], rows: int, columns: int, size: int, words: Int[Tensor, "rounds"]) -> Tensor:
     """Return where a permutation of range(size) sends each index, given the words of its rounds."""
     out = torch.empty_like(index)
-    arrays = index.contiguous().numpy(), rows, columns, size, words.numpy(), out.numpy()
-    over_rows(_permute, len(index), *arrays)
+    _permute(0, len(index), index.contiguous().numpy(), rows, columns, size, words.numpy(), out.numpy())
     return out
 
 
