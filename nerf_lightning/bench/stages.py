@@ -31,7 +31,7 @@ def stage_seconds(step: TrainStep, batch: Batch, optimizer: torch.optim.Optimize
     optimizer.zero_grad()
     whole = seconds_of(lambda: step.gradients(batch))
     update = seconds_of(optimizer.step)
-    if level.takes_whole_rays(rays.near.device, rays.origins.requires_grad):
+    if level.takes_whole_rays(rays.near.device, training=True, learns_cameras=rays.origins.requires_grad):
         return {"whole rays, loss and gradients": whole, "optimizer": update}
     with torch.no_grad():
         points = ragged_points(rays, sampler(rays, None), None)

@@ -5,7 +5,7 @@ What a tile of rays needs stays in the cache, and the sum of the tiles' gradient
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -254,9 +254,7 @@ class TrainStep:
             backward: adds a loss's gradients to the parameters'.
             measure_gradients: whether to measure the gradients' norms, before they are clipped.
         """
-        # Whole batches are for torch's threads; what is cut into tiles is shared out here.
-        alone = self.tile_points is not None and self.device.type == "cpu"
-        with torch_on_one_thread() if alone else nullcontext():
+        with self._on_threads():
             return self._take(batch, optimizer, backward, measure_gradients)
 
     def _take(self, batch: Batch, optimizer: Any, backward: Backward, measure_gradients: bool) -> StepOutput:
@@ -303,6 +301,15 @@ class TrainStep:
             What this share saw; its losses and errors add up over all shares to the batch's.
         """
         share = Share(0, batch.num_rays, batch.weight.sum()) if share is None else share
+        with self._on_threads():
+            return self._gradients(batch, backward, share)
+
+    def _on_threads(self) -> AbstractContextManager[None]:
+        # Whole batches are for torch's threads; tiles, and rays that kernels take whole, are shared out here.
+        alone = self.tile_points is not None and self.device.type == "cpu"
+        return torch_on_one_thread() if alone else nullcontext()
+
+    def _gradients(self, batch: Batch, backward: Backward, share: Share) -> StepOutput:
         counts = [count.clone() for count in self.model.sample_counts()]
         while True:
             try:
@@ -407,7 +414,9 @@ class TrainStep:
 
         together = self.rays_together
         threads = 1 if self.tile_points is None else threads_on(device)
-        if threads > 1 and not self.model.shares_out_rays(device, self.rays.refinement.moves()):
+        if threads > 1 and not self.model.takes_whole_rays(
+            device, training=True, learns_cameras=self.rays.refinement.moves()
+        ):
             parts = list(tiles(num_rays, tile_rays, together, multiple=threads))
             lost = parallel_backward(lose, parts, backward, self._parameters())
         else:

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 def measured_tile(settings: TrainerSettings, step: TrainStep, batches: RayBatches) -> int:
     """Return the best of a few tile sizes, by training steps that are thrown away; a few seconds at most."""
     step.to(settings.device)
-    if step.model.shares_out_rays(step.device, step.rays.refinement.moves()):
+    if step.model.takes_whole_rays(step.device, training=True, learns_cameras=step.rays.refinement.moves()):
         return WHOLE_RAYS_TILE
     batch = batches.at(0, batches.crop_rays(0)).to(settings.device)
     num_rays = _rays_in_time(settings, step, batch)

@@ -54,16 +54,21 @@ def backend(module: str) -> ModuleType | None:
         # Compiled when first called: better here, where something else can do the work, than in the midst of a step.
         with _told_if_long(library):
             try:
-                found.trial()
+                _try(found)
             except Exception:  # a damaged cache, perhaps: unpickling raises anything
                 if library != "numba" or not _forget_compiled(found):
                     raise
-                found.trial()
+                _try(found)
         return found
     except Exception as error:  # a broken LLVM or driver raises anything: OSError, RuntimeError, SystemError
         _reasons[module] = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         _warn_once(library, _reasons[module])
         return None
+
+
+def _try(module: Any) -> None:
+    with torch.inference_mode(False), torch.enable_grad():  # the first call may be for a picture
+        module.trial()
 
 
 @contextmanager

@@ -69,12 +69,13 @@ class Model(nn.Module, ABC):
             random: the step's numbers for these rays; None for evaluation.
         """
 
-    def shares_out_rays(self, device: torch.device, learns_cameras: bool) -> bool:
-        """Return whether kernels share out the rays of a training step over threads; otherwise tiles of it are.
+    def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
+        """Return whether kernels take rays from end to end and share them out over threads, so that tiles may be large.
 
         Args:
             device: of the parameters.
-            learns_cameras: whether gradients of rays are wanted.
+            training: whether gradients follow.
+            learns_cameras: whether gradients of rays are wanted, too.
         """
         return False
 

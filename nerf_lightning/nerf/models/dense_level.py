@@ -77,7 +77,7 @@ class DenseLevel(Level):
         seen = self.field_output(points_along(rays, samples, random, self.field.sees_cones))
         return composite(soften_near_gradients(seen, samples.midpoints, whole_from), samples, rays, background)
 
-    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
+    def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
         """Return whether there is a kernel for the field; it has gradients of rays, too."""
         return self._parts_on(device) is not None
 

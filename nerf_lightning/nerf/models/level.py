@@ -65,8 +65,8 @@ class Level(nn.Module):
     def points_per_ray(self, before: float, training: bool) -> float:
         """Return how many points a ray sends through the field at once, given how many the level before had."""
 
-    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
-        """Return whether a kernel takes the rays of training steps from end to end (`Model.shares_out_rays`)."""
+    def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
+        """Return whether a kernel takes rays from end to end (`Model.takes_whole_rays`)."""
         return False
 
     def fit_to(self, scene: Scene) -> None:

@@ -62,9 +62,9 @@ class RadianceModel(PointField):
         """Whether every level does."""
         return all(level.replays for level in self._in_order())
 
-    def shares_out_rays(self, device: torch.device, learns_cameras: bool) -> bool:
-        """Return whether every level takes whole rays."""
-        return all(level.takes_whole_rays(device, learns_cameras) for level in self._in_order())
+    def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
+        """Return whether every level does."""
+        return all(level.takes_whole_rays(device, training, learns_cameras) for level in self._in_order())
 
     def points_per_ray(self, training: bool) -> float:
         """Return the largest number of points that a ray sends through any field at once: what tiles are cut by."""

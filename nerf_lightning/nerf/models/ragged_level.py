@@ -53,22 +53,22 @@ class RaggedLevel(Level):
         output = self.field(ragged_points(rays, samples, random, self.field.sees_cones), features)
         return composite_ragged(output, samples, rays, background)
 
-    def takes_whole_rays(self, device: torch.device, learns_cameras: bool) -> bool:
-        """Return whether training renders rays in one kernel: it keeps no weights, and knows no gradients of rays."""
-        if self.returns_weights or learns_cameras or device.type != "cpu":  # elsewhere the field's parts would be read
-            return False
-        return has_kernel(self.field.parts(), self.field.matmul_precision, device, gradients=True)
+    def takes_whole_rays(self, device: torch.device, training: bool, learns_cameras: bool = False) -> bool:
+        """Return whether a kernel takes rays from end to end: in training without weights and gradients of rays."""
+        if device.type != "cpu" or (training and (self.returns_weights or learns_cameras)):
+            return False  # on other devices the field's parts would be read
+        return has_kernel(self.field.parts(), self.field.matmul_precision, device, gradients=training)
 
     def _whole_rays(
         self, rays: RayBundle, background: Float[Tensor, "rays 3"] | None, random: RayRandom | None, evaluates: bool
     ) -> Rendering | None:
         device, matmul_precision, sampler = rays.near.device, self.field.matmul_precision, self.sampler
-        trains = torch.is_grad_enabled() and self.takes_whole_rays(device, rays.origins.requires_grad)
-        parts = self.field.parts() if evaluates or trains else None
-        if parts is None or not has_kernel(parts, matmul_precision, device, gradients=trains):
+        trains = torch.is_grad_enabled()
+        if not (evaluates or trains) or not self.takes_whole_rays(device, trains, rays.origins.requires_grad):
             return None
+        parts = self.field.parts()
         march = sampler.marcher(rays).grid_march() if evaluates else sampler.grid_march(rays, random)
-        if march is None:
+        if parts is None or march is None:
             return None
         expected = None if evaluates else self.points_per_ray(1.0, training=True)
         found = render_whole_rays(rays, parts, march, matmul_precision, sampler.opaque_below, LEAST_ALPHA, expected)

@@ -23,6 +23,9 @@ from nerf_lightning.nerf.types.rays import PixelIndex, RayBundle
 from nerf_lightning.nerf.types.scene import Background
 from nerf_lightning.nerf.types.tensor_struct import TensorStruct
 
+WHOLE_RAYS = 4096
+"""Of a tile, where kernels take rays from end to end: what they have under way stays in their caches anyway."""
+
 log = logging.getLogger(__name__)
 
 
@@ -155,7 +158,10 @@ def render_rays(model: Model, rays: RayBundle, background: Background, tile_poin
 
 def _in_tiles(model: Model, count: int, tile_points: int, render: Callable[[slice], Picture]) -> Picture:
     """Return what `render` sees of so many rays, a tile at a time, in ever smaller tiles where there is no memory."""
-    at_once = min(tile_rays_for(model, tile_points), count)
+    at_once = tile_rays_for(model, tile_points)
+    if model.takes_whole_rays(next(model.parameters()).device, training=False):
+        at_once = max(at_once, WHOLE_RAYS)
+    at_once = min(at_once, count)
     if model.most_rays is not None:
         at_once = min(at_once, model.most_rays)
     while True:

@@ -187,10 +187,10 @@ def test_many_rays_are_shared_out_and_nothing_changes(threads):
 def test_it_goes_the_other_way_where_something_else_is_wanted():
     level, rays, cpu = a_level(density_bias=3.0), some_rays(50), torch.device("cpu")
     assert isinstance(level(rays, None, [], None), RaggedRendering)  # as a notebook wants it
-    assert not level.takes_whole_rays(cpu, learns_cameras=False)
+    assert not level.takes_whole_rays(cpu, training=True, learns_cameras=False)
     level.returns_weights = False
-    assert level.takes_whole_rays(cpu, learns_cameras=False)
-    assert not level.takes_whole_rays(cpu, learns_cameras=True)
+    assert level.takes_whole_rays(cpu, training=True, learns_cameras=False)
+    assert not level.takes_whole_rays(cpu, training=True, learns_cameras=True)
     assert not isinstance(level(rays, None, [], None), RaggedRendering)
     with torch.no_grad():
         assert isinstance(level(rays, None, [], batch_random(0, 50)), RaggedRendering)

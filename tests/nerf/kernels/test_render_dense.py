@@ -10,6 +10,7 @@ from support.scenes import some_rays
 from nerf_lightning.nerf.encoders.hash_grid import HashGridEncoder
 from nerf_lightning.nerf.encoders.spherical_harmonics import SphericalHarmonicsEncoder
 from nerf_lightning.nerf.fields.ngp_field import NGPField
+from nerf_lightning.nerf.kernels import backends
 from nerf_lightning.nerf.kernels.backends import without
 from nerf_lightning.nerf.kernels.render import workspace
 from nerf_lightning.nerf.models.dense_level import DenseLevel
@@ -141,19 +142,19 @@ def test_a_ray_does_not_depend_on_the_others_and_a_picture_is_what_training_saw(
 
 def test_fields_that_the_kernel_does_not_know_take_the_plain_way():
     cpu, rays = torch.device("cpu"), some_rays(30)
-    assert a_level().takes_whole_rays(cpu, learns_cameras=True)
-    assert not a_level().takes_whole_rays(torch.device("meta"), learns_cameras=False)
+    assert a_level().takes_whole_rays(cpu, training=True, learns_cameras=True)
+    assert not a_level().takes_whole_rays(torch.device("meta"), training=True, learns_cameras=False)
     narrow = a_level()
     narrow.field.density_mlp[1] = torch.nn.Parameter(torch.ones(16, 20))
     narrow.field.density_mlp[0] = torch.nn.Parameter(torch.ones(20, 16))
-    assert not narrow.takes_whole_rays(cpu, learns_cameras=False)
+    assert not narrow.takes_whole_rays(cpu, training=True, learns_cameras=False)
     assert narrow(rays, None, [], None).rgb.isfinite().all()
     blends = a_level()
     blends.field.position_encoder = HashGridEncoder(4, 4, 8, 2, 16, blend_in=0.5)
     blends.field.position_encoder.on_step(StepContext(0.1, 0, 0))
-    assert not blends.takes_whole_rays(cpu, learns_cameras=False)
+    assert not blends.takes_whole_rays(cpu, training=True, learns_cameras=False)
     other = a_level(type("Other", (DenseLevel,), {"field_output": lambda self, points: self.field(points)}))
-    assert not other.takes_whole_rays(cpu, learns_cameras=False)
+    assert not other.takes_whole_rays(cpu, training=True, learns_cameras=False)
 
 
 def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
@@ -165,3 +166,10 @@ def test_a_proposal_that_does_not_learn_keeps_nothing(monkeypatch):
     assert [each.blocks for each in workspace._spare] == [1]
     level.update(4, 0)
     assert level(rays, None, [], batch_random(0, 30)).weights.requires_grad
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_the_first_rays_may_be_those_of_a_picture(mode, monkeypatch):
+    monkeypatch.setattr(backends, "backend", backends.backend.__wrapped__)
+    with mode():
+        assert a_level().takes_whole_rays(torch.device("cpu"), training=False)

@@ -17,7 +17,6 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
-from nerf_lightning.nerf.activations import LARGEST_SLOPE_RAW
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays, write_point_gradient
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
@@ -35,19 +34,15 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
     words_of,
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import LANES, bytes_of, round_vector
-from nerf_lightning.nerf.kernels.render.cpu import LARGEST_RAW, arrays_of, is_inside, network
-from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponentials, sigmoids
+from nerf_lightning.nerf.kernels.render.cpu import arrays_of, network
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.quadrature import BACK, COLOR, LIGHT, SHARE, WEIGHT, absorb, new_rooms, shade
 from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, TWO, QUARTER, ZERO = (np.float32(each) for each in (0.5, 1.0, 2.0, 0.25, 0.0))
-LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
 FEWEST_RAYS = 32
-BACK, LIGHT, WEIGHT, SHARE, COLOR = 0, 1, 2, 3, 4
-"""What the workspace keeps of each sample: length times slope of the density times SHARE; the light behind it; its
-weight; the share of its gradients that counts; three colours."""
 OWN_FLOATS = np.float32(0)
 """Tells `round_vector` to copy."""
 
@@ -258,28 +253,6 @@ def _place(space, first, start, count, block, points):
 
 @njit
 @no_type_check
-def _absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, numbers, rooms):
-    # From raw densities to what each sample absorbs of the light that reaches it; and what their gradients need.
-    biased, density, alpha, bits = rooms
-    for i in range(count):
-        biased[i] = min(raw[i * outer] + bias, LARGEST_RAW)
-    exponentials(biased[:count], density[:count], bits[:count])
-    for i in range(count):
-        slope = density[i]
-        if abs(biased[i]) > LARGEST_SLOPE:
-            slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
-        if not (everywhere or is_inside(points, i)):
-            density[i] = slope = ZERO
-        share = ONE
-        if whole_from > ZERO:
-            share = min((t[i] / whole_from) ** 2, ONE)
-        numbers[i, BACK], numbers[i, SHARE] = delta[i] * slope * share, share
-        density[i] *= delta[i]
-    absorbed(density[:count], alpha[:count], bits[:count])
-
-
-@njit
-@no_type_check
 def _composite(count, start, samples, closed, alpha, light, numbers, weights):
     # Ray by ray from front to back; returns the light behind the last of these samples.
     k = start % samples
@@ -321,19 +294,6 @@ def _color_inputs(count, hidden, flat, outer, owner, of_rays, inputs):
 
 @njit
 @no_type_check
-def _shade(count, flat, outer, owner, numbers, rooms, foreground):
-    raw, shades, _, bits = rooms
-    for c in range(3):
-        for i in range(count):
-            raw[i] = flat[i * outer + c]
-        sigmoids(raw[:count], shades[:count], bits[:count])
-        for i in range(count):
-            numbers[i, COLOR + c] = shades[i]
-            foreground[owner[i], c] += numbers[i, WEIGHT] * shades[i]
-
-
-@njit
-@no_type_check
 def _new_block():
     floats = np.zeros((5, ROWS), np.float32)
     return np.zeros(ROWS, np.int64), floats[0], floats[1], floats[2], floats[3], floats[4]
@@ -348,8 +308,7 @@ def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of
     all_numbers, all_points, density_kept, color_kept = kept
     all_weights, foreground = out[0].reshape(-1), out[1]
     samples, colored = space[2].shape[1] - 1, color_dims.shape[0] > 0
-    block, floats, bits = _new_block(), np.zeros((3, ROWS), np.float32), np.zeros(ROWS, np.int32)
-    rooms, features = (floats[0], floats[1], floats[2], bits), np.zeros((ROWS, dims[0]), np.float32)
+    block, rooms, features = _new_block(), new_rooms(), np.zeros((ROWS, dims[0]), np.float32)
     inputs = np.zeros((ROWS, color_dims[0] if colored else 0), np.float32)
     sums, light = np.zeros((ROWS, max(dims.max(), color_dims.max() if colored else 0)), np.float32), ONE
     flat, outer = sums.reshape(-1), dims[-1]
@@ -363,15 +322,15 @@ def _forward(kind, first, last, keep, space, of_rays, grid, networks, numbers_of
         x, y = address(density_kept) + row * stride, address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
         through(kind, x, stride, address(density_words), dims, y, y)
-        _absorb(count, flat, outer, bias, space[3], whole_from, block[2], block[1], points, numbers, rooms)
+        absorb(count, flat, outer, bias, space[3], whole_from, block[2], block[1], points, numbers, rooms)
         weights = all_weights[first * samples + start : first * samples + start + count]
-        light = _composite(count, start, samples, closed, floats[2], light, numbers, weights)
+        light = _composite(count, start, samples, closed, rooms[2], light, numbers, weights)
         if colored:
             _color_inputs(count, hidden, flat, outer, block[0], of_rays, inputs)
             x = address(color_kept) + row * color_stride
             round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
             through(kind, x, color_stride, address(color_words), color_dims, y, y)
-            _shade(count, flat, color_dims[-1], block[0], numbers, rooms, foreground)
+            shade(count, flat, color_dims[-1], block[0], numbers, rooms, foreground)
 
 
 @njit

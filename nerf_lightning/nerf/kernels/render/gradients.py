@@ -16,7 +16,6 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
-from nerf_lightning.nerf.activations import LARGEST_SLOPE_RAW
 from nerf_lightning.nerf.kernels.hash_grid import cpu as hash_grid
 from nerf_lightning.nerf.kernels.hash_grid.cpu import encode, level_arrays
 from nerf_lightning.nerf.kernels.hash_grid.interpolate import table_gradient
@@ -35,11 +34,9 @@ from nerf_lightning.nerf.kernels.mlp.cpu import (
 )
 from nerf_lightning.nerf.kernels.mlp.vectors import bytes_of
 from nerf_lightning.nerf.kernels.render.cpu import (
-    LARGEST_RAW,
     along,
     arrays_of,
     interval,
-    is_inside,
     locate,
     network,
     next_sample,
@@ -47,18 +44,25 @@ from nerf_lightning.nerf.kernels.render.cpu import (
     trial_arguments,
 )
 from nerf_lightning.nerf.kernels.render.parts import FieldParts
+from nerf_lightning.nerf.kernels.render.quadrature import (
+    BACK,
+    COLOR,
+    DISTANCE,
+    LIGHT,
+    WEIGHT,
+    absorb,
+    new_rooms,
+    shade,
+)
 from nerf_lightning.nerf.kernels.render.workspace import Workspace, give_back, take_workspace
 from nerf_lightning.nerf.kernels.threads import in_parallel, num_threads, parts_of
 from nerf_lightning.nerf.types.rays import RayBundle
 
 HALF, ONE, ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
-LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
-"""The field's own bounds on what its exponential is asked for, and on where that has a slope (`fields.ngp_field`)."""
 SLOTS = 64
 """So many rays are under way at a time. Samples in a row lie close in the tables; but those behind an opaque one were
 asked about in vain."""
 SPARE_BLOCKS, FEWEST_RAYS = 8, 64
-# Of each sample the workspace keeps: length, distance, light behind it, weight, slope of the density, three colours.
 
 
 def render(
@@ -94,7 +98,7 @@ def render(
 def trial() -> None:
     """Run the kernels once on next to nothing; it raises whatever their compiler raises."""
     for rays, field, state, lattice, grid in trial_arguments():
-        for dtype in dtypes():
+        for dtype in dtypes()[-1:]:
             field.table.requires_grad_()
             light, opacity, depth, _ = render(rays, field, state, lattice, grid, 1e-3, dtype, 1.0)
             (light.sum() + opacity.sum() + depth.sum()).backward()
@@ -198,7 +202,7 @@ class _WholeRays(torch.autograd.Function):
 
 @njit
 @no_type_check
-def _take(march, world, live, ray, sample_index, slots, owners, numbers, points):
+def _take(march, world, live, ray, sample_index, slots, owners, lengths, distances, points):
     # Gives each ray under way its next samples, as many as there is room for; returns how many samples there are.
     each, end, count = ROWS // live, march[5].shape[0] - 2, 0
     for s in range(live):
@@ -210,7 +214,7 @@ def _take(march, world, live, ray, sample_index, slots, owners, numbers, points)
             t = HALF * (begin + stop)
             locate(world, r, t, points, count)
             slots[count], owners[count] = s, r
-            numbers[count, 0], numbers[count, 1] = stop - begin, t
+            lengths[count], distances[count] = stop - begin, t
             count += 1
             k = next_sample(march, r, k + 1)
         sample_index[s] = k
@@ -219,39 +223,21 @@ def _take(march, world, live, ray, sample_index, slots, owners, numbers, points)
 
 @njit
 @no_type_check
-def _weigh(count, raw, outer, bias, opaque_below, slots, light, owners, numbers, points, opacity, depth):
-    # From raw densities to weights, ray by ray from front to back; samples behind an opaque one get no owner.
-    asked = 0
+def _composite(count, alpha, opaque_below, slots, light, owners, distances, numbers, opacity, depth):
+    # Ray by ray from front to back; samples behind an opaque one get no owner. Returns how many have one.
+    seen = 0
     for i in range(count):
         s = slots[i]
         if light[s] <= opaque_below:
             owners[i] = -1
             continue
-        asked += 1
-        density = slope = ZERO
-        if is_inside(points, i):
-            biased = raw[i * outer] + bias
-            density = np.float32(np.exp(min(biased, LARGEST_RAW)))
-            slope = np.float32(np.exp(min(max(biased, -LARGEST_SLOPE), LARGEST_SLOPE)))
-        thickness = density * numbers[i, 0]
-        w = light[s] * np.float32(-np.expm1(-thickness))
-        light[s] *= np.float32(np.exp(-thickness))
-        numbers[i, 2], numbers[i, 3], numbers[i, 4] = light[s], w, slope
+        seen += 1
+        w = light[s] * alpha[i]
+        light[s] -= w
+        numbers[i, LIGHT], numbers[i, WEIGHT], numbers[i, DISTANCE] = light[s], w, distances[i]
         opacity[owners[i]] += w
-        depth[owners[i]] += w * numbers[i, 1]
-    return asked
-
-
-@njit
-@no_type_check
-def _color(count, raw, outer, owners, numbers, foreground):
-    for i in range(count):
-        r = owners[i]
-        if r >= 0:
-            for c in range(3):
-                shade = ONE / (ONE + np.float32(np.exp(-raw[i * outer + c])))
-                numbers[i, 5 + c] = shade
-                foreground[r, c] += numbers[i, 3] * shade
+        depth[owners[i]] += w * distances[i]
+    return seen
 
 
 @njit
@@ -278,6 +264,7 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
     all_owners, all_numbers, all_points, density_kept, color_kept = room
     ray, sample_index, light = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.float32)
     slots, features = np.zeros(ROWS, np.int64), np.zeros((ROWS, dims[0]), np.float32)
+    lengths, distances, rooms = np.zeros(ROWS, np.float32), np.zeros(ROWS, np.float32), new_rooms()
     inputs = np.zeros((ROWS, color_dims[0]), np.float32)
     sums = np.zeros((ROWS, max(dims.max(), color_dims.max())), np.float32)
     flat, hidden = sums.reshape(-1), color_dims[0] - directions.shape[1]
@@ -291,22 +278,21 @@ def _see(kind, first, last, march, world, directions, table, levels, networks, l
             return block + 1, asked
         rows = slice(block * ROWS, (block + 1) * ROWS)
         owners, numbers, points = all_owners[rows], all_numbers[rows], all_points[rows]
-        count = _take(march, world, live, ray, sample_index, slots, owners, numbers, points)
+        count = _take(march, world, live, ray, sample_index, slots, owners, lengths, distances, points)
         owners[count:], points[count:] = -1, HALF
         encode(0, count, table, points, resolutions, offsets, hashed, mask, lanes, features)
         x, y = address(density_kept) + block * ROWS * stride, address(sums)
         round_rows(kind, address(features), 4 * dims[0], x, stride, ROWS, dims[0])
         through(kind, x, stride, address(density_words), dims, y, y)
-        asked += _weigh(
-            count, flat, dims[-1], bias, opaque_below, slots, light, owners, numbers, points, opacity, depth
-        )
+        absorb(count, flat, dims[-1], bias, False, ZERO, lengths, distances, points, numbers, rooms)
+        asked += _composite(count, rooms[2], opaque_below, slots, light, owners, distances, numbers, opacity, depth)
         for i in range(count):
             inputs[i, :hidden] = flat[i * dims[-1] : i * dims[-1] + hidden]
             inputs[i, hidden:] = directions[ray[slots[i]]]
         x = address(color_kept) + block * ROWS * color_stride
         round_rows(kind, address(inputs), 4 * color_dims[0], x, color_stride, ROWS, color_dims[0])
         through(kind, x, color_stride, address(color_words), color_dims, y, y)
-        _color(count, flat, color_dims[-1], owners, numbers, foreground)
+        shade(count, flat, color_dims[-1], owners, numbers, rooms, foreground)
         live = _end(live, end, opaque_below, ray, sample_index, light)
         block += 1
 
@@ -322,16 +308,16 @@ def _composite_back(owners, numbers, first, least_slope, grads, behind, outer, f
         of_density[i] = ZERO
         if r < 0:
             continue
-        w = numbers[i, 3]
-        g = of_opacity[r] + of_depth[r] * numbers[i, 1]
+        w = numbers[i, WEIGHT]
+        g = of_opacity[r] + of_depth[r] * numbers[i, DISTANCE]
         for c in range(3):
-            shade, toward = numbers[i, 5 + c], of_light[r, c] * w
+            shade, toward = numbers[i, COLOR + c], of_light[r, c] * w
             g += of_light[r, c] * shade
             slope = shade * (ONE - shade)
             if toward * (shade - HALF) > ZERO:  # a step goes against the gradient: back from black, or from full
                 slope = max(slope, least_slope)
             flat[i * outer + c] = toward * slope
-        of_density[i] = numbers[i, 0] * (numbers[i, 2] * g - behind[r - first]) * numbers[i, 4]
+        of_density[i] = numbers[i, BACK] * (numbers[i, LIGHT] * g - behind[r - first])
         behind[r - first] += w * g
 
 

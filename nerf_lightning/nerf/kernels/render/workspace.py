@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.nerf.kernels.mlp.cpu import ROWS
 
 NUMBERS = 8
-"""Of each sample, whatever the kernels keep there."""
+"""Of each sample (`render.quadrature`)."""
 
 
 @dataclass

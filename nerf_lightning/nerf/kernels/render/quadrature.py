@@ -1,0 +1,68 @@
+"""What the kernels of whole rays with gradients keep of each sample, and how a block of samples comes to it.
+
+Letters as in `rendering.quadrature`.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from nerf_lightning.nerf.activations import LARGEST_SLOPE_RAW
+from nerf_lightning.nerf.kernels.mlp.cpu import ROWS
+from nerf_lightning.nerf.kernels.render.cpu import LARGEST_RAW, is_inside
+from nerf_lightning.nerf.kernels.render.exponential import absorbed, exponentials, sigmoids
+
+BACK, LIGHT, WEIGHT, SHARE, COLOR, DISTANCE = 0, 1, 2, 3, 4, 7
+"""Of each sample: length times slope of the density times SHARE; the light behind it; its weight; the share of its
+gradients that counts (`rendering.near_gradients`); three colours; its distance."""
+LARGEST_SLOPE = np.float32(LARGEST_SLOPE_RAW)
+ONE, ZERO = np.float32(1.0), np.float32(0.0)
+
+
+@njit
+@no_type_check
+def new_rooms():
+    """Return what `absorb` and `shade` compute in: three rows of numbers, and one of bits."""
+    floats = np.zeros((3, ROWS), np.float32)
+    return floats[0], floats[1], floats[2], np.zeros(ROWS, np.int32)
+
+
+@njit
+@no_type_check
+def absorb(count, raw, outer, bias, everywhere, whole_from, delta, t, points, numbers, rooms):
+    """Leave each sample's alpha in the third of the rooms, given its raw density; and in `numbers` what gradients need.
+
+    Outside of the unit cube there is nothing, unless `everywhere`; from `whole_from` on gradients are whole.
+    """
+    biased, density, alpha, bits = rooms
+    for i in range(count):
+        biased[i] = min(raw[i * outer] + bias, LARGEST_RAW)
+    exponentials(biased[:count], density[:count], bits[:count])
+    for i in range(count):
+        slope = density[i]
+        if abs(biased[i]) > LARGEST_SLOPE:
+            slope = np.float32(np.exp(min(max(biased[i], -LARGEST_SLOPE), LARGEST_SLOPE)))
+        if not (everywhere or is_inside(points, i)):
+            density[i] = slope = ZERO
+        share = ONE
+        if whole_from > ZERO:
+            share = min((t[i] / whole_from) ** 2, ONE)
+        numbers[i, BACK], numbers[i, SHARE] = delta[i] * slope * share, share
+        density[i] *= delta[i]
+    absorbed(density[:count], alpha[:count], bits[:count])
+
+
+@njit
+@no_type_check
+def shade(count, flat, outer, owner, numbers, rooms, foreground):
+    """Add weighted colours to the foreground of each sample's ray, given raw ones; some samples have no owner."""
+    raw, shades, _, bits = rooms
+    for c in range(3):
+        for i in range(count):
+            raw[i] = flat[i * outer + c]
+        sigmoids(raw[:count], shades[:count], bits[:count])
+        for i in range(count):
+            numbers[i, COLOR + c] = shades[i]
+            if owner[i] >= 0:
+                foreground[owner[i], c] += numbers[i, WEIGHT] * shades[i]
